@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HoleFill: TypeAlias = Literal["left", "nearest", "farthest"]
-"""Neighbour from which a hole gets its depth."""
+"""Choice of the neighbour whose depth fills a hole."""
 
 MILLIMETRE: Final = 1e-3
 """Default step of a depth map of 16 bits, metres."""
 
 MAX_PASSES: Final = 16
-"""Largest number of iterations, and of pixels over which holes are filled."""
+"""Largest number of iterations of a filter, and largest width of a filled rim, pixels."""
 
 MIN_NEW_SCENE_SHARE: Final = 0.5
-"""Share of the pixels that must jump for the average to restart."""
+"""Share of the pixels that must jump before the whole average restarts."""
 
 
 @takes(scale=a_number)
@@ -70,8 +70,8 @@ class SpatialFilter:
     """Smooth a depth map and keep its edges.
 
     The filter is a recursive exponential average along rows, then along columns, each forwards and
-    backwards. A pixel moves by ``1 - alpha`` of its difference towards the smoothed pixel before
-    it. The average restarts at holes and at steps of ``delta`` or more. Holes stay holes.
+    backwards. Each pixel is moved towards the smoothed pixel before it, by ``1 - alpha`` of their
+    difference. The average restarts at holes and at steps of ``delta`` or more. Holes stay holes.
 
     Args:
         alpha: weight of the pixel itself, above 0; 1 changes nothing.
@@ -115,10 +115,10 @@ class SpatialFilter:
     def shared(self) -> float:
         """Number of pixels with common noise after filtering, away from edges."""
         reach = min(1000, math.ceil(8 / self.alpha))
-        once = (1 - self.alpha) ** np.abs(np.arange(-reach, reach + 1))
-        kernel = once = once / once.sum()
+        single_pass = (1 - self.alpha) ** np.abs(np.arange(-reach, reach + 1))
+        kernel = single_pass = single_pass / single_pass.sum()
         for _ in range(self.iterations - 1):
-            kernel = np.convolve(kernel, once)
+            kernel = np.convolve(kernel, single_pass)
         return float(1 / np.sum(kernel**2) ** 2)
 
     def _smooth(self, lines: NDArray[np.float32]) -> None:
@@ -144,7 +144,7 @@ class TemporalFilter:
 
     The average of a pixel restarts at a difference of ``delta`` or more: something moved. If half
     of the picture jumps, or the size of the maps changes, all pixels restart. A hole is not
-    averaged. It keeps the earlier average for ``persistence`` maps, unless a pixel beside it
+    averaged. It keeps the earlier average for ``persistence`` maps, unless a neighbouring pixel
     restarts.
 
     Args:
@@ -167,11 +167,11 @@ class TemporalFilter:
         self.delta: float = delta
         self.persistence: int = persistence
         self._average: NDArray[np.float32] | None = None
-        self._holes: NDArray[np.uint8] | None = None  # number of maps since each pixel had a depth
+        self._hole_ages: NDArray[np.uint8] | None = None  # maps since each pixel had a depth
 
     def reset(self) -> None:
         """Restart the average, as after a move of the camera or a long pause."""
-        self._average = self._holes = None
+        self._average = self._hole_ages = None
 
     def __call__(self, depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.float32]:
         """Add a map, and return the average, (H, W) float32; maps of uint16 become metres.
@@ -180,27 +180,27 @@ class TemporalFilter:
             FrameFormatError: the array is no depth map; the average is unchanged.
         """
         new = as_metres(depth, scale)
-        average, holes = self._average, self._holes
-        if average is None or holes is None or average.shape != new.shape:
-            return self._begin(new)
-        seen = new > 0
-        both = seen & (average > 0)
-        step = new - average
-        changed = both & (np.abs(step) >= self.delta)
-        if np.count_nonzero(changed) > MIN_NEW_SCENE_SHARE * np.count_nonzero(both):
-            return self._begin(new)
-        steady = both & ~changed
-        np.add(average, np.float32(self.alpha) * step, out=average, where=steady)
-        np.copyto(average, new, where=seen & ~steady)
-        holes += holes < 255
-        holes[seen] = 0
-        holes[_dilated(changed) & ~seen] = 255
-        average[holes > self.persistence] = 0.0
+        average, hole_ages = self._average, self._hole_ages
+        if average is None or hole_ages is None or average.shape != new.shape:
+            return self._restart(new)
+        has_depth = new > 0
+        in_both = has_depth & (average > 0)
+        difference = new - average
+        has_jumped = in_both & (np.abs(difference) >= self.delta)
+        if np.count_nonzero(has_jumped) > MIN_NEW_SCENE_SHARE * np.count_nonzero(in_both):
+            return self._restart(new)
+        is_steady = in_both & ~has_jumped
+        np.add(average, np.float32(self.alpha) * difference, out=average, where=is_steady)
+        np.copyto(average, new, where=has_depth & ~is_steady)
+        hole_ages += hole_ages < 255
+        hole_ages[has_depth] = 0
+        hole_ages[_dilate(has_jumped) & ~has_depth] = 255
+        average[hole_ages > self.persistence] = 0.0
         return average.copy()
 
-    def _begin(self, new: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _restart(self, new: NDArray[np.float32]) -> NDArray[np.float32]:
         self._average = new.copy()
-        self._holes = np.where(new > 0, 0, 255).astype(np.uint8)
+        self._hole_ages = np.where(new > 0, 0, 255).astype(np.uint8)
         return new
 
 
@@ -219,8 +219,8 @@ def fill_holes(
     Args:
         depth: (H, W), float, or uint16, which becomes metres.
         how: ``"left"``: the next depth to the left; ``"nearest"`` or ``"farthest"``: the least or
-            the largest of the eight neighbours, ring by ring. Beside an edge, where one of two
-            cameras sees nothing, ``"farthest"`` is right.
+            the largest of the eight neighbours, ring by ring. ``"farthest"`` is right near an
+            edge, where one of two cameras sees nothing.
         reach: width, pixels, of the rim of a hole that is filled, 1 to 16.
         scale: metres of a step of uint16.
 
@@ -241,29 +241,29 @@ def fill_holes(
         holes = filled == 0
         if not holes.any():
             break
-        around = _left(filled) if how == "left" else _extreme(filled, how)
-        np.copyto(filled, around, where=holes)
+        neighbours = _shift_right(filled) if how == "left" else _extreme_neighbours(filled, how)
+        np.copyto(filled, neighbours, where=holes)
     return filled
 
 
-def _left(metres: NDArray[np.float32]) -> NDArray[np.float32]:
+def _shift_right(metres: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.pad(metres[:, :-1], ((0, 0), (1, 0)))
 
 
-def _extreme(metres: NDArray[np.float32], how: HoleFill) -> NDArray[np.float32]:
+def _extreme_neighbours(metres: NDArray[np.float32], how: HoleFill) -> NDArray[np.float32]:
     """Return the least or largest depth among each pixel and its neighbours, 0 if all are holes."""
     if how == "farthest":
-        return _widened(metres, np.maximum)
-    least = _widened(np.where(metres > 0, metres, np.float32(np.inf)), np.minimum)
+        return _join_neighbours(metres, np.maximum)
+    least = _join_neighbours(np.where(metres > 0, metres, np.float32(np.inf)), np.minimum)
     return np.where(np.isinf(least), np.float32(0.0), least)
 
 
-def _dilated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return _widened(mask, np.logical_or) if mask.any() else mask
+def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return _join_neighbours(mask, np.logical_or) if mask.any() else mask
 
 
-def _widened(values: NDArray[Any], join: np.ufunc) -> NDArray[Any]:
-    """Return each pixel combined with its eight neighbours."""
+def _join_neighbours(values: NDArray[Any], join: np.ufunc) -> NDArray[Any]:
+    """Return each pixel joined with its eight neighbours by a ufunc, such as ``np.maximum``."""
     for _ in range(2):
         wide = values.copy()
         join(wide[1:], values[:-1], out=wide[1:])

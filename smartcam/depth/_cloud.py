@@ -43,14 +43,14 @@ class Cloud:
 
     def __post_init__(self) -> None:
         """Check the arrays, and make read-only views."""
-        points = _floats(self.points, "points", (None, 3))
+        points = _as_floats(self.points, "points", (None, 3))
         object.__setattr__(self, "points", points)
         count = len(points)
         if self.colours is not None:
-            colours = _bytes(self.colours, "colours", (count, 3))
+            colours = _as_bytes(self.colours, "colours", (count, 3))
             object.__setattr__(self, "colours", colours)
         if self.sigma is not None:
-            sigma = _floats(self.sigma, "sigma", (count,))
+            sigma = _as_floats(self.sigma, "sigma", (count,))
             if count and sigma.min() < 0:
                 raise ConfigurationError(f"sigma: expected 0 or more, got {sigma.min():g}")
             object.__setattr__(self, "sigma", sigma)
@@ -64,7 +64,7 @@ class Cloud:
         return len(self.points)
 
     def __repr__(self) -> str:
-        """Return the number of points as a text, with the names of their other values."""
+        """Return a text with the number of points and the names of their other values."""
         more = [name for name in ("colours", "sigma") if getattr(self, name) is not None]
         return f"<Cloud of {len(self):,} points{''.join(f', {name}' for name in more)}>"
 
@@ -90,26 +90,30 @@ class Cloud:
             ConfigurationError: other shapes, a depth that is below 0 or not finite, a matrix that
                 is no camera matrix, or sizes of depth, colours and sigma that differ.
         """
-        metres = _floats(depth, "depth", (None, None))
+        metres = _as_floats(depth, "depth", (None, None))
         if metres.size and metres.min() < 0:
             raise ConfigurationError(
                 f"depth: expected metres, 0 for none; got {metres.min():g} at its lowest"
             )
-        inverse = _inverse(matrix)
+        inverse = _invert_camera_matrix(matrix)
         rows, columns = np.nonzero(metres)
-        along = metres[rows, columns].astype(np.float64)
+        depths = metres[rows, columns].astype(np.float64)
         pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
         rays = pixels @ inverse.T  # with z = 1
-        picked = spread = None
+        point_colours = point_sigmas = None
         if colours is not None:
-            picture = _picture(colours, metres.shape)
-            picked = picture[rows, columns]
+            picture = _as_colour_picture(colours, metres.shape)
+            point_colours = picture[rows, columns]
         if sigma is not None:
             lengths = np.linalg.norm(rays, axis=1)
             if np.shape(sigma) == metres.shape:
                 sigma = np.where(metres > 0, sigma, 0)  # without depth, sigma is not used
-            spread = _floats(sigma, "sigma", metres.shape)[rows, columns] * lengths
-        return cls(_as(rays * along[:, None]), picked, None if spread is None else _as(spread))
+            point_sigmas = _as_floats(sigma, "sigma", metres.shape)[rows, columns] * lengths
+        return cls(
+            _as_float32(rays * depths[:, None]),
+            point_colours,
+            None if point_sigmas is None else _as_float32(point_sigmas),
+        )
 
     @classmethod
     def joined(cls, clouds: Iterable[Cloud]) -> Self:
@@ -147,7 +151,7 @@ class Cloud:
                 f"transformed: expected a Transform, got {type(pose).__name__}"
             )
         moved = motion.apply(self.points.astype(np.float64))
-        return type(self)(_as(moved), self.colours, self.sigma)
+        return type(self)(_as_float32(moved), self.colours, self.sigma)
 
     def select(self, index: NDArray[Any]) -> Self:
         """Return the points of a mask (N,), or of indices in their order."""
@@ -158,13 +162,13 @@ class Cloud:
         )
 
 
-def _as(values: NDArray[Any]) -> NDArray[np.float32]:
+def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
     """Return values as float32; too large values become infinite, which a cloud refuses."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 
 
-def _shape(values: NDArray[Any], label: str, shape: tuple[int | None, ...]) -> None:
+def _check_shape(values: NDArray[Any], label: str, shape: tuple[int | None, ...]) -> None:
     fits = len(values.shape) == len(shape) and all(
         want is None or count == want for count, want in zip(values.shape, shape, strict=True)
     )
@@ -173,12 +177,12 @@ def _shape(values: NDArray[Any], label: str, shape: tuple[int | None, ...]) -> N
         raise ConfigurationError(f"{label}: expected the shape ({wanted}), got {values.shape}")
 
 
-def _floats(given: ArrayLike, label: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+def _as_floats(given: ArrayLike, label: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
     """Return a read-only view as finite float32; raise ConfigurationError otherwise."""
-    values = _array(given, label)
+    values = _as_array(given, label)
     if values.dtype.kind not in _NUMBERS:
         raise ConfigurationError(f"{label}: expected numbers, got {values.dtype}")
-    _shape(values, label, shape)
+    _check_shape(values, label, shape)
     with np.errstate(over="ignore"):
         floats = np.ascontiguousarray(values, np.float32).view()
     if not np.isfinite(floats).all():
@@ -190,41 +194,41 @@ def _floats(given: ArrayLike, label: str, shape: tuple[int | None, ...]) -> NDAr
     return floats
 
 
-def _bytes(given: ArrayLike, label: str, shape: tuple[int | None, ...]) -> NDArray[np.uint8]:
-    values = _array(given, label)
+def _as_bytes(given: ArrayLike, label: str, shape: tuple[int | None, ...]) -> NDArray[np.uint8]:
+    values = _as_array(given, label)
     if values.dtype != np.uint8:
         raise ConfigurationError(f"{label}: expected uint8, got {values.dtype}")
-    _shape(values, label, shape)
+    _check_shape(values, label, shape)
     view = np.ascontiguousarray(values).view()
     view.flags.writeable = False
     return view
 
 
-def _array(given: ArrayLike, label: str) -> NDArray[Any]:
+def _as_array(given: ArrayLike, label: str) -> NDArray[Any]:
     try:
         return np.asarray(given)
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise ConfigurationError(f"{label}: expected an array, got {type(given).__name__}") from exc
 
 
-def _picture(given: ArrayLike, size: tuple[int, ...]) -> NDArray[np.uint8]:
+def _as_colour_picture(given: ArrayLike, size: tuple[int, ...]) -> NDArray[np.uint8]:
     """Return a colour picture (H, W, 3) made of a colour or grey picture."""
-    values = _array(given, "colours")
+    values = _as_array(given, "colours")
     if values.ndim == 2:
-        grey = _bytes(values, "colours", size)
+        grey = _as_bytes(values, "colours", size)
         return np.broadcast_to(grey[..., None], (*size, 3))
-    return _bytes(values, "colours", (*size, 3))
+    return _as_bytes(values, "colours", (*size, 3))
 
 
-def _inverse(given: ArrayLike) -> NDArray[np.float64]:
+def _invert_camera_matrix(given: ArrayLike) -> NDArray[np.float64]:
     """Return the inverse of a camera matrix, which turns pixels into rays with z = 1."""
-    matrix = _array(given, "matrix")
-    _shape(matrix, "matrix", (3, 3))
+    matrix = _as_array(given, "matrix")
+    _check_shape(matrix, "matrix", (3, 3))
     if matrix.dtype.kind not in _NUMBERS or not np.isfinite(matrix).all():
         raise ConfigurationError(f"matrix: expected finite numbers, got {matrix.tolist()}")
-    low = np.array([[False] * 3, [True, False, False], [True, True, False]])
-    upper = not matrix[low].any() and matrix[2, 2] == 1
-    if not upper or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+    below_diagonal = np.array([[False] * 3, [True, False, False], [True, True, False]])
+    is_triangular = not matrix[below_diagonal].any() and matrix[2, 2] == 1
+    if not is_triangular or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise ConfigurationError(
             "matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0, "
             f"got {matrix.tolist()}"

@@ -70,12 +70,12 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
     :func:`save_cloud` name the unit in a comment. For any other file give ``unit``: ``m``, ``cm``,
     ``mm`` or ``inch``.
 
-    PLY is read as text and as bytes of either order, PCD as text, as bytes and compressed. Points
-    with a coordinate that is not finite, as in organised files, are left out. Colours are
+    PLY files may be text, or bytes in either order; PCD files may be text, bytes, or compressed.
+    Points with a coordinate that is not finite, as in organised files, are left out. Colours are
     ``red``, ``green``, ``blue``, or ``diffuse_red`` and so on, or ``r``, ``g``, ``b``, or PCL's
     ``rgb``: bytes, 16 bits, other numbers of 0 to 255, or of 0 to 1. ``sigma`` is in the same unit.
-    Properties of other names are skipped, and so is a PCD's viewpoint. Large files take seconds: do
-    not read them in a coroutine, but in a thread.
+    Other properties are skipped, as is a PCD file's viewpoint. Large files take seconds: read them
+    in a thread, not in a coroutine.
 
     Raises:
         ConfigurationError: the suffix or the unit is unknown.
@@ -84,28 +84,29 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
             coordinates are so large that float32 would round them by a millimetre.
     """
     path = check_path(path, "path", "cloud")
-    form = _format(path)
+    cloud_format = _find_format(path)
     if unit is not None and unit not in METRES_PER_UNIT:
         raise ConfigurationError(
             f"unit: expected one of {', '.join(METRES_PER_UNIT)}, got {shown(unit)}"
         )
     try:
         with path.open("rb") as stream:
-            status = os.fstat(stream.fileno())  # read() would allocate its whole argument
-            regular = stat.S_ISREG(status.st_mode) and status.st_size <= MAX_FILE_BYTES
-            data = stream.read(status.st_size if regular else MAX_FILE_BYTES + 1)
+            # read() allocates as many bytes as it is asked for, so the size is checked before
+            status = os.fstat(stream.fileno())
+            is_readable_whole = stat.S_ISREG(status.st_mode) and status.st_size <= MAX_FILE_BYTES
+            data = stream.read(status.st_size if is_readable_whole else MAX_FILE_BYTES + 1)
     except OSError as exc:
         reason = exc.strerror or exc
         raise FrameSourceError(f"{path}: cannot be read: {reason}", source=str(path)) from exc
     try:
         if len(data) > MAX_FILE_BYTES:
             raise BadTableError(f"a file of {MAX_FILE_BYTES:,} bytes at most", "more")
-        return _cloud(form.read(data), METRES_PER_UNIT[unit or _unit_comment(data)])
+        return _make_cloud(cloud_format.read(data), METRES_PER_UNIT[unit or _read_unit(data)])
     except BadTableError as exc:
         raise FrameFormatError(f"{path}: {exc}", source=str(path)) from exc
 
 
-def _unit_comment(data: bytes) -> str:
+def _read_unit(data: bytes) -> str:
     """Return the unit from the header's comment; raise BadTableError if it is missing."""
     match = UNIT_COMMENT.search(data[:MAX_HEAD_BYTES])
     if match is None:
@@ -127,14 +128,14 @@ def save_cloud(path: str | os.PathLike[str], cloud: Cloud, *, text: bool = False
         ConfigurationError: the suffix is unknown, or the file cannot be written.
     """
     path = check_path(path, "path", "cloud")
-    data = _format(path).write(cloud, text)
+    data = _find_format(path).write(cloud, text)
     try:
         replace_file(path, data)
     except OSError as exc:
         raise ConfigurationError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
 
 
-def _format(path: Path) -> _CloudFormat:
+def _find_format(path: Path) -> _CloudFormat:
     try:
         return FORMATS[path.suffix.lower()]
     except KeyError:
@@ -143,10 +144,10 @@ def _format(path: Path) -> _CloudFormat:
         ) from None
 
 
-def _cloud(columns: Mapping[str, NDArray[Any]], metre: float) -> Cloud:
-    """Return a cloud made of a file's columns; raise BadTableError if they do not fit.
+def _make_cloud(columns: Mapping[str, NDArray[Any]], unit_metres: float) -> Cloud:
+    """Return the cloud of a file's columns; raise BadTableError if the columns are not valid.
 
-    ``metre``: the file's unit in metres.
+    ``unit_metres``: metres of the file's unit.
     """
     missing = [name for name in "xyz" if name not in columns]
     if missing:
@@ -156,29 +157,33 @@ def _cloud(columns: Mapping[str, NDArray[Any]], metre: float) -> Cloud:
     for column in coordinates[1:]:
         valid = valid & np.isfinite(column)
     points = np.empty((int(valid.sum()), 3), np.float32)
-    for place, column in enumerate(coordinates):
-        values = column[valid] if metre == 1.0 else column[valid] * metre
+    for axis, column in enumerate(coordinates):
+        values = column[valid] if unit_metres == 1.0 else column[valid] * unit_metres
         with np.errstate(over="ignore"):
-            points[:, place] = values
-        if values.dtype == np.float64 and values.size and _loses(values, points[:, place]):
+            points[:, axis] = values
+        if values.dtype == np.float64 and values.size and _rounds_too_much(values, points[:, axis]):
             raise BadTableError(
                 "coordinates that float32 keeps to a millimetre",
-                f"{'xyz'[place]} up to {np.abs(values).max():g} m: move the origin",
+                f"{'xyz'[axis]} up to {np.abs(values).max():g} m: move the origin",
             )
     try:
-        sigma = _sigma(columns, valid)
-        scaled = sigma if sigma is None or metre == 1.0 else (metre * sigma).astype(sigma.dtype)
-        return Cloud(points, _colours(columns, valid), scaled)
+        sigma = _find_sigma(columns, valid)
+        scaled = (
+            sigma
+            if sigma is None or unit_metres == 1.0
+            else (unit_metres * sigma).astype(sigma.dtype)
+        )
+        return Cloud(points, _find_colours(columns, valid), scaled)
     except ConfigurationError as exc:
         raise BadTableError("a cloud", str(exc)) from exc
 
 
-def _loses(exact: NDArray[Any], stored: NDArray[Any]) -> bool:
+def _rounds_too_much(exact: NDArray[Any], stored: NDArray[Any]) -> bool:
     with np.errstate(invalid="ignore"):
         return not float(np.abs(exact - stored.astype(np.float64)).max()) <= MAX_ROUNDING_METRES
 
 
-def _colours(
+def _find_colours(
     columns: Mapping[str, NDArray[Any]], valid: NDArray[np.bool_]
 ) -> NDArray[np.uint8] | None:
     names = next(
@@ -206,7 +211,7 @@ def _colours(
     return levels
 
 
-def _sigma(
+def _find_sigma(
     columns: Mapping[str, NDArray[Any]], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32] | None:
     if "sigma" not in columns:

@@ -31,7 +31,7 @@ MIN_COLOURFUL: Final = 40
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColourRange:
-    """A range of colours in HSV, in OpenCV's units of 8 bits; both ends are part of it.
+    """A range of colours in HSV, in OpenCV's units of 8 bits; both ends belong to the range.
 
     Attributes:
         hue: from, to, each 0 to 179: half degrees on the circle of colours: 0 red, 30 yellow, 60
@@ -55,10 +55,10 @@ class ColourRange:
             given: Any = getattr(self, name)
             try:
                 low, high = given
-                fits = all(type(level) is int and 0 <= level <= most for level in (low, high))
+                is_valid = all(type(level) is int and 0 <= level <= most for level in (low, high))
             except (TypeError, ValueError, ArithmeticError):
-                low, high, fits = 0, 0, False
-            if not fits or (low > high and name != "hue"):
+                low, high, is_valid = 0, 0, False
+            if not is_valid or (low > high and name != "hue"):
                 raise ConfigurationError(
                     f"ColourRange: {name}: expected (from, to) of whole numbers 0 to {most}, "
                     f"got {shown(given)}"
@@ -82,12 +82,10 @@ class ColourRange:
         """Return the mask (H, W) of the pixels in the range, from HSV (H, W, 3) of uint8."""
         low, high = self.hue
         if low <= high:
-            chosen = self._between(picture, low, high)
+            mask = self._between(picture, low, high)
         else:
-            chosen = self._between(picture, low, MAX_LEVELS["hue"]) | self._between(
-                picture, 0, high
-            )
-        return chosen > 0
+            mask = self._between(picture, low, MAX_LEVELS["hue"]) | self._between(picture, 0, high)
+        return mask > 0
 
     def _between(self, picture: NDArray[np.uint8], low: int, high: int) -> NDArray[np.uint8]:
         lows, highs = zip((low, high), self.saturation, self.value, strict=True)
@@ -148,9 +146,9 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
         raise ConfigurationError(
             f"ColourRange: expected a pixel within {width}x{height}, got ({x}, {y})"
         )
-    around = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
-    hues, saturations, values = around.reshape(-1, 3).astype(int).T
-    saturation, value = _spread(saturations, margin), _spread(values, margin)
+    neighbours = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
+    hues, saturations, values = neighbours.reshape(-1, 3).astype(int).T
+    saturation, value = _range_of(saturations, margin), _range_of(values, margin)
     if np.median(values) < MIN_COLOURFUL:
         return ColourRange(value=(0, value[1]))
     if np.median(saturations) < MIN_COLOURFUL:
@@ -166,23 +164,23 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
     return ColourRange(hue=hue, saturation=saturation, value=value)
 
 
-def _spread(levels: NDArray[Any], margin: int) -> tuple[int, int]:
+def _range_of(levels: NDArray[Any], margin: int) -> tuple[int, int]:
     low, high = np.percentile(levels, (5, 95))
     return max(0, round(float(low)) - margin), min(255, round(float(high)) + margin)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ColourRegion:
-    """A connected region of a mask; pixels count from the middle of the upper left one.
+    """A connected region of a mask; the middle of the upper left pixel is at (0, 0).
 
     Attributes:
-        centre: x, y of the middle of its pixels.
+        centre: x, y of the mean of the region's pixels.
         area: pixels.
-        sides: the longer and the shorter side of the smallest rectangle around it, pixels.
+        sides: the longer and the shorter side of the smallest rectangle around the region, pixels.
         corners: corners of this rectangle, (4, 2).
         orientation: angle of the region's longer axis, radians, above -pi/2 up to pi/2, from x
-            (right) towards y (down). It is the axis of least inertia, which noise at the rim
-            changes less than the rectangle. For squares and circles it has no meaning.
+            (right) towards y (down). The longer axis is the axis of least inertia; noise at the rim
+            changes it less than the rectangle. For squares and circles it has no meaning.
         mask: pixels of the region, (H, W) of bool.
     """
 
@@ -226,7 +224,7 @@ def find_regions(
         mask: (H, W) of bool.
         area: least and largest area, pixels.
         ratio: least and largest ratio of the longer to the shorter side.
-        fullness: least share of its rectangle that a region fills, 0 to 1.
+        fullness: least share of the rectangle around a region that the region fills, 0 to 1.
         whole: whether to leave out regions that touch the picture's rim, since they may be cut.
         most: number of regions at most; the largest are returned.
 
@@ -252,12 +250,12 @@ def find_regions(
     regions: list[ColourRegion] = []
     for label in sorted(wanted.tolist(), key=lambda index: -int(rows[index, cv2.CC_STAT_AREA])):
         left, top, width, height = (int(number) for number in rows[label, :4])
-        cut = (
+        touches_rim = (
             min(left, top) == 0 or left + width == given.shape[1] or top + height == given.shape[0]
         )
-        if whole and cut:
+        if whole and touches_rim:
             continue
-        region = _region(labels, label, np.s_[top : top + height, left : left + width])
+        region = _make_region(labels, label, np.s_[top : top + height, left : left + width])
         if ratio[0] <= region.ratio <= ratio[1] and region.fullness >= fullness:
             regions.append(region)
         if len(regions) == most:
@@ -265,24 +263,27 @@ def find_regions(
     return regions
 
 
-def _region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> ColourRegion:
+def _make_region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> ColourRegion:
     cv2 = load("cv2")
     pixels = labels[box] == label
     ys, xs = np.nonzero(pixels)
     points = np.column_stack((xs + box[1].start, ys + box[0].start))
     middle = points.mean(axis=0)
     x, y = (points - middle).T
-    turned = 0.5 * math.atan2(2 * float(np.mean(x * y)), float(np.mean(x * x) - np.mean(y * y)))
+    orientation = 0.5 * math.atan2(
+        2 * float(np.mean(x * y)), float(np.mean(x * x) - np.mean(y * y))
+    )
     hull = cv2.convexHull(points.astype(np.int32))
-    around = cv2.minAreaRect(hull)
-    (width, height), angle = (side + 1 for side in around[1]), around[2]  # from rim to rim
+    rectangle = cv2.minAreaRect(hull)
+    # sizes between the rims, not the centres, of the outer pixels
+    (width, height), angle = (side + 1 for side in rectangle[1]), rectangle[2]
     mask = np.zeros(labels.shape, bool)
     mask[box] = pixels
     return ColourRegion(
         centre=(float(middle[0]), float(middle[1])),
         area=len(points),
         sides=(max(width, height), min(width, height)),
-        corners=np.asarray(cv2.boxPoints((around[0], (width, height), angle)), float),
-        orientation=turned,
+        corners=np.asarray(cv2.boxPoints((rectangle[0], (width, height), angle)), float),
+        orientation=orientation,
         mask=mask,
     )

@@ -1,4 +1,4 @@
-"""Filter clouds by place, by number of neighbours, or to one point per voxel."""
+"""Filter clouds: by position, by number of neighbours, or to one point per voxel."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_NEIGHBOURS: Final = 1000
 
 @takes(cloud=of_class("Cloud"), axis=check_text, low=a_number, high=a_number)
 def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = math.inf) -> Cloud:
-    """Return the points with ``low <= coordinate <= high``, in metres.
+    """Return the points whose coordinate on an axis is from ``low`` to ``high``, metres.
 
     Raises:
         ConfigurationError: the axis is none of x, y, z, or the range is not valid.
@@ -39,9 +39,9 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
         raise ConfigurationError(
             f"pass_through: expected low <= high, got {shown(low)} and {shown(high)}"
         )
-    along = cloud.points[:, AXES.index(axis)]
-    ends = _as_float32((low, high))
-    return cloud.select((along >= ends[0]) & (along <= ends[1]))
+    coordinates = cloud.points[:, AXES.index(axis)]
+    bounds = _as_float32((low, high))
+    return cloud.select((coordinates >= bounds[0]) & (coordinates <= bounds[1]))
 
 
 @takes(cloud=of_class("Cloud"), low=numbers, high=numbers)
@@ -56,20 +56,20 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
     corners = [np.asarray(corner, np.float64) for corner in (low, high)]
     if any(corner.shape != (3,) for corner in corners) or not (corners[0] <= corners[1]).all():
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
-    ends = _as_float32(corners)
-    inside = np.all((cloud.points >= ends[0]) & (cloud.points <= ends[1]), axis=1)
+    bounds = _as_float32(corners)
+    inside = np.all((cloud.points >= bounds[0]) & (cloud.points <= bounds[1]), axis=1)
     return cloud.select(np.asarray(inside))
 
 
-def _as_float32(ends: ArrayLike) -> NDArray[np.float32]:
+def _as_float32(bounds: ArrayLike) -> NDArray[np.float32]:
     """Return bounds as float32, like points: a bound of 0.1 includes a point at 0.1."""
     with np.errstate(over="ignore"):  # a bound beyond float32 becomes infinite
-        return np.asarray(ends, np.float64).astype(np.float32)
+        return np.asarray(bounds, np.float64).astype(np.float32)
 
 
 @takes(cloud=of_class("Cloud"), ratio=a_number)
 def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
-    """Return the points without points that are unusually far from their neighbours.
+    """Return the cloud without the points that are unusually far from their neighbours.
 
     A point stays if its mean distance to its ``neighbours`` nearest points is at most ``ratio``
     standard deviations above the mean of these distances. An empty cloud is returned as it is.
@@ -91,12 +91,16 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
             f"remove_statistical_outliers: expected more than {neighbours} points, got {len(cloud)}"
         )
     tree = load("scipy.spatial").cKDTree(cloud.points)
-    means = np.empty(len(cloud))
-    for part in _parts(len(cloud)):
-        # The nearest point is the point itself, or another at the same place.
-        distances, _ = tree.query(cloud.points[part], k=neighbours + 1)
-        means[part] = distances[:, 1:].mean(axis=1)
-    return cloud.select(means <= means.mean() + ratio * means.std(ddof=1 if len(means) > 1 else 0))
+    mean_distances = np.empty(len(cloud))
+    for chunk in _chunks(len(cloud)):
+        # The nearest point is the point itself, or another point at the same position.
+        distances, _ = tree.query(cloud.points[chunk], k=neighbours + 1)
+        mean_distances[chunk] = distances[:, 1:].mean(axis=1)
+    return cloud.select(
+        mean_distances
+        <= mean_distances.mean()
+        + ratio * mean_distances.std(ddof=1 if len(mean_distances) > 1 else 0)
+    )
 
 
 @takes(cloud=of_class("Cloud"), radius=a_number)
@@ -113,10 +117,10 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
         return cloud.select(np.zeros(len(cloud), bool))
     tree = load("scipy.spatial").cKDTree(cloud.points)
     mask = np.empty(len(cloud), bool)
-    for part in _parts(len(cloud)):
+    for chunk in _chunks(len(cloud)):
         # It is enough to know the distance to the last of the required neighbours.
-        distances, _ = tree.query(cloud.points[part], k=[neighbours + 1])
-        mask[part] = distances[:, 0] <= radius
+        distances, _ = tree.query(cloud.points[chunk], k=[neighbours + 1])
+        mask[chunk] = distances[:, 0] <= radius
     return cloud.select(mask)
 
 
@@ -125,8 +129,8 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
     """Return one point per voxel: the mean of its points, with their mean colour.
 
     Voxels are cubes of ``size`` metres, with a corner at the origin, so the grid is the same for
-    every cloud. They are ordered by x, then y, then z. A voxel's sigma is the RMS of its points'
-    sigmas: errors of neighbouring depths are alike, so averaging hardly reduces them.
+    every cloud. The points are ordered by x, then y, then z. A voxel's sigma is the RMS of its
+    points' sigmas: neighbouring depths have similar errors, which averaging hardly reduces.
 
     Raises:
         ConfigurationError: the size is not above 0, or so small that the voxels cannot be counted.
@@ -134,31 +138,31 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
     _check_length(size, "voxel_grid: size")
     if not len(cloud):
         return cloud
-    keys = _voxels(cloud, size)
-    order = np.argsort(keys)  # the order within a voxel does not matter: sums are float64
-    keys = keys[order]
-    first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    counts = np.diff(np.append(first, len(keys)))
+    voxels = _voxel_indices(cloud, size)
+    order = np.argsort(voxels)  # any order within a voxel will do, since the sums are float64
+    voxels = voxels[order]
+    starts = np.flatnonzero(np.concatenate([[True], voxels[1:] != voxels[:-1]]))
+    counts = np.diff(np.append(starts, len(voxels)))
 
     def means(values: NDArray[Any]) -> NDArray[np.float64]:
-        sums: NDArray[np.float64] = np.add.reduceat(values[order].astype(np.float64), first)
+        sums: NDArray[np.float64] = np.add.reduceat(values[order].astype(np.float64), starts)
         return sums / counts
 
-    def columns(values: NDArray[Any]) -> NDArray[np.float64]:
+    def column_means(values: NDArray[Any]) -> NDArray[np.float64]:
         return np.stack([means(column) for column in values.T], axis=1)
 
     colours = cloud.colours
     return Cloud(
-        columns(cloud.points).astype(np.float32),
-        None if colours is None else np.rint(columns(colours)).astype(np.uint8),
+        column_means(cloud.points).astype(np.float32),
+        None if colours is None else np.rint(column_means(colours)).astype(np.uint8),
         None
         if cloud.sigma is None
         else np.sqrt(means(cloud.sigma.astype(np.float64) ** 2)).astype(np.float32),
     )
 
 
-def _voxels(cloud: Cloud, size: float) -> NDArray[np.int64]:
-    """Return the number of the voxel of each point."""
+def _voxel_indices(cloud: Cloud, size: float) -> NDArray[np.int64]:
+    """Return the index of each point's voxel, which grows with x, then y, then z."""
     low = np.floor(cloud.points.min(axis=0).astype(np.float64) / size)
     high = np.floor(cloud.points.max(axis=0).astype(np.float64) / size)
     spans = high - low + 1
@@ -168,15 +172,15 @@ def _voxels(cloud: Cloud, size: float) -> NDArray[np.int64]:
             f"voxel_grid: expected fewer than 2**62 voxels, got more: voxels of {size:g} m in a "
             f"cloud of {extent} m"
         )
-    numbers = np.zeros(len(cloud), np.int64)
+    indices = np.zeros(len(cloud), np.int64)
     for axis, span in enumerate(spans.astype(np.int64)):
-        numbers *= span
+        indices *= span
         column = cloud.points[:, axis].astype(np.float64)
-        numbers += (np.floor(column / size) - low[axis]).astype(np.int64)
-    return numbers
+        indices += (np.floor(column / size) - low[axis]).astype(np.int64)
+    return indices
 
 
-def _parts(count: int) -> Iterator[slice]:
+def _chunks(count: int) -> Iterator[slice]:
     for start in range(0, count, POINTS_AT_A_TIME):
         yield slice(start, min(start + POINTS_AT_A_TIME, count))
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ReaderDriver(FrameDriver):
-    """Driver that passes on the frames of a reader, which it enters and leaves."""
+    """Driver that passes on the frames of a reader; it enters and leaves this reader."""
 
     times_frames: ClassVar[bool] = True  # the reader's source sets the times
 
@@ -24,7 +24,7 @@ class ReaderDriver(FrameDriver):
         super().__init__(FrameAddress.parse("synthetic://"))
         self._frames, self._name = frames, name
         self._reader: FrameReader | None = None
-        self._pump: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[None] | None = None
 
     @property
     def name(self) -> str:
@@ -47,16 +47,16 @@ class ReaderDriver(FrameDriver):
         """Start passing on the reader's frames."""
         if self._reader is None:
             raise FrameSourceError(f"{self._name}: the reader is closed", source=self._name)
-        self._pump = asyncio.create_task(
-            _hand_on(self._reader, sink), name=f"frames of {self._name} for depth"
+        self._task = asyncio.create_task(
+            _pass_frames(self._reader, sink), name=f"frames of {self._name} for depth"
         )
 
     async def stop(self) -> None:
         """Stop passing on frames."""
-        pump, self._pump = self._pump, None
-        if pump is not None:
-            pump.cancel()
-            await asyncio.wait([pump])
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
 
     async def close(self) -> None:
         """Leave the reader."""
@@ -66,13 +66,13 @@ class ReaderDriver(FrameDriver):
             await self._frames.__aexit__(None, None, None)
 
 
-async def _hand_on(reader: FrameReader, sink: FrameSink) -> None:
+async def _pass_frames(reader: FrameReader, sink: FrameSink) -> None:
     while True:
         try:
             async for frame in reader:
                 sink.frame(frame)
         except FrameTimeoutError:
-            continue  # iterating over the pair has its own deadline
+            continue  # the iterator over pairs has a timeout of its own
         except FrameSourceError as error:
             sink.ended(error)
         else:

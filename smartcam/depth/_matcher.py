@@ -12,7 +12,7 @@ from smartcam._argument_checks import a_number, an_integer, or_none, takes
 from smartcam._arguments import check_text, shown
 from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
-from smartcam.depth._subpixel import refined
+from smartcam.depth._subpixel import refine_disparities
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 if TYPE_CHECKING:
@@ -53,19 +53,20 @@ class _WholeParameter(NamedTuple):
     default: int
     low: int
     high: int
-    every: int = 1  # the value is ``low`` plus a multiple of this
+    multiple: int = 1  # values are ``low`` plus a multiple of this number
 
     def __str__(self) -> str:
-        step = {1: "", 2: ", odd" if self.low % 2 else ", even"}
-        return f"{self.low} to {self.high}{step.get(self.every, f', a multiple of {self.every}')}"
+        other_step = f", a multiple of {self.multiple}"
+        step = {1: "", 2: ", odd" if self.low % 2 else ", even"}.get(self.multiple, other_step)
+        return f"{self.low} to {self.high}{step}"
 
     def check(self, value: object) -> int | None:
         """Return a value for OpenCV; None if it is not allowed."""
         if not isinstance(value, int | np.integer) or isinstance(value, bool):
             return None
         number = int(value)
-        fits = self.low <= number <= self.high and (number - self.low) % self.every == 0
-        return number if fits else None
+        is_allowed = self.low <= number <= self.high and (number - self.low) % self.multiple == 0
+        return number if is_allowed else None
 
 
 class _WordParameter(NamedTuple):
@@ -89,7 +90,7 @@ class _WordParameter(NamedTuple):
         return int(getattr(load("cv2"), self.prefix + str(value).upper()))
 
 
-_BOTH: Final[dict[str, _WholeParameter | _WordParameter]] = {
+_COMMON_PARAMETERS: Final[dict[str, _WholeParameter | _WordParameter]] = {
     "min_disparity": _WholeParameter(0, -MAX_DISPARITIES, MAX_DISPARITIES),
     "num_disparities": _WholeParameter(128, 16, MAX_DISPARITIES, 16),
     "speckle_window_size": _WholeParameter(100, 0, 1_000_000),
@@ -98,7 +99,7 @@ _BOTH: Final[dict[str, _WholeParameter | _WordParameter]] = {
 
 _PARAMETERS: Final[dict[str, dict[str, _WholeParameter | _WordParameter]]] = {
     "sgbm": {
-        **_BOTH,
+        **_COMMON_PARAMETERS,
         "block_size": _WholeParameter(3, 1, 51, 2),
         "P1": _WholeParameter(0, 0, 1_000_000),
         "P2": _WholeParameter(0, 0, 1_000_000),
@@ -107,7 +108,7 @@ _PARAMETERS: Final[dict[str, dict[str, _WholeParameter | _WordParameter]]] = {
         "mode": _WordParameter(("sgbm_3way", "sgbm", "hh", "hh4"), "StereoSGBM_MODE_"),
     },
     "bm": {
-        **_BOTH,
+        **_COMMON_PARAMETERS,
         "block_size": _WholeParameter(15, 5, 255, 2),
         "uniqueness_ratio": _WholeParameter(5, 0, 100),
         "pre_filter_type": _WordParameter(("xsobel", "normalized_response"), "StereoBM_PREFILTER_"),
@@ -128,10 +129,10 @@ class StereoMatcher:
         disparity = matcher(left, right)
         disparity.pixels, disparity.sigma
 
-    OpenCV's matcher runs from left to right and from right to left; disparities on which both do
-    not agree, and speckles, are dropped. The rest are refined by least squares in a window, which
-    also estimates their sigma: see ``docs/depth.md``. Points near the left border, which OpenCV
-    alone leaves out, are matched, too. Colours are converted to grey.
+    OpenCV's matcher runs from left to right and from right to left; disparities on which the two
+    directions do not agree, and speckles, are dropped. The other disparities are refined by least
+    squares in a window, which also estimates their sigma: see ``docs/depth.md``. Points near the
+    left border, which OpenCV by itself leaves out, are matched, too. Colours are converted to grey.
 
     Args:
         algorithm: ``sgbm``, semi-global, or ``bm``, blocks: three times faster, with more holes.
@@ -141,8 +142,8 @@ class StereoMatcher:
         wls: lambda and sigma of OpenCV's weighted least squares filter, such as (8000, 1.5), which
             smooths disparities between edges and fills holes; None: no filter.
         parameters: parameters of OpenCV's matcher, by its names with underscores:
-            ``num_disparities``, ``block_size``, ``P1``, ``uniqueness_ratio``, ``mode="hh"``. ``P1``
-            and ``P2`` of 0 are 8 and 32 times ``block_size`` squared.
+            ``num_disparities``, ``block_size``, ``P1``, ``uniqueness_ratio``, ``mode="hh"``. 0 for
+            ``P1`` or ``P2`` means 8 or 32 times ``block_size`` squared.
 
     Raises:
         ConfigurationError: the algorithm, parameter or value is unknown, or ``wls`` is given but
@@ -165,7 +166,7 @@ class StereoMatcher:
                 f"StereoMatcher: expected {' or '.join(_PARAMETERS)}, got {shown(algorithm)}"
             )
         self.algorithm = algorithm
-        self.parameters: Mapping[str, Value] = _merged(algorithm, parameters)
+        self.parameters: Mapping[str, Value] = _merge_parameters(algorithm, parameters)
         if left_right is not None and not 0 <= left_right <= MAX_DISPARITIES:
             raise _argument_error(
                 "left_right", f"0 to {MAX_DISPARITIES} pixels or None", left_right
@@ -173,17 +174,17 @@ class StereoMatcher:
         if refine not in WINDOWS:
             raise _argument_error("refine", f"one of {WINDOWS}", refine)
         self._left_right, self._refine = left_right, refine
-        self._smooth = None if wls is None else _wls(wls)
-        numbers = {
+        self._wls_filter = None if wls is None else _make_wls_filter(wls)
+        opencv_values = {
             name: _PARAMETERS[algorithm][name].check(value)
             for name, value in self.parameters.items()
         }
-        # OpenCV's own check compares only its first guesses, in whole pixels; -1 does not turn it
-        # off for SGBM
-        numbers["disp12_max_diff"] = (
+        # OpenCV's own check compares only its first estimates, in whole pixels. -1 does not switch
+        # this check off for SGBM.
+        opencv_values["disp12_max_diff"] = (
             MAX_DISPARITIES if left_right is None else math.ceil(left_right)
         )
-        self._compute = _ALGORITHMS[algorithm](numbers)
+        self._compute = _ALGORITHMS[algorithm](opencv_values)
         self._lock = threading.Lock()  # OpenCV's matchers reuse their buffers
 
     @property
@@ -204,7 +205,7 @@ class StereoMatcher:
         Raises:
             FrameFormatError: the pictures have other shapes or types, or are too small.
         """
-        first, second = _grey(left, "left"), _grey(right, "right")
+        first, second = _as_grey(left, "left"), _as_grey(right, "right")
         window = int(self.parameters["block_size"])
         if first.shape != second.shape or min(first.shape) < window:
             raise FrameFormatError(
@@ -213,18 +214,22 @@ class StereoMatcher:
             )
         with self._lock:
             disparity = self._match(first, second)
-        return Disparity(*refined(first, second, disparity, self._refine))
+        return Disparity(*refine_disparities(first, second, disparity, self._refine))
 
     def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return OpenCV's disparities, NaN for pixels without one."""
         cv2 = load("cv2")
         invalid = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
-        sixteenths = self._padded(left, right)
-        if self._smooth is not None:
-            sixteenths = self._smooth(sixteenths, left, np.negative(self._reverse(left, right)))
+        sixteenths = self._match_padded(left, right)
+        if self._wls_filter is not None:
+            sixteenths = self._wls_filter(
+                sixteenths, left, np.negative(self._match_reverse(left, right))
+            )
         elif self._left_right is not None:
-            apart = _disagreement(sixteenths, self._reverse(left, right), invalid)
-            sixteenths[~(apart <= self._left_right * SUBPIXELS)] = invalid
+            difference = _direction_difference(
+                sixteenths, self._match_reverse(left, right), invalid
+            )
+            sixteenths[~(difference <= self._left_right * SUBPIXELS)] = invalid
         column = np.arange(left.shape[1])
         right_column = column - np.round(sixteenths / SUBPIXELS)
         sixteenths[(right_column < 0) | (right_column >= left.shape[1])] = invalid
@@ -236,12 +241,14 @@ class StereoMatcher:
             sixteenths > invalid, sixteenths / np.float32(SUBPIXELS), np.float32(np.nan)
         )
 
-    def _reverse(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+    def _match_reverse(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8]
+    ) -> NDArray[np.int16]:
         """Return disparities from right to left in 1/16 pixel, with the sign of left to right."""
         # the mirrored right picture is the left picture of a mirrored pair
-        return np.ascontiguousarray(self._padded(right[:, ::-1], left[:, ::-1])[:, ::-1])
+        return np.ascontiguousarray(self._match_padded(right[:, ::-1], left[:, ::-1])[:, ::-1])
 
-    def _padded(self, left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.int16]:
+    def _match_padded(self, left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.int16]:
         """Return disparities in 1/16 pixel, also near borders, where OpenCV leaves them out."""
         cv2 = load("cv2")
         before = max(0, self.max_disparity + 1)
@@ -257,7 +264,7 @@ class StereoMatcher:
         return np.ascontiguousarray(computed)
 
 
-def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
+def _merge_parameters(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
     """Return all parameters of an algorithm."""
     known = _PARAMETERS[algorithm]
     for name, value in given.items():
@@ -282,7 +289,7 @@ def _argument_error(label: str, expected: str, actual: object) -> ConfigurationE
     return ConfigurationError(f"StereoMatcher: {label}: expected {expected}, got {shown(actual)}")
 
 
-def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+def _as_grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
     shape = picture.shape
     if picture.dtype != np.uint8 or not (len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)):
         raise FrameFormatError(
@@ -294,23 +301,23 @@ def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def _disagreement(
+def _direction_difference(
     forward: NDArray[np.int16], backward: NDArray[np.int16], invalid: int
 ) -> NDArray[np.float32]:
-    """Return the differences between disparities of both directions at the same point.
+    """Return the differences, in 1/16 pixel, between both directions' disparities of a point.
 
-    They are in 1/16 pixel, and infinite if a disparity is missing or the point is outside of the
-    right picture.
+    A difference is infinite if a disparity is missing, or the point is outside of the right
+    picture.
     """
     width = forward.shape[1]
     column = np.arange(width, dtype=np.int32)[None] - ((forward.astype(np.int32) + 8) >> 4)
     inside = (column >= 0) & (column < width) & (forward > invalid)
     other = np.take_along_axis(backward, np.clip(column, 0, width - 1), axis=1)
-    apart = np.abs(other.astype(np.float32) - forward)
-    return np.where(inside & (other > invalid), apart, np.float32(np.inf))
+    difference = np.abs(other.astype(np.float32) - forward)
+    return np.where(inside & (other > invalid), difference, np.float32(np.inf))
 
 
-def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
+def _make_wls_filter(wls: tuple[float, float]) -> Callable[..., Any]:
     """Return OpenCV's weighted least squares filter for disparities in 1/16 pixel."""
     cv2 = load("cv2")
     if not hasattr(cv2, "ximgproc"):
@@ -325,19 +332,19 @@ def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
         smoothness = edges = -1.0
     if not (0 < smoothness < 1e9 and 0 < edges < 1e3):
         raise _argument_error("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)
-    made = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # True: weights by agreement
-    made.setLambda(smoothness)
-    made.setSigmaColor(edges)
+    wls_filter = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # True: weights by agreement
+    wls_filter.setLambda(smoothness)
+    wls_filter.setSigmaColor(edges)
 
-    def smooth(
+    def apply_filter(
         sixteenths: NDArray[np.int16], left: NDArray[np.uint8], back: NDArray[np.int16]
     ) -> NDArray[np.int16]:
-        return np.array(made.filter(sixteenths, left, None, back), dtype=np.int16)
+        return np.array(wls_filter.filter(sixteenths, left, None, back), dtype=np.int16)
 
-    return smooth
+    return apply_filter
 
 
-def _sgbm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
+def _make_sgbm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
     names = {
         "min_disparity": "minDisparity",
         "num_disparities": "numDisparities",
@@ -357,21 +364,21 @@ def _sgbm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
     return compute
 
 
-def _bm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
-    made = load("cv2").StereoBM_create(numbers["num_disparities"], numbers["block_size"])
-    made.setMinDisparity(numbers["min_disparity"])
-    made.setUniquenessRatio(numbers["uniqueness_ratio"])
-    made.setPreFilterType(numbers["pre_filter_type"])
-    made.setPreFilterSize(numbers["pre_filter_size"])
-    made.setPreFilterCap(numbers["pre_filter_cap"])
-    made.setTextureThreshold(numbers["texture_threshold"])
-    made.setDisp12MaxDiff(numbers["disp12_max_diff"])
-    made.setSpeckleWindowSize(0)
-    compute: Callable[..., Any] = made.compute
+def _make_bm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
+    matcher = load("cv2").StereoBM_create(numbers["num_disparities"], numbers["block_size"])
+    matcher.setMinDisparity(numbers["min_disparity"])
+    matcher.setUniquenessRatio(numbers["uniqueness_ratio"])
+    matcher.setPreFilterType(numbers["pre_filter_type"])
+    matcher.setPreFilterSize(numbers["pre_filter_size"])
+    matcher.setPreFilterCap(numbers["pre_filter_cap"])
+    matcher.setTextureThreshold(numbers["texture_threshold"])
+    matcher.setDisp12MaxDiff(numbers["disp12_max_diff"])
+    matcher.setSpeckleWindowSize(0)
+    compute: Callable[..., Any] = matcher.compute
     return compute
 
 
 _ALGORITHMS: Final[dict[str, Callable[[Mapping[str, int | None]], Callable[..., Any]]]] = {
-    "sgbm": _sgbm,
-    "bm": _bm,
+    "sgbm": _make_sgbm,
+    "bm": _make_bm,
 }

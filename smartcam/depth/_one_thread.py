@@ -25,20 +25,20 @@ class OneThread:
         self._pool: ThreadPoolExecutor | None = ThreadPoolExecutor(1, f"smartcam {name}")
         self._running: asyncio.Future[Any] | None = None
 
-    async def idle(self) -> None:
+    async def wait_until_idle(self) -> None:
         """Wait until no call is running."""
         while self._running is not None and not self._running.done():
             await asyncio.wait([self._running])
 
-    async def run(self, work: Callable[[], T]) -> T:
+    async def run(self, function: Callable[[], T]) -> T:
         """Run a function in the thread, in the order of the calls.
 
         Raises LocalProtocolError: the thread was closed.
         """
-        await self.idle()
+        await self.wait_until_idle()
         if self._pool is None:
             raise LocalProtocolError(f"{self._name}: closed")
-        self._running = asyncio.get_running_loop().run_in_executor(self._pool, work)
+        self._running = asyncio.get_running_loop().run_in_executor(self._pool, function)
         self._running.add_done_callback(_retrieve_error)
         return await asyncio.shield(self._running)
 
@@ -50,7 +50,7 @@ class OneThread:
         pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown(wait=False)
-            await self.idle()
+            await self.wait_until_idle()
 
 
 def _retrieve_error(done: asyncio.Future[Any]) -> None:

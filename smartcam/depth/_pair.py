@@ -38,7 +38,8 @@ Both pictures are rounded; averaging over a window halves the sum of the two var
 """
 
 MIN_AVERAGING_FACTOR: Final = 1.25
-"""Reduction of size above which a picture is averaged first: remap reads only four pixels."""
+"""Reduction of size above which a picture is first reduced by averaging, since remap reads only
+four pixels."""
 
 
 @takes(left=check_path, right=check_path)
@@ -55,8 +56,8 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
         MissingExtraError: PyYAML is not installed.
         OSError: one of the files cannot be read.
     """
-    given = [(parse_camera_info(_text(path)), path) for path in (left, right)]
-    (first_info, _), (second_info, _) = given
+    infos = [(parse_camera_info(_read_text(path)), path) for path in (left, right)]
+    (first_info, _), (second_info, _) = infos
     shift = float(second_info.projection[0, 3] / second_info.projection[0, 0])
     if not shift < 0:
         raise CalibrationError(
@@ -68,7 +69,7 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
         )
     # p_rectified = R1 p_left; the right rectified frame is shifted, so p_right = R2^T (R1 p_left +
     # shift)
-    first, second = (_rotation(info.rectification, path) for info, path in given)
+    first, second = (_rotation(info.rectification, path) for info, path in infos)
     transform = Transform("right", "left", second.T @ first, second.T @ np.array([shift, 0, 0]))
     return CameraChain(
         cameras=(first_info.camera, second_info.camera),
@@ -80,17 +81,17 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
 def _rotation(matrix: NDArray[np.float64], path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Return the rotation nearest to a matrix that was written with five digits."""
     u, _, v = np.linalg.svd(matrix)
-    turn = np.asarray(u @ v)
-    if np.linalg.det(turn) < 0 or np.abs(turn - matrix).max() > MAX_ROTATION_ERROR:
+    rotation = np.asarray(u @ v)
+    if np.linalg.det(rotation) < 0 or np.abs(rotation - matrix).max() > MAX_ROTATION_ERROR:
         raise CalibrationError(
             f"{path}: rectification_matrix: expected a rotation, got {matrix.tolist()}",
             code=Code.NOT_RIGID,
             got=matrix.tolist(),
         )
-    return turn
+    return rotation
 
 
-def _text(path: str | os.PathLike[str]) -> str:
+def _read_text(path: str | os.PathLike[str]) -> str:
     with Path(path).open("rb") as file:
         content = file.read(MAX_FILE_BYTES + 1)
     if len(content) > MAX_FILE_BYTES:
@@ -103,9 +104,9 @@ def _text(path: str | os.PathLike[str]) -> str:
         raise CalibrationError(f"{path}: expected text: {exc}", code=Code.MALFORMED) from exc
 
 
-def scaled(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
+def scale_camera(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
     """Return the lens for a scaled picture."""
-    # pixels count from the middle of the first pixel, whose corner at -1/2 does not move
+    # the first pixel's middle is at 0, its corner at -1/2; the corner does not move
     across, down = size[0] / camera.size[0], size[1] / camera.size[1]
     matrix = camera.matrix.copy()
     matrix[0] = [across * matrix[0, 0], 0, across * (matrix[0, 2] + 0.5) - 0.5]
@@ -135,10 +136,10 @@ class CalibratedPair:
         alpha: float,
         focal_sigma: float,
     ) -> None:
-        lenses, transform, covariance = _parts(calibration)
+        lenses, transform, covariance = _split_calibration(calibration)
         self._shapes = tuple(lens.size for lens in lenses)
-        wanted = lenses[0].size if size is None else size
-        left, right = (scaled(lens, wanted) for lens in lenses)
+        picture_size = lenses[0].size if size is None else size
+        left, right = (scale_camera(lens, picture_size) for lens in lenses)
         rectification = rectify(left, right, transform, alpha=alpha)
         self.size = rectification.size
         projection = rectification.projections[1]
@@ -153,13 +154,13 @@ class CalibratedPair:
         self.camera_info = CameraModel(
             size=rectification.size, matrix=rectification.projections[0][:, :3]
         )
-        self._focal_sigma = focal_sigma * wanted[0] / lenses[0].size[0]
+        self._focal_sigma = focal_sigma * picture_size[0] / lenses[0].size[0]
         self._covariance_root = _covariance_root(rectification.rotations[1], covariance)
         self._maps, self._masks = rectification.maps, rectification.masks
         self.rotation: NDArray[np.float64] = rectification.rotations[0]
-        self._fixed: list[tuple[tuple[int, int], Any]] = [((0, 0), None)] * 2
+        self._cached_maps: list[tuple[tuple[int, int], Any]] = [((0, 0), None)] * 2
 
-    def rectified(self, picture: NDArray[Any], side: int, source: str) -> NDArray[Any]:
+    def rectify(self, picture: NDArray[Any], side: int, source: str) -> NDArray[Any]:
         """Return the rectified picture, (H, W) or (H, W, C); 0 outside of the given picture.
 
         Raises FrameFormatError: the picture's aspect ratio is not the calibrated one.
@@ -177,12 +178,12 @@ class CalibratedPair:
         if width > MIN_AVERAGING_FACTOR * self.size[0]:
             picture = cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA)
             width, height = self.size
-        made_for, maps = self._fixed[side]
-        if made_for != (width, height):
+        maps_size, maps = self._cached_maps[side]
+        if maps_size != (width, height):
             scale = np.array([width / self.size[0], height / self.size[1]], np.float32)
-            chart = (self._maps[side] + np.float32(0.5)) * scale - np.float32(0.5)
-            maps = cv2.convertMaps(chart, None, cv2.CV_16SC2)
-            self._fixed[side] = ((width, height), maps)
+            float_maps = (self._maps[side] + np.float32(0.5)) * scale - np.float32(0.5)
+            maps = cv2.convertMaps(float_maps, None, cv2.CV_16SC2)
+            self._cached_maps[side] = ((width, height), maps)
         return np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR))
 
     def drop_outside(self, disparity: NDArray[np.float32]) -> None:
@@ -194,29 +195,29 @@ class CalibratedPair:
         column = np.clip(np.round(column), 0, self.size[0] - 1).astype(np.intp)
         disparity[~(first & np.take_along_axis(second, column, axis=1))] = np.nan
 
-    def depth(self, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+    def to_depth(self, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return depths in metres (H, W), 0 where no disparity is above 0."""
         metres = np.zeros_like(disparity)
         np.divide(self.focal * self.baseline, disparity, out=metres, where=disparity > 0)
         return metres
 
-    def sigma(
+    def depth_sigma(
         self, depth: NDArray[np.float32], disparity_sigma: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Return the standard deviation of depths, metres; NaN where there is no depth."""
-        # Z = f b / d, so sigma_Z = Z^2 / (f b) sigma_d; the calibration's error is added as an
-        # error of the disparity
-        known = depth > 0
-        z = np.where(known, depth, np.float32(1))
+        # Z = f b / d, so sigma_Z = Z^2 / (f b) sigma_d; the calibration's error is added to the
+        # variance of the disparity
+        has_depth = depth > 0
+        z = np.where(has_depth, depth, np.float32(1))
         variance = disparity_sigma.astype(np.float32) ** 2 + np.float32(REMAP_VARIANCE_PX2)
         if self._covariance_root is not None:
-            variance += self._of_calibration(z, self._covariance_root)
+            variance += self._calibration_variance(z, self._covariance_root)
         sigma = z * z / np.float32(self.focal * self.baseline) * np.sqrt(variance)
         if self._focal_sigma:
             sigma = np.hypot(sigma, z * np.float32(self._focal_sigma / self.focal))
-        return np.where(known, sigma, np.float32(np.nan)).astype(np.float32)
+        return np.where(has_depth, sigma, np.float32(np.nan)).astype(np.float32)
 
-    def _of_calibration(
+    def _calibration_variance(
         self, z: NDArray[np.float32], spread: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Return the variance of the disparity that follows from the transform's covariance."""
@@ -227,14 +228,14 @@ class CalibratedPair:
         x = ((np.arange(self.size[0]) - cx) / self.focal).astype(np.float32)[None]
         y = ((np.arange(self.size[1]) - cy) / self.focal).astype(np.float32)[:, None]
         inverse_depth = 1 / z
-        beside = x - np.float32(self.baseline) * inverse_depth
+        right_x = x - np.float32(self.baseline) * inverse_depth
         factors = (
-            -beside * y,
-            1 + beside * x,
+            -right_x * y,
+            1 + right_x * x,
             -y,
             inverse_depth,
             np.float32(0),
-            -beside * inverse_depth,
+            -right_x * inverse_depth,
         )
         variance = np.zeros_like(z)
         for column in spread.T:
@@ -245,10 +246,10 @@ class CalibratedPair:
         return variance * f * f
 
 
-def _parts(
+def _split_calibration(
     calibration: StereoCalibration | CameraChain,
 ) -> tuple[tuple[CameraModel, CameraModel], Transform, NDArray[np.float64] | None]:
-    """Return lenses, ``T_right_left`` and its covariance, None if unknown."""
+    """Return both lenses, ``T_right_left``, and its covariance; None: it is not known."""
     if not isinstance(calibration, CameraChain):
         return (
             (calibration.left, calibration.right),
@@ -265,11 +266,11 @@ def _parts(
 
 
 def _covariance_root(
-    turn: NDArray[np.float64], covariance: NDArray[np.float64] | None
+    rotation: NDArray[np.float64], covariance: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
     """Return A (6, 6) with A A^T the covariance in the right rectified frame; None if unknown."""
     if covariance is None or not covariance.any():
         return None
-    both = np.kron(np.eye(2), turn)
-    values, vectors = np.linalg.eigh(both @ covariance @ both.T)
+    block_rotation = np.kron(np.eye(2), rotation)
+    values, vectors = np.linalg.eigh(block_rotation @ covariance @ block_rotation.T)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))

@@ -26,7 +26,7 @@ MIN_PAIRS: Final = 30
 """Least number of pairs to estimate frame rates."""
 
 
-class _SeenPair(NamedTuple):
+class _TimedPair(NamedTuple):
     captured: tuple[float, float]  # left and right, seconds of the local clock
     sequence: tuple[int, int]
 
@@ -35,11 +35,11 @@ class PairClock:
     """Estimate skew and drift of two cameras from their paired frames."""
 
     def __init__(self) -> None:
-        self._pairs: collections.deque[_SeenPair] = collections.deque(maxlen=MAX_PAIRS)
+        self._pairs: collections.deque[_TimedPair] = collections.deque(maxlen=MAX_PAIRS)
 
-    def saw(self, left: Frame, right: Frame) -> None:
+    def add_pair(self, left: Frame, right: Frame) -> None:
         """Record a pair; restart if a camera's frame numbers restarted."""
-        pair = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
+        pair = _TimedPair((left.captured, right.captured), (left.sequence, right.sequence))
         if self._pairs and not all(
             a < b for a, b in zip(self._pairs[-1].sequence, pair.sequence, strict=True)
         ):
@@ -47,14 +47,14 @@ class PairClock:
         self._pairs.append(pair)
 
     def skew(self) -> float | None:
-        """Return the median time, seconds, by which the right frames of recent pairs are later."""
+        """Return the median time, seconds, from the left to the right frames of recent pairs."""
         recent = list(self._pairs)[-SKEW_PAIRS:]
         if not recent:
             return None
         return statistics.median(pair.captured[1] - pair.captured[0] for pair in recent)
 
     def drift(self, clocks: Sequence[ClockStatistics | None]) -> tuple[float | None, str]:
-        """Return the right clock's drift against the left clock, and the source of this value.
+        """Return the right clock's drift relative to the left clock, and the source of this value.
 
         Each camera's own clock sets its frame rate. Without timestamps of these clocks, and at the
         same nominal rate, the ratio of the frame rates is the ratio of the clocks.
@@ -70,12 +70,17 @@ class PairClock:
 
     def _rates(self) -> tuple[float, float] | None:
         """Return both cameras' frame rates by the local clock."""
-        seen = list(self._pairs)
-        if len(seen) < MIN_PAIRS or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
+        pairs = list(self._pairs)
+        if (
+            len(pairs) < MIN_PAIRS
+            or pairs[-1].captured[0] - pairs[0].captured[0] < MIN_DRIFT_DURATION
+        ):
             return None
         rates = []
         for side in (0, 1):
-            at = np.array([pair.captured[side] - seen[0].captured[side] for pair in seen])
-            number = np.array([pair.sequence[side] - seen[0].sequence[side] for pair in seen])
-            rates.append(float(np.polyfit(at, number, 1)[0]))
+            times = np.array([pair.captured[side] - pairs[0].captured[side] for pair in pairs])
+            frame_numbers = np.array(
+                [pair.sequence[side] - pairs[0].sequence[side] for pair in pairs]
+            )
+            rates.append(float(np.polyfit(times, frame_numbers, 1)[0]))
         return (rates[0], rates[1]) if min(rates) > 0 else None

@@ -16,10 +16,10 @@ from smartcam.depth._tables import (
     MAX_FIELDS,
     BadTableError,
     check_row,
-    count_of,
     from_bytes,
     from_text,
-    header_line,
+    parse_count,
+    read_header_line,
     shown,
     to_bytes,
     to_text,
@@ -43,7 +43,7 @@ MAX_UNPACKED_BYTES: Final = 1 << 30
 """Largest size of unpacked points, bytes: the limit of uncompressed files."""
 
 COLOURS: Final = ("rgb", "rgba")
-"""Fields of 4 bytes with a colour, blue in the lowest byte; a float holds it as its bits."""
+"""Fields of 4 bytes with a colour, blue in the lowest byte; in a float, the colour is its bits."""
 
 PADDING_NAME: Final = "_"
 """Name of padding fields, which are skipped and may occur more than once."""
@@ -61,27 +61,27 @@ class _PcdHeader:
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
     """Return the columns of a file's points; raise BadTableError if the file is not valid."""
-    head = _header(data)
+    head = _read_header(data)
     columns = READERS[head.data](data, head)
     for name in COLOURS:
         if name in columns and columns[name].dtype.itemsize == 4:
             packed = columns[name].view(np.uint32)
-            for shift, part in ((16, "red"), (8, "green"), (0, "blue")):
-                columns[part] = (packed >> shift & 0xFF).astype(np.uint8)
+            for shift, colour in ((16, "red"), (8, "green"), (0, "blue")):
+                columns[colour] = (packed >> shift & 0xFF).astype(np.uint8)
             break
     return columns
 
 
-def _header(data: bytes) -> _PcdHeader:
+def _read_header(data: bytes) -> _PcdHeader:
     lines: dict[str, list[str]] = {}
-    place = 0
+    offset = 0
     while "DATA" not in lines:
-        line, place = header_line(data, place)
+        line, offset = read_header_line(data, offset)
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        if words[0] not in KNOWN or words[0] in lines:
-            raise BadTableError(f"a PCD file's {', '.join(KNOWN)}, each once", shown(line))
+        if words[0] not in HEADER_WORDS or words[0] in lines:
+            raise BadTableError(f"a PCD file's {', '.join(HEADER_WORDS)}, each once", shown(line))
         lines[words[0]] = words[1:]
     if lines.get("VERSION") not in (["0.7"], [".7"]):
         raise BadTableError("VERSION 0.7", shown(" ".join(lines.get("VERSION", ["none"]))))
@@ -95,12 +95,12 @@ def _header(data: bytes) -> _PcdHeader:
             f"up to {MAX_FIELDS} FIELDS, with SIZE, TYPE and COUNT of each",
             f"{len(names)}, {len(sizes)}, {len(kinds)} and {len(counts)}",
         )
-    named = [name for name in names if name != PADDING_NAME]
-    if len(set(named)) < len(named):
+    unpadded = [name for name in names if name != PADDING_NAME]
+    if len(set(unpadded)) < len(unpadded):
         raise BadTableError("each of the FIELDS once", shown(" ".join(names)))
     types = []
     for kind, size in zip(kinds, sizes, strict=True):
-        number_type = TYPES.get((kind, count_of(size, "bytes")))
+        number_type = TYPES.get((kind, parse_count(size, "bytes")))
         if number_type is None:
             raise BadTableError("I or U of 1, 2, 4 or 8, or F of 4 or 8 bytes", shown(kind + size))
         types.append(number_type)
@@ -109,39 +109,41 @@ def _header(data: bytes) -> _PcdHeader:
         raise BadTableError("WIDTH times HEIGHT POINTS", f"{width}, {height} and {points}")
     if lines["DATA"] not in [[reader] for reader in READERS]:
         raise BadTableError(f"DATA {', '.join(READERS)}", shown(" ".join(lines["DATA"])))
-    many = [count_of(count, "numbers") for count in counts]
-    if max(many) > MAX_FIELDS or min(many) < 1:
-        raise BadTableError(f"COUNT from 1 to {MAX_FIELDS}", f"{min(many)} to {max(many)}")
-    return _PcdHeader(names, types, many, points, lines["DATA"][0], place)
+    value_counts = [parse_count(count, "numbers") for count in counts]
+    if max(value_counts) > MAX_FIELDS or min(value_counts) < 1:
+        raise BadTableError(
+            f"COUNT from 1 to {MAX_FIELDS}", f"{min(value_counts)} to {max(value_counts)}"
+        )
+    return _PcdHeader(names, types, value_counts, points, lines["DATA"][0], offset)
 
 
 def _single_count(lines: Mapping[str, list[str]], name: str) -> int:
     words = lines.get(name, [])
     if len(words) != 1:
         raise BadTableError(f"{name} and a number", shown(" ".join(words)))
-    return count_of(words[0], name.lower())
+    return parse_count(words[0], name.lower())
 
 
-def _row(head: _PcdHeader) -> np.dtype[Any]:
-    """Return the rows' type; its fields are numbered, since names may occur twice."""
+def _row_type(head: _PcdHeader) -> np.dtype[Any]:
+    """Return NumPy's type of a row; fields are named by number, since names may occur twice."""
     fields = zip(head.types, head.counts, strict=True)
-    row = np.dtype([(str(place), kind, (count,)) for place, (kind, count) in enumerate(fields)])
+    row = np.dtype([(str(index), kind, (count,)) for index, (kind, count) in enumerate(fields)])
     check_row(row)
     return row
 
 
-def _binary(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
-    rows = from_bytes(data, head.start, head.points, _row(head))
+def _read_binary(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
+    rows = from_bytes(data, head.start, head.points, _row_type(head))
     return {
-        name: rows[str(place)][:, 0].copy()
-        for place, (name, count) in enumerate(zip(head.names, head.counts, strict=True))
+        name: rows[str(index)][:, 0].copy()
+        for index, (name, count) in enumerate(zip(head.names, head.counts, strict=True))
         if count == 1 and name != PADDING_NAME
     }
 
 
-def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
-    """Return columns that are stored one after the other in compressed form."""
-    size = head.points * _row(head).itemsize
+def _read_compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
+    """Return the columns of compressed data, which stores one column after the other."""
+    size = head.points * _row_type(head).itemsize
     if size > MAX_UNPACKED_BYTES:  # 3 bytes of LZF can expand to 264
         raise BadTableError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
     if len(data) < head.start + 8:
@@ -152,43 +154,43 @@ def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
             f"up to {len(data) - head.start - 8} bytes that unpack to {size}",
             f"{packed} that unpack to {unpacked_size}",
         )
-    columns, place = {}, 0
-    body = unpacked(data[head.start + 8 : head.start + 8 + packed], size)
+    columns, offset = {}, 0
+    body = unpack_lzf(data[head.start + 8 : head.start + 8 + packed], size)
     for name, kind, count in zip(head.names, head.types, head.counts, strict=True):
-        many = count * head.points
+        value_count = count * head.points
         if count == 1 and name != PADDING_NAME:
-            columns[name] = np.frombuffer(body, kind, many, place).copy()
-        place += many * np.dtype(kind).itemsize
+            columns[name] = np.frombuffer(body, kind, value_count, offset).copy()
+        offset += value_count * np.dtype(kind).itemsize
     return columns
 
 
-def unpacked(data: bytes, size: int) -> bytes:
+def unpack_lzf(data: bytes, size: int) -> bytes:
     """Unpack LZF-packed data; raise BadTableError unless the result has the given size."""
-    out, place, end = bytearray(), 0, len(data)
-    while place < end and len(out) <= size:
-        control, place = data[place], place + 1
+    out, position, end = bytearray(), 0, len(data)
+    while position < end and len(out) <= size:
+        control, position = data[position], position + 1
         if control < 32:  # control + 1 uncompressed bytes follow
-            out += data[place : place + control + 1]
-            place += control + 1
+            out += data[position : position + control + 1]
+            position += control + 1
             continue
         length = control >> 5
-        if length == 7 and place < end:  # a longer copy
-            length, place = length + data[place], place + 1
-        if place >= end:
+        if length == 7 and position < end:  # a longer copy
+            length, position = length + data[position], position + 1
+        if position >= end:
             break
-        back, place = ((control & 31) << 8 | data[place]) + 1, place + 1
-        begin = len(out) - back
+        distance, position = ((control & 31) << 8 | data[position]) + 1, position + 1
+        begin = len(out) - distance
         if begin < 0:
             raise BadTableError("a place in what is unpacked", f"{-begin} bytes before it")
         length += 2
-        part = out[begin : begin + length]  # may overlap with its own output
-        out += (part * (length // len(part) + 1))[:length]
-    if len(out) != size or place != end:
-        raise BadTableError(f"{end} bytes that unpack to {size}", f"{place} to {len(out)}")
+        copied = out[begin : begin + length]  # may overlap with its own output
+        out += (copied * (length // len(copied) + 1))[:length]
+    if len(out) != size or position != end:
+        raise BadTableError(f"{end} bytes that unpack to {size}", f"{position} to {len(out)}")
     return bytes(out)
 
 
-def _text(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
+def _read_text(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     types, names = [], []
     for name, kind, count in zip(head.names, head.types, head.counts, strict=True):
         types += [np.dtype(kind)] * count
@@ -198,17 +200,21 @@ def _text(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     return {name: column for name, column in pairs if name != PADDING_NAME}
 
 
-READERS: Final = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}
+READERS: Final = {
+    "ascii": _read_text,
+    "binary": _read_binary,
+    "binary_compressed": _read_compressed,
+}
 """Readers of points by the word after DATA."""
 
-KNOWN: Final = (
+HEADER_WORDS: Final = (
     *("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT"),
     *("WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"),
 )
 
 
 def write(cloud: Cloud, text: bool) -> bytes:
-    """Return a cloud as a PCD file: colours are a float's bits, in text a number."""
+    """Return a cloud as a PCD file: a colour is the bits of a float, or in text a number."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.T, strict=True))
     if cloud.colours is not None:
         red, green, blue = cloud.colours.T.astype(np.uint32)

@@ -14,10 +14,10 @@ from smartcam.depth._tables import (
     MAX_FIELDS,
     BadTableError,
     check_row,
-    count_of,
     from_bytes,
     from_text,
-    header_line,
+    parse_count,
+    read_header_line,
     shown,
     to_bytes,
     to_text,
@@ -65,35 +65,37 @@ class _PlyElement:
     parts: list[tuple[str, ...]] = field(default_factory=list)
 
     @property
-    def lists(self) -> bool:
+    def has_lists(self) -> bool:
         """True if the rows have lists, and so no fixed length."""
         return any(len(part) > 1 for part in self.parts)
 
-    def row(self, order: str) -> np.dtype[Any]:
-        """Return the rows' type."""
-        if self.lists or not self.properties:
+    def row_type(self, byte_order: str) -> np.dtype[Any]:
+        """Return NumPy's type of a row."""
+        if self.has_lists or not self.properties:
             raise BadTableError(
-                f"rows of numbers for {self.name}", "lists" if self.lists else "none"
+                f"rows of numbers for {self.name}", "lists" if self.has_lists else "none"
             )
-        row = np.dtype([(name, (order or "<") + kind) for name, kind in self.properties.items()])
+        row = np.dtype(
+            [(name, (byte_order or "<") + kind) for name, kind in self.properties.items()]
+        )
         check_row(row)
         return row
 
-    def end(self, data: bytes, start: int, order: str) -> int:
+    def end_of_rows(self, data: bytes, start: int, byte_order: str) -> int:
         """Return the offset after the rows that begin at ``start``."""
-        if not self.lists:
-            return start + (self.count * self.row(order).itemsize if self.count else 0)
+        if not self.has_lists:
+            return start + (self.count * self.row_type(byte_order).itemsize if self.count else 0)
         if self.count > MAX_LIST_ROWS:
             raise BadTableError(
                 f"up to {MAX_LIST_ROWS} rows of lists before the vertices", f"{self.count}"
             )
-        kinds = [[np.dtype(order + kind) for kind in part] for part in self.parts]
+        kinds = [[np.dtype(byte_order + kind) for kind in part] for part in self.parts]
         for _ in range(self.count):
             for size, *items in kinds:
                 end = start + size.itemsize
                 if items:
-                    many = int(np.frombuffer(data[start:end].ljust(8, b"\0"), size, 1)[0])
-                    end += max(0, many) * items[0].itemsize
+                    item_count = int(np.frombuffer(data[start:end].ljust(8, b"\0"), size, 1)[0])
+                    end += max(0, item_count) * items[0].itemsize
                 start = end
             if start > len(data):
                 raise BadTableError(f"{self.count} rows for {self.name}", "fewer")
@@ -102,12 +104,12 @@ class _PlyElement:
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
     """Return the columns of a file's vertices; raise BadTableError if the file is not valid."""
-    order, elements, start = _header(data)
-    before, vertex = _vertex(elements)
-    row = vertex.row(order)
-    if order:
+    byte_order, elements, start = _read_header(data)
+    before, vertex = _split_at_vertices(elements)
+    row = vertex.row_type(byte_order)
+    if byte_order:
         for element in before:
-            start = element.end(data, start, order)
+            start = element.end_of_rows(data, start, byte_order)
         rows = from_bytes(data, start, vertex.count, row)
         return {name: rows[name].astype(kind) for name, kind in vertex.properties.items()}
     types = [np.dtype(kind) for kind in vertex.properties.values()]
@@ -115,36 +117,36 @@ def read(data: bytes) -> dict[str, NDArray[Any]]:
     return dict(zip(row.names or (), columns, strict=True))
 
 
-def _header(data: bytes) -> tuple[str, list[_PlyElement], int]:
-    """Return the byte order (empty for text), the elements, and the offset of the first row."""
-    line, place = header_line(data, 0) if data.startswith(b"ply") else ("", 0)
+def _read_header(data: bytes) -> tuple[str, list[_PlyElement], int]:
+    """Return the byte order ("" for text), the elements, and the offset of the first row."""
+    line, offset = read_header_line(data, 0) if data.startswith(b"ply") else ("", 0)
     if line.rstrip() != "ply":
         raise BadTableError("a PLY file, which begins with ply", shown(data[:60]))
-    order: str | None = None
+    byte_order: str | None = None
     elements: list[_PlyElement] = []
     while True:
-        line, place = header_line(data, place)
+        line, offset = read_header_line(data, offset)
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case ["end_header"]:
                 break
-            case ["format", name, "1.0"] if name in ORDERS and order is None:
-                order = ORDERS[name]
+            case ["format", name, "1.0"] if name in ORDERS and byte_order is None:
+                byte_order = ORDERS[name]
             case ["element", name, count] if len(elements) < MAX_FIELDS:
-                elements.append(_PlyElement(name, count_of(count, "rows")))
+                elements.append(_PlyElement(name, parse_count(count, "rows")))
             case ["property", "list", size, kind, _] if elements and {size, kind} <= TYPES.keys():
                 _add_part(elements[-1], TYPES[size], TYPES[kind])
             case ["property", kind, name] if elements and kind in TYPES:
-                _add(elements[-1], name, TYPES[kind])
+                _add_property(elements[-1], name, TYPES[kind])
             case _:
                 raise BadTableError("a line of a PLY header", shown(line))
-    if order is None:
+    if byte_order is None:
         raise BadTableError(f"a format of {', '.join(ORDERS)}", "none")
-    return order, elements, place
+    return byte_order, elements, offset
 
 
-def _add(element: _PlyElement, name: str, kind: str) -> None:
+def _add_property(element: _PlyElement, name: str, kind: str) -> None:
     if name in element.properties or len(element.properties) >= MAX_FIELDS:
         raise BadTableError(f"up to {MAX_FIELDS} properties, each once", f"{shown(name)} again")
     element.properties[name] = kind
@@ -160,11 +162,11 @@ def _add_part(element: _PlyElement, *part: str) -> None:
     element.parts.append(part)
 
 
-def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
+def _split_at_vertices(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
     """Return the elements before the vertices, and the vertices' element."""
-    for place, element in enumerate(elements):
+    for index, element in enumerate(elements):
         if element.name == "vertex":
-            return elements[:place], element
+            return elements[:index], element
     names = ", ".join(shown(element.name) for element in elements) or "none"
     raise BadTableError("an element vertex", names)
 

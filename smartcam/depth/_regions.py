@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 DepthArea: TypeAlias = "tuple[int, int, int, int] | Sequence[tuple[float, float]] | NDArray[Any]"
 """A box ``(x, y, width, height)``, a polygon (N, 2) of ``x, y``, or a mask (H, W) of bool; in
-pixels from the middle of the upper left one."""
+pixels; the middle of the upper left pixel is at (0, 0)."""
 
 SIGMA_PER_MAD: Final = 1.4826
 """Standard deviation of normal noise as a multiple of its median absolute deviation (MAD)."""
@@ -37,8 +37,8 @@ class RegionDepth:
     Attributes:
         median: median of the depths, metres.
         sigma: standard deviation of ``median`` from noise alone, metres.
-        spread: standard deviation of one pixel, metres, from the median absolute deviation, which
-            single outliers do not change; a slope does.
+        spread: standard deviation of one pixel, metres, from the median absolute deviation. Single
+            outliers do not change it; a slope of the surface does.
         count: number of pixels with a depth.
         pixels: number of pixels of the region.
     """
@@ -78,12 +78,12 @@ def region_depth(
             f"region_depth: shared: expected 1 or more pixels, got {shown(shared)}"
         )
     metres = as_metres(depth, scale)
-    inside = metres[_mask(region, metres.shape)]
-    measured = inside[inside > 0].astype(float)
+    region_depths = metres[_region_mask(region, metres.shape)]
+    measured = region_depths[region_depths > 0].astype(float)
     if not measured.size:
         raise FrameFormatError(
-            f"region_depth: expected a depth in {_described(region)}, "
-            f"got none in {inside.size} pixels"
+            f"region_depth: expected a depth in {_describe(region)}, "
+            f"got none in {region_depths.size} pixels"
         )
     median = float(np.median(measured))
     spread = SIGMA_PER_MAD * float(np.median(np.abs(measured - median)))
@@ -94,7 +94,7 @@ def region_depth(
         sigma=spread * math.sqrt(variance),
         spread=spread,
         count=int(measured.size),
-        pixels=int(inside.size),
+        pixels=int(region_depths.size),
     )
 
 
@@ -119,30 +119,32 @@ def equalize_depth(
         FrameFormatError: the array is no depth map.
     """
     metres = as_metres(depth, scale)
-    mask = _mask(region, metres.shape)
+    mask = _region_mask(region, metres.shape)
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
-        raise ConfigurationError(f"equalize_depth: {_described(region)} is outside of the map")
+        raise ConfigurationError(f"equalize_depth: {_describe(region)} is outside of the map")
     box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     shown = mask[box] & (metres[box] > 0)
     picture = np.zeros(shown.shape, np.uint8)
     if shown.any():
-        picture[shown] = _equal(-metres[box][shown])
+        picture[shown] = _equalize(-metres[box][shown])
     return picture
 
 
-def _equal(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return levels as greys from 1 to 255, with equally many pixels of each grey."""
-    _, place, counts = np.unique(levels, return_inverse=True, return_counts=True)
-    upto = np.cumsum(counts)
-    span = upto[-1] - upto[0]
+def _equalize(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return levels as greys from 1 to 255, each grey with about the same number of pixels."""
+    _, level_index, counts = np.unique(levels, return_inverse=True, return_counts=True)
+    pixels_up_to = np.cumsum(counts)
+    span = pixels_up_to[-1] - pixels_up_to[0]
     if not span:
         return np.full(levels.shape, 255, np.uint8)
-    greys: NDArray[np.uint8] = np.rint(1 + 254 * (upto - upto[0]) / span).astype(np.uint8)
-    return greys[place.reshape(levels.shape)]
+    greys: NDArray[np.uint8] = np.rint(1 + 254 * (pixels_up_to - pixels_up_to[0]) / span).astype(
+        np.uint8
+    )
+    return greys[level_index.reshape(levels.shape)]
 
 
-def _described(region: DepthArea | None) -> str:
+def _describe(region: DepthArea | None) -> str:
     if region is None:
         return "the map"
     given = np.asarray(region)
@@ -151,7 +153,7 @@ def _described(region: DepthArea | None) -> str:
     return f"the {'box' if given.ndim == 1 else 'polygon'} {given.tolist()}"
 
 
-def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _region_mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return a region as a mask of a map's shape."""
     if region is None:
         return np.ones(shape, bool)
@@ -168,14 +170,14 @@ def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
             mask[max(0, y) : max(0, y + height), max(0, x) : max(0, x + width)] = True
             return mask
         if given.ndim == 2 and given.shape[1] == 2 and len(given) > 2:
-            return _polygon(given.astype(float), shape)
+            return _polygon_mask(given.astype(float), shape)
     raise ConfigurationError(
         "region: expected a box (x, y, width, height) of whole pixels, a polygon (N, 2) or a mask "
         f"of bool {shape}, got {shown(region)}"
     )
 
 
-def _polygon(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _polygon_mask(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return the mask of the pixels with centres in a polygon, by the even-odd rule."""
     columns = np.arange(shape[1], dtype=float)
     rows = np.arange(shape[0], dtype=float)[:, None]

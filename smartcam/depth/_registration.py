@@ -12,7 +12,7 @@ from smartcam._argument_checks import a_number, of_class, or_none, takes
 from smartcam._arguments import check_text, shown
 from smartcam._extras import load
 from smartcam.depth._filters import voxel_grid
-from smartcam.depth._surface import open_directions, planes_of, slopes
+from smartcam.depth._surface import displacement_jacobian, fit_planes, open_directions
 from smartcam.exceptions import ConfigurationError
 from smartcam.geometry import Transform
 
@@ -27,15 +27,15 @@ METHODS: Final = {"gicp": "GICP", "icp": "ICP", "plane": "PLANE_ICP"}
 """small-gicp's name of each method."""
 
 NEIGHBOURS: Final = 20
-"""Number of neighbours that the plane around each point is fitted to."""
+"""Number of neighbours to which the plane around each point is fitted."""
 
 MAX_STEPS: Final = 60
 FURTHER_STEPS: Final = 10
-"""Number of extra steps that test convergence, since matches may alternate between neighbours."""
+"""Number of further steps that test convergence, since matches may alternate between neighbours."""
 
 MIN_TURN_STEP: Final = 1e-5
 MIN_SHIFT_STEP: Final = 1e-4
-"""Least steps that count: in radians, and as a share of ``max_distance``."""
+"""Steps below which the iteration ends: radians, and a share of ``max_distance``."""
 
 MAX_DISTANCE_FACTOR: Final = 5.0
 """Points that start farther off than this multiple of ``max_distance`` are left out.
@@ -61,7 +61,7 @@ class Registration:
         rms: RMS distance of the matched points from the target's planes, or for ``icp`` from its
             points, metres.
         overlap: share of the source's points with a target point within ``max_distance``, 0 to 1.
-        matched: number of these points.
+        matched: number of the source's points with such a target point.
         information: (6, 6), J^T J of the matched points' distances from the target's planes, for a
             small turn in radians about the target's axes, then a shift in metres. Divide it by the
             variance of a distance to get the inverse covariance.
@@ -113,14 +113,15 @@ def register(
 
     The result is the pose nearest to ``initial``, whose error should be less than ``max_distance``;
     points with five times this error are left out. The call holds Python's GIL, for tenths of a
-    second with 100,000 points: beside an event loop, run it in another process.
+    second with 100,000 points: in a program with an event loop, call it in another process.
 
     Args:
         source: cloud of at least 20 points.
         target: cloud of at least 20 points that does not move.
         method: ``gicp`` from surface to surface, ``plane`` from point to surface, ``icp`` from
             point to point.
-        voxel: size of the voxels that both clouds are thinned to first, metres; None: no thinning.
+        voxel: size, metres, of the voxels to which both clouds are thinned first; None: no
+            thinning.
         max_distance: largest distance, metres, at which two points are matched.
         initial: first estimate of ``T_target_source``, with the frames' names for the result; None:
             the identity, between frames ``target`` and ``source``.
@@ -131,33 +132,33 @@ def register(
             points.
         MissingExtraError: the extra ``depth`` is not installed.
     """
-    _check(method, max_distance, min_overlap)
-    begin = Transform("target", "source", np.eye(3), np.zeros(3)) if initial is None else initial
-    if not isinstance(begin, Transform):
-        raise ConfigurationError(f"initial: expected a Transform, got {type(begin).__name__}")
+    _check_arguments(method, max_distance, min_overlap)
+    start = Transform("target", "source", np.eye(3), np.zeros(3)) if initial is None else initial
+    if not isinstance(start, Transform):
+        raise ConfigurationError(f"initial: expected a Transform, got {type(start).__name__}")
     clouds = []
     for name, cloud in (("source", source), ("target", target)):
-        thin = cloud if voxel is None else voxel_grid(cloud, voxel)
-        if len(thin) < NEIGHBOURS:
+        thinned = cloud if voxel is None else voxel_grid(cloud, voxel)
+        if len(thinned) < NEIGHBOURS:
             raise ConfigurationError(
                 f"register: {name}: expected {NEIGHBOURS} points or more"
-                f"{'' if voxel is None else f', thinned to {voxel:g} m'}, got {len(thin)}"
+                f"{'' if voxel is None else f', thinned to {voxel:g} m'}, got {len(thinned)}"
             )
-        clouds.append(thin.points.astype(np.float64))
-    points, goals = clouds
-    tree = load("scipy.spatial").cKDTree(goals)
+        clouds.append(thinned.points.astype(np.float64))
+    points, target_points = clouds
+    tree = load("scipy.spatial").cKDTree(target_points)
     distances, _ = tree.query(
-        begin.apply(points), distance_upper_bound=MAX_DISTANCE_FACTOR * max_distance
+        start.apply(points), distance_upper_bound=MAX_DISTANCE_FACTOR * max_distance
     )
     points_near = points[np.isfinite(distances)]
-    pose, ended = begin, True
+    pose, has_ended = start, True
     if len(points_near) >= NEIGHBOURS:
-        pose, ended = _aligned(points_near, goals, begin, METHODS[method], max_distance)
-    match = _matched(points, tree, pose, max_distance)
-    return _judged(method, pose, ended, match, len(points), goals, tree, min_overlap)
+        pose, has_ended = _align(points_near, target_points, start, METHODS[method], max_distance)
+    match = _match_points(points, tree, pose, max_distance)
+    return _judge(method, pose, has_ended, match, len(points), target_points, tree, min_overlap)
 
 
-def _check(method: str, max_distance: float, min_overlap: float) -> None:
+def _check_arguments(method: str, max_distance: float, min_overlap: float) -> None:
     if method not in METHODS:
         raise ConfigurationError(
             f"method: expected one of {', '.join(METHODS)}, got {shown(method)}"
@@ -170,18 +171,18 @@ def _check(method: str, max_distance: float, min_overlap: float) -> None:
         raise ConfigurationError(f"min_overlap: expected 0 to 1, got {shown(min_overlap)}")
 
 
-def _aligned(
-    points: Array, goals: Array, begin: Transform, kind: str, reach: float
+def _align(
+    points: Array, target_points: Array, start: Transform, kind: str, reach: float
 ) -> tuple[Transform, bool]:
-    """Return the pose, and whether the iteration converged; both clouds are centred first."""
+    """Return the pose, and whether the iteration converged; both clouds are centred for it."""
     gicp = load("small_gicp")
-    centre, goal_centre = points.mean(axis=0), goals.mean(axis=0)
-    clouds = [gicp.PointCloud(points - centre), gicp.PointCloud(goals - goal_centre)]
+    centre, target_centre = points.mean(axis=0), target_points.mean(axis=0)
+    clouds = [gicp.PointCloud(points - centre), gicp.PointCloud(target_points - target_centre)]
     for cloud in clouds:
         gicp.estimate_normals_covariances(cloud, None, NEIGHBOURS)
     tree = gicp.KdTree(clouds[1])
 
-    def stepped(motion: Array, most: int) -> Any:
+    def run_steps(motion: Array, most: int) -> Any:
         return gicp.align(
             clouds[1],
             clouds[0],
@@ -195,25 +196,25 @@ def _aligned(
         )
 
     motion = np.eye(4)
-    motion[:3, :3] = begin.rotation
-    motion[:3, 3] = begin.rotation @ centre + begin.translation - goal_centre
-    result = stepped(motion, MAX_STEPS)
-    motion, ended = np.asarray(result.T_target_source, np.float64), bool(result.converged)
-    if np.isfinite(motion).all() and not ended:
+    motion[:3, :3] = start.rotation
+    motion[:3, 3] = start.rotation @ centre + start.translation - target_centre
+    result = run_steps(motion, MAX_STEPS)
+    motion, has_ended = np.asarray(result.T_target_source, np.float64), bool(result.converged)
+    if np.isfinite(motion).all() and not has_ended:
         before = motion
-        motion = np.asarray(stepped(before, FURTHER_STEPS).T_target_source, np.float64)
+        motion = np.asarray(run_steps(before, FURTHER_STEPS).T_target_source, np.float64)
         change = (points - centre) @ (motion - before)[:3, :3].T + (motion - before)[:3, 3]
-        ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < MAX_FURTHER_SHARE * reach)
+        has_ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < MAX_FURTHER_SHARE * reach)
     if not np.isfinite(motion).all():
-        return begin, False
+        return start, False
     # The product of many small turns is not exactly a rotation.
     left, _, right = np.linalg.svd(motion[:3, :3])
     rotation = left @ right
-    translation = motion[:3, 3] - rotation @ centre + goal_centre
-    return Transform(begin.target, begin.source, rotation, translation), ended
+    translation = motion[:3, 3] - rotation @ centre + target_centre
+    return Transform(start.target, start.source, rotation, translation), has_ended
 
 
-def _matched(points: Array, tree: Any, pose: Transform, reach: float) -> _Neighbours:
+def _match_points(points: Array, tree: Any, pose: Transform, reach: float) -> _Neighbours:
     turned = points @ pose.rotation.T
     moved = turned + pose.translation
     distances, nearest = tree.query(moved, distance_upper_bound=reach)
@@ -222,42 +223,44 @@ def _matched(points: Array, tree: Any, pose: Transform, reach: float) -> _Neighb
     return _Neighbours(moved[is_near], index, tree.data[index] - moved[is_near], turned[is_near])
 
 
-def _judged(
+def _judge(
     method: str,
     pose: Transform,
-    ended: bool,
+    has_ended: bool,
     match: _Neighbours,
     count: int,
-    goals: Array,
+    target_points: Array,
     tree: Any,
     min_overlap: float,
 ) -> Registration:
     matched = len(match.nearest)
     reasons = []
-    if not ended:
+    if not has_ended:
         reasons.append(f"the steps did not end within {MAX_STEPS}")
     if matched / count < min_overlap or matched < NEIGHBOURS:
         reasons.append(
             f"{matched} of {count} points of the source lie on the target, "
             f"{matched / count:.0%}; expected {min_overlap:.0%}"
         )
-    rms, information, covariance, left_open = math.nan, np.zeros((6, 6)), None, np.eye(6)
+    rms, information, covariance, undetermined = math.nan, np.zeros((6, 6)), None, np.eye(6)
     if matched >= NEIGHBOURS:
-        once, places = np.unique(match.nearest, return_inverse=True)
-        planes = planes_of(goals, tree, NEIGHBOURS, once).subset(places.reshape(-1))
+        matched_points, plane_of_match = np.unique(match.nearest, return_inverse=True)
+        planes = fit_planes(target_points, tree, NEIGHBOURS, matched_points).subset(
+            plane_of_match.reshape(-1)
+        )
         centre = match.moved.mean(axis=0)
         steps = open_directions(match.moved - centre, planes)
-        reasons += [_described(step, match.moved - centre) for step in steps]
-        left_open = steps.copy()
-        left_open[:, 3:] += np.cross(steps[:, :3], pose.translation - centre)
-        rows = slopes(match.arms, planes.normals)
+        reasons += [_describe_motion(step, match.moved - centre) for step in steps]
+        undetermined = steps.copy()
+        undetermined[:, 3:] += np.cross(steps[:, :3], pose.translation - centre)
+        rows = displacement_jacobian(match.arms, planes.normals)
         information = rows.T @ rows
-        across = (match.offsets * planes.normals).sum(axis=1)
-        distances = np.linalg.norm(match.offsets, axis=1) if method == "icp" else across
+        plane_distances = (match.offsets * planes.normals).sum(axis=1)
+        distances = np.linalg.norm(match.offsets, axis=1) if method == "icp" else plane_distances
         rms = float(np.sqrt((distances**2).mean()))
         if method != "icp" and not len(steps):
-            covariance = _covariance(rows, across, match.nearest)
-    for array in (information, covariance, left_open):
+            covariance = _covariance(rows, plane_distances, match.nearest)
+    for array in (information, covariance, undetermined):
         if array is not None:
             array.flags.writeable = False
     return Registration(
@@ -269,28 +272,28 @@ def _judged(
         matched=matched,
         information=information,
         covariance=covariance,
-        undetermined=left_open,
+        undetermined=undetermined,
     )
 
 
-def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
+def _covariance(rows: Array, plane_distances: Array, nearest: NDArray[np.intp]) -> Array:
     """Return the covariance of a fit to planes, from its residuals.
 
-    Residuals at the same point of the target have its error in common, so they are added before
+    Residuals at the same point of the target share this point's error, so they are added before
     they are squared.
     """
     # Source: White, A heteroskedasticity-consistent covariance matrix estimator (1980), over
     # groups by the method of Liang and Zeger (1986).
-    places = np.unique(nearest, return_inverse=True)[1].reshape(-1)
-    groups = np.zeros((int(places.max()) + 1, 6))
-    np.add.at(groups, places, rows * across[:, None])
+    group_of_match = np.unique(nearest, return_inverse=True)[1].reshape(-1)
+    groups = np.zeros((int(group_of_match.max()) + 1, 6))
+    np.add.at(groups, group_of_match, rows * plane_distances[:, None])
     inverse = np.linalg.inv(rows.T @ rows)
     spread = len(groups) / max(len(groups) - 6, 1)
     covariance: Array = spread * inverse @ (groups.T @ groups) @ inverse
     return covariance
 
 
-def _described(step: Array, arms: Array) -> str:
+def _describe_motion(step: Array, arms: Array) -> str:
     """Describe an undetermined motion about the matched points' centre in words."""
     turn, shift = step[:3], step[3:]
     reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
@@ -298,5 +301,5 @@ def _described(step: Array, arms: Array) -> str:
     main, word = (turn, "turn about") if size > np.linalg.norm(shift) else (shift, "shift along")
     axis = main / np.linalg.norm(main)
     axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
-    named = ", ".join(f"{value + 0.0:.2f}" for value in np.round(axis, 2))
-    return f"the surfaces do not determine a {word} ({named})"
+    axis_text = ", ".join(f"{value + 0.0:.2f}" for value in np.round(axis, 2))
+    return f"the surfaces do not determine a {word} ({axis_text})"

@@ -124,23 +124,23 @@ class TowerTable:
         self.random: np.random.Generator = np.random.default_rng(seed)
         self.blocks: list[WoodenBlock] = []
         self.held: WoodenBlock | None = None
-        self._beside = self.random.normal(0, CAMERA_SIGMA, 3)
+        self._camera_error = self.random.normal(0, CAMERA_SIGMA, 3)
 
     def look(self, camera: tuple[float, float, float], maps: int = 1) -> TableSight:
-        """Return a picture and ``maps`` depth maps from roughly the given place (metres)."""
-        true = np.add(camera, self._beside)
-        rays = _TableRays((float(true[0]), float(true[1]), float(true[2])))
+        """Return a picture and ``maps`` depth maps; the camera's place, metres, is not exact."""
+        true_place = np.add(camera, self._camera_error)
+        rays = _TableRays((float(true_place[0]), float(true_place[1]), float(true_place[2])))
         for block in self.blocks:
             rays.draw(block)
-        seen = rays.picture()
-        seen += GREY_SIGMA * self.random.standard_normal(seen.shape, np.float32)
-        rgb = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
-        return TableSight(camera, rgb, self._measured(rays.depth, maps) if maps else [])
+        levels = rays.picture()
+        levels += GREY_SIGMA * self.random.standard_normal(levels.shape, np.float32)
+        rgb = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+        return TableSight(camera, rgb, self._make_depth_maps(rays.depth, maps) if maps else [])
 
     def tower(self) -> list[WoodenBlock]:
         """Return the blocks of the highest stack, the lowest first."""
         top = max(self.blocks, key=lambda block: block.top)
-        stack = [block for block in self.blocks if _apart(block, top) < BLOCK[0] / 2]
+        stack = [block for block in self.blocks if _distance(block, top) < BLOCK[0] / 2]
         return sorted(stack, key=lambda block: block.z)
 
     def pick(self, x: float, y: float, angle: float) -> Grip:
@@ -148,10 +148,10 @@ class TowerTable:
 
         Returns the errors from the nearest black block; ``held`` is None if it is missed.
         """
-        wanted = WoodenBlock(x, y, angle)
+        gripper = WoodenBlock(x, y, angle)
         loose = [block for block in self.blocks if block.z == 0 and block.colour == "black"]
-        block = min(loose, key=lambda block: _apart(block, wanted))
-        grip = Grip(_apart(block, wanted), math.remainder(angle - block.angle, math.pi))
+        block = min(loose, key=lambda block: _distance(block, gripper))
+        grip = Grip(_distance(block, gripper), math.remainder(angle - block.angle, math.pi))
         if grip.off < GRIP_TOLERANCE_METRES and block.size == BLOCK:
             self.blocks.remove(block)
             c, s = math.cos(angle), math.sin(angle)
@@ -172,7 +172,7 @@ class TowerTable:
         return held
 
     def add(self) -> None:
-        """Add a wooden block to the tower as a person would, across and not quite straight."""
+        """Add a wooden block to the tower as a person would: across, and not quite straight."""
         top = self.tower()[-1]
         dx, dy = self.random.uniform(-0.004, 0.004, 2)
         angle = top.angle + math.pi / 2 + self.random.uniform(-0.15, 0.15)
@@ -182,37 +182,37 @@ class TowerTable:
         """Remove the highest block as a person would."""
         self.blocks.remove(self.tower()[-1])
 
-    def _measured(self, fine: NDArray[np.float32], maps: int) -> list[NDArray[np.uint16]]:
+    def _make_depth_maps(self, rays: NDArray[np.float32], maps: int) -> list[NDArray[np.uint16]]:
         """Return depth maps as of two cameras: mixed at edges, noisy, with holes."""
-        depth = _pixels(fine)
-        middle = fine[RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE, RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE]
-        rough = _jumps(middle)
-        hidden = _hidden(middle)
+        depth = _pixel_means(rays)
+        middle = rays[RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE, RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE]
+        at_jump = _find_jumps(middle)
+        is_hidden = _find_hidden(middle)
         measured: list[NDArray[np.uint16]] = []
         for _ in range(maps):
             sigma = depth**2 / (FOCAL * BASELINE) * DISPARITY_SIGMA
             noisy = depth + sigma * self.random.standard_normal(depth.shape, np.float32)
             chance = self.random.random(depth.shape, np.float32)
-            lost = hidden | (chance < HOLE_SHARES[0]) | (rough & (chance < HOLE_SHARES[1]))
-            measured.append(np.where(lost, 0, np.rint(1e3 * noisy)).astype(np.uint16))
+            is_hole = is_hidden | (chance < HOLE_SHARES[0]) | (at_jump & (chance < HOLE_SHARES[1]))
+            measured.append(np.where(is_hole, 0, np.rint(1e3 * noisy)).astype(np.uint16))
         return measured
 
 
-def _apart(first: WoodenBlock, other: WoodenBlock) -> float:
+def _distance(first: WoodenBlock, other: WoodenBlock) -> float:
     return math.hypot(first.x - other.x, first.y - other.y)
 
 
-def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:
+def _pixel_means(rays: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean of the rays of each pixel."""
     places = [(row, column) for row in range(RAYS_PER_SIDE) for column in range(RAYS_PER_SIDE)]
-    total = fine[::RAYS_PER_SIDE, ::RAYS_PER_SIDE].copy()
+    total = rays[::RAYS_PER_SIDE, ::RAYS_PER_SIDE].copy()
     for row, column in places[1:]:
-        total += fine[row::RAYS_PER_SIDE, column::RAYS_PER_SIDE]
+        total += rays[row::RAYS_PER_SIDE, column::RAYS_PER_SIDE]
     total /= len(places)
     return total
 
 
-def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _find_jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return the mask of the pixels that have a neighbour beyond an edge."""
     jumps = np.zeros(depth.shape, bool)
     for axis in (0, 1):
@@ -223,9 +223,9 @@ def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     return jumps
 
 
-def _hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _find_hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return the mask of the pixels that the second camera, to the right, does not see."""
-    column_in_right = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth  # columns in its picture
+    column_in_right = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth
     nearer = np.minimum.accumulate(column_in_right[:, ::-1], axis=1)[:, ::-1]
     hidden = np.zeros(depth.shape, bool)
     hidden[:, :-1] = column_in_right[:, :-1] >= nearer[:, 1:]
@@ -248,15 +248,15 @@ class _TableRays:
 
     def picture(self) -> NDArray[np.float32]:
         """Return the shaded picture, (H, W, 3)."""
-        seen = _pixels(self.colour)
+        levels = _pixel_means(self.colour)
         x, y, z = self._camera
         light = 1.0 + 0.5 * (x - 0.4 - self._down[::RAYS_PER_SIDE] * z)
-        seen *= (light - 0.7 * (y - self._across[::RAYS_PER_SIDE] * z))[..., None]
-        return seen
+        levels *= (light - 0.7 * (y - self._across[::RAYS_PER_SIDE] * z))[..., None]
+        return levels
 
     def draw(self, block: WoodenBlock) -> None:
         """Draw a block where it is nearer than the scene so far, by the slab method."""
-        box = self._box_of(block)
+        box = self._bounding_box(block)
         across, down = self._across[box[1]], self._down[box[0]]
         shape = np.broadcast_shapes(across.shape, down.shape)
         if 0 in shape:
@@ -264,29 +264,37 @@ class _TableRays:
         c, s = np.float32(math.cos(block.angle)), np.float32(math.sin(block.angle))
         to_camera = np.subtract(self._camera, (block.x, block.y, block.z))
         # AXES: right is -y of the robot, down is -x, ahead is -z
-        begin = (
+        origin = (
             c * to_camera[0] + s * to_camera[1],
             c * to_camera[1] - s * to_camera[0],
             to_camera[2] - block.size[2] / 2,
         )
-        ways = (-c * down - s * across, s * down - c * across, np.full((1, 1), -1.0, np.float32))
+        directions = (
+            -c * down - s * across,
+            s * down - c * across,
+            np.full((1, 1), -1.0, np.float32),
+        )
         nearest, farthest = np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
         side = np.zeros(shape, np.int8)
-        for axis, (start, direction, size) in enumerate(zip(begin, ways, block.size, strict=True)):
+        for axis, (start, direction, size) in enumerate(
+            zip(origin, directions, block.size, strict=True)
+        ):
             direction = np.where(np.abs(direction) < 1e-9, np.float32(1e-9), direction)
             first_face, other = ((sign * size / 2 - start) / direction for sign in (-1, 1))
             enters = np.minimum(first_face, other).astype(np.float32)
             side[np.broadcast_to(enters, shape) > nearest] = axis
             nearest = np.maximum(nearest, enters)
             farthest = np.minimum(farthest, np.maximum(first_face, other).astype(np.float32))
-        hit = (nearest < farthest) & (nearest < self.depth[box])
-        self.depth[box][hit] = nearest[hit]
-        along = begin[0] + nearest * ways[0]
-        grain = 1 + 0.06 * np.sin(900 * (begin[1] + nearest * ways[1]) + 20 * along)
+        is_hit = (nearest < farthest) & (nearest < self.depth[box])
+        self.depth[box][is_hit] = nearest[is_hit]
+        along = origin[0] + nearest * directions[0]
+        grain = 1 + 0.06 * np.sin(900 * (origin[1] + nearest * directions[1]) + 20 * along)
         shade = np.take(np.asarray(SHADES, np.float32), side) * grain
-        self.colour[box][hit] = shade[hit][:, None] * np.asarray(COLOURS[block.colour], np.float32)
+        self.colour[box][is_hit] = shade[is_hit][:, None] * np.asarray(
+            COLOURS[block.colour], np.float32
+        )
 
-    def _box_of(self, block: WoodenBlock) -> tuple[slice, slice]:
+    def _bounding_box(self, block: WoodenBlock) -> tuple[slice, slice]:
         """Return the rows and columns that the block covers."""
         reach = math.hypot(*block.size[:2]) / 2
         off_x, off_y = block.x - self._camera[0], block.y - self._camera[1]
@@ -303,7 +311,7 @@ class _TableRays:
         return slice(lows[0], highs[0]), slice(lows[1], highs[1])
 
 
-# ---------------------------------------------------------------------- what lies there at first
+# ---------------------------------------------------------------------- a table at the start
 
 
 def random_table(seed: int, supply: int = 5) -> TowerTable:
@@ -320,13 +328,13 @@ def random_table(seed: int, supply: int = 5) -> TowerTable:
     table.blocks.append(WoodenBlock(x, y, angle + math.pi / 2, z=BLOCK[2]))
     table.blocks.append(WoodenBlock(0.56, -0.17, random.uniform(-1.5, 1.5), colour="black"))
     others = [("black", (0.04, 0.04, 0.01)), ("black", (0.13, 0.01, 0.004))]
-    wanted = [*others, *[("black", BLOCK)] * supply, *[("wood", BLOCK)] * 3]
-    for colour, size in wanted:
-        table.blocks.append(_anywhere(table, colour, size))
+    objects = [*others, *[("black", BLOCK)] * supply, *[("wood", BLOCK)] * 3]
+    for colour, size in objects:
+        table.blocks.append(_random_object(table, colour, size))
     return table
 
 
-def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) -> WoodenBlock:
+def _random_object(table: TowerTable, colour: str, size: tuple[float, float, float]) -> WoodenBlock:
     """Return an object at a random place with room for a gripper, within the robot's reach.
 
     A high tower must not hide the place from a camera above the middle.
@@ -334,14 +342,14 @@ def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) 
     tower = table.blocks[0]
     for _ in range(100_000):
         x, y = table.random.uniform(0.17, 0.46), table.random.uniform(-0.26, 0.26)
-        apart = min(
+        gap = min(
             math.hypot(x - block.x, y - block.y)
             - math.hypot(*size[:2]) / 2
             - math.hypot(*block.size[:2]) / 2
             for block in table.blocks
         )
-        beside = math.hypot(x - tower.x, y - tower.y)
-        if apart > MIN_GAP_METRES and beside > 0.13 and 0.2 < math.hypot(x, y) < 0.47:
+        tower_distance = math.hypot(x - tower.x, y - tower.y)
+        if gap > MIN_GAP_METRES and tower_distance > 0.13 and 0.2 < math.hypot(x, y) < 0.47:
             angle = table.random.uniform(-math.pi / 2, math.pi / 2)
             return WoodenBlock(x, y, angle, colour=colour, size=size)
     raise ValueError("the table is full")

@@ -51,7 +51,7 @@ class DepthFrame:
         captured: time of the left frame's capture, seconds of ``time.monotonic()``.
         utc: time of the left frame's capture, seconds since 1970.
         skew: seconds by which the right frame was captured later.
-        sequences: the numbers that the cameras gave the frames, left and right.
+        sequences: sequence numbers of the left and the right frame.
     """
 
     depth: NDArray[np.float32]
@@ -74,8 +74,8 @@ class StereoStatistics:
         group: statistics of the frames' pairing; its ``skew`` is the largest skew.
         skew: seconds by which the right frames are later: the median of the last pairs; None: no
             pair came yet.
-        drift: rate by which the right camera's clock is faster than the left one's, seconds per
-            second; None: not known yet.
+        drift: rate by which the right camera's clock is faster than the left camera's clock,
+            seconds per second; None: not known yet.
         drift_from: source of ``drift``: ``clocks``, the cameras' own clocks; ``frames``, if they
             have none: the ratio of their frame counts at the same nominal rate; or "".
     """
@@ -87,7 +87,7 @@ class StereoStatistics:
 
 
 class StereoDepth:
-    """Two cameras and their calibration; an iterator of :class:`DepthFrame`, the newest first.
+    """Two cameras and their calibration; iterate to get the newest :class:`DepthFrame`.
 
     ::
 
@@ -109,7 +109,8 @@ class StereoDepth:
         matcher: matcher of the pictures; None: ``sgbm`` for disparities up to a fifth of the width.
         size: width and height of the rectified pictures, pixels; None: the size of the left
             calibration.
-        alpha: part of the pictures that is kept: 0: only valid pixels; 1: all source pixels.
+        alpha: share of the pictures that is kept, from 0: only valid pixels, to 1: all source
+            pixels.
         colour: whether :attr:`DepthFrame.left` is in colour.
         focal_sigma: standard deviation of the focal length, pixels of the calibrated left picture;
             a calibration of a pair has only the uncertainty of the poses.
@@ -145,7 +146,7 @@ class StereoDepth:
             len(size) == 2 and all(isinstance(count, int) and count > 0 for count in size)
         ):
             raise ConfigurationError(f"stereo: size: expected width and height, got {shown(size)}")
-        self._make = partial(
+        self._make_pair = partial(
             CalibratedPair, calibration, size=size, alpha=alpha, focal_sigma=focal_sigma
         )
         sources = {
@@ -176,7 +177,7 @@ class StereoDepth:
             raise LocalProtocolError("the pair of cameras was opened before; make a new one")
         self._worker = OneThread("stereo")
         try:
-            self._pair = await self._worker.run(self._make)
+            self._pair = await self._worker.run(self._make_pair)
             if self._matcher is None:
                 self._matcher = _default_matcher(self._pair.size[0])
             await self._group.__aenter__()
@@ -211,22 +212,22 @@ class StereoDepth:
         Raises:
             LocalProtocolError: the pair is not open.
         """
-        return self._opened()[1].camera_info
+        return self._require_open()[1].camera_info
 
     @property
     def rotation(self) -> NDArray[np.float64]:
         """The rotation (3, 3) from the left camera's frame into its rectified one."""
-        return self._opened()[1].rotation
+        return self._require_open()[1].rotation
 
     @property
     def baseline(self) -> float:
         """Metres between the cameras; raises as :attr:`camera_info` does."""
-        return self._opened()[1].baseline
+        return self._require_open()[1].baseline
 
     @property
     def min_depth(self) -> float:
         """Least depth that is measured, metres; raises as :attr:`camera_info` does."""
-        _, pair, matcher = self._opened()
+        _, pair, matcher = self._require_open()
         return pair.focal * pair.baseline / max(matcher.max_disparity, 1)
 
     def statistics(self) -> StereoStatistics:
@@ -251,13 +252,13 @@ class StereoDepth:
         Cancellation: safe; the pair that is being matched is dropped. The next call waits until
         matching ends, then uses the newest pair.
         """
-        worker, pair, matcher = self._opened()
-        await worker.idle()
-        both = await anext(self._group)
-        self._clock.saw(both["left"], both["right"])
-        return await worker.run(partial(_depth, both, pair, matcher, self._colour))
+        worker, pair, matcher = self._require_open()
+        await worker.wait_until_idle()
+        frame_pair = await anext(self._group)
+        self._clock.add_pair(frame_pair["left"], frame_pair["right"])
+        return await worker.run(partial(_measure_depth, frame_pair, pair, matcher, self._colour))
 
-    def _opened(self) -> tuple[OneThread, CalibratedPair, StereoMatcher]:
+    def _require_open(self) -> tuple[OneThread, CalibratedPair, StereoMatcher]:
         if self._worker is None or self._pair is None or self._matcher is None:
             raise LocalProtocolError("the pair of cameras is not open: use `async with`")
         return self._worker, self._pair, self._matcher
@@ -269,25 +270,27 @@ def _default_matcher(width: int) -> StereoMatcher:
     )
 
 
-def _depth(
-    both: FrameSet, pair: CalibratedPair, matcher: StereoMatcher, colour: bool
+def _measure_depth(
+    frame_pair: FrameSet, pair: CalibratedPair, matcher: StereoMatcher, colour: bool
 ) -> DepthFrame:
-    left, right = both["left"], both["right"]
+    left, right = frame_pair["left"], frame_pair["right"]
     grey = [
-        pair.rectified(_bytes(frame, frame.grey()), side, frame.source)
+        pair.rectify(_upper_bits(frame, frame.grey()), side, frame.source)
         for side, frame in enumerate((left, right))
     ]
     disparities = matcher(grey[0], grey[1])
     disparity = disparities.pixels
     pair.drop_outside(disparity)
     disparity[~(disparity > 0)] = np.nan  # at infinity, or behind the camera
-    depth = pair.depth(disparity)
-    shown = pair.rectified(_bytes(left, left.rgb()), 0, left.source) if colour else grey[0]
+    depth = pair.to_depth(disparity)
+    left_picture = (
+        pair.rectify(_upper_bits(left, left.rgb()), 0, left.source) if colour else grey[0]
+    )
     return DepthFrame(
         depth=depth,
-        sigma=pair.sigma(depth, disparities.sigma),
+        sigma=pair.depth_sigma(depth, disparities.sigma),
         disparity=disparity,
-        left=shown,
+        left=left_picture,
         camera_info=pair.camera_info,
         baseline=pair.baseline,
         captured=left.captured,
@@ -297,8 +300,8 @@ def _depth(
     )
 
 
-def _bytes(frame: Frame, pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return pixels as uint8: of more bits, the 8 highest."""
+def _upper_bits(frame: Frame, pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return pixels as uint8: the 8 highest bits of each."""
     if pixels.dtype == np.uint8:
         return pixels
     return (pixels >> (frame.format.depth - 8)).astype(np.uint8)

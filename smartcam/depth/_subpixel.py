@@ -20,15 +20,15 @@ MAX_GAUSS_NEWTON_STEPS: Final = 3
 """Largest number of steps of Gauss and Newton that refine the disparities."""
 
 MAX_LAST_MOVE_SIGMAS: Final = 1.0
-"""The fit ends when a step moves the disparities by less than this RMS, in sigmas: another step
-would move them by about a tenth of it."""
+"""RMS change of the disparities by a step, in sigmas, below which the fit ends: another step would
+change them by about a tenth of it."""
 
 MAX_SHIFT_PX: Final = 0.5
-"""A disparity may be moved by at most this many pixels: farther off is another point."""
+"""Largest change of a disparity, pixels: a larger change leads to another point."""
 
 MAX_ROUGHNESS_PX: Final = 0.5
-"""Largest RMS distance, pixels, of coarse disparities from a plane; a window with more has an edge
-in it."""
+"""Largest RMS distance, pixels, of coarse disparities from a plane; if it is larger, there is an
+edge in the window."""
 
 MIN_FILLED_SHARE: Final = 0.5
 """Least share of a window's pixels that must have disparities."""
@@ -58,15 +58,15 @@ MIN_NOISE_FACTOR: Final = 0.2
 """Least factor by which correlated noise changes a variance."""
 
 
-def refined(
+def refine_disparities(
     left: NDArray[np.uint8], right: NDArray[np.uint8], coarse: NDArray[np.float32], window: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return disparities and their sigma, both (H, W), NaN where ``coarse`` is.
+    """Return disparities and their sigma, both (H, W), NaN where ``coarse`` is NaN.
 
     In a window the disparity is a plane, and the brightness of the pictures differs by a constant
     and a factor: exposures, gains and the shade of lenses differ. If a window has an edge in it or
-    too little texture, or if the result is too far off, the coarse value stays: its sigma is
-    ``MIN_COARSE_SIGMA_PX``, or the roughness of the window if that is more.
+    too little texture, or if the result differs too much, the coarse value is kept. Its sigma is
+    ``MIN_COARSE_SIGMA_PX``, or the roughness of the window if the roughness is larger.
     """
     known = np.isfinite(coarse)
     sigma = np.where(known, np.float32(MIN_COARSE_SIGMA_PX), np.float32(np.nan))
@@ -74,47 +74,51 @@ def refined(
         return coarse, sigma
     sums = _WindowSums(window)
     pictures = left.astype(np.float32), right.astype(np.float32)
-    start = np.where(known, coarse, np.float32(0))
-    plane = _plane(start, known, sums)
-    smooth = (plane.rough <= MAX_ROUGHNESS_PX) & (plane.pixels >= MIN_FILLED_SHARE * window**2)
-    smooth &= _whole_around(known)
+    initial = np.where(known, coarse, np.float32(0))
+    plane = _fit_planes(initial, known, sums)
+    is_refinable = (plane.roughness <= MAX_ROUGHNESS_PX) & (
+        plane.pixels >= MIN_FILLED_SHARE * window**2
+    )
+    is_refinable &= _find_far_from_holes(known)
     # near an edge, a coarse value may belong to the other side of the edge
-    found_sigma = np.fmax(sigma, plane.rough)
-    disparity, usable = start, known
-    fit = _fitted(_linearized(pictures, disparity, known), disparity, None, plane, sums)
+    found_sigma = np.fmax(sigma, plane.roughness)
+    disparity, is_refined = initial, known
+    fit = _gauss_newton_step(_linearize(pictures, disparity, known), disparity, None, plane, sums)
     for step in range(MAX_GAUSS_NEWTON_STEPS):
-        last = step == MAX_GAUSS_NEWTON_STEPS - 1
+        is_last = step == MAX_GAUSS_NEWTON_STEPS - 1
         if step:
-            plane = _plane(disparity, usable if usable.any() else known, sums)
-            linear = _without_outliers(_linearized(pictures, disparity, known), fit)
-            fit = _fitted(linear, disparity, usable, plane, sums)
-            last = last or _moved(fit, disparity, usable) < MAX_LAST_MOVE_SIGMAS
-        if last:
-            fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
-        usable = (
-            smooth
+            plane = _fit_planes(disparity, is_refined if is_refined.any() else known, sums)
+            linear = _drop_outliers(_linearize(pictures, disparity, known), fit)
+            fit = _gauss_newton_step(linear, disparity, is_refined, plane, sums)
+            is_last = is_last or _relative_move(fit, disparity, is_refined) < MAX_LAST_MOVE_SIGMAS
+        if is_last:
+            fit = fit._replace(
+                sigma=fit.sigma * np.float32(np.sqrt(_correlation_factor(fit, is_refined)))
+            )
+        is_refined = (
+            is_refinable
             & (fit.sigma < MIN_COARSE_SIGMA_PX)
-            & (np.abs(fit.disparity - start) < MAX_SHIFT_PX)
+            & (np.abs(fit.disparity - initial) < MAX_SHIFT_PX)
         )
-        disparity = np.where(usable, fit.disparity, start)
-        if last:
+        disparity = np.where(is_refined, fit.disparity, initial)
+        if is_last:
             break
-    found_sigma = np.where(usable, fit.sigma, found_sigma)
+    found_sigma = np.where(is_refined, fit.sigma, found_sigma)
     disparity[~known] = np.nan
     found_sigma[~known] = np.nan
     return disparity.astype(np.float32, copy=False), found_sigma.astype(np.float32, copy=False)
 
 
-def _moved(fit: _Refined, before: Field, usable: NDArray[np.bool_]) -> float:
+def _relative_move(fit: _RefinedDisparity, before: Field, is_refined: NDArray[np.bool_]) -> float:
     """Return the RMS change of the usable disparities by a step, in sigmas."""
-    moves = (fit.disparity - before)[usable] / fit.sigma[usable]
+    moves = (fit.disparity - before)[is_refined] / fit.sigma[is_refined]
     return float(np.sqrt((moves**2).mean())) if len(moves) else 0.0
 
 
-def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask of the pixels without a hole nearby, as at edges of near objects."""
-    around = np.ones((2 * HOLE_MARGIN_PX + 1, 2 * HOLE_MARGIN_PX + 1), np.uint8)
-    return np.asarray(load("cv2").erode(known.astype(np.uint8), around) > 0)
+def _find_far_from_holes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the mask of the pixels that have no hole nearby, as edges of near objects have."""
+    neighbourhood = np.ones((2 * HOLE_MARGIN_PX + 1, 2 * HOLE_MARGIN_PX + 1), np.uint8)
+    return np.asarray(load("cv2").erode(known.astype(np.uint8), neighbourhood) > 0)
 
 
 class _WindowSums:
@@ -126,14 +130,17 @@ class _WindowSums:
         self._ramp = np.arange(side, dtype=np.float32) - side // 2
         self._border = self._cv2.BORDER_CONSTANT
 
-    def __call__(self, values: Field, across: int = 0, down: int = 0) -> Field:
-        """Return the sums of values times powers of the distance from the window's middle."""
-        if not (across or down):
+    def __call__(self, values: Field, x_power: int = 0, y_power: int = 0) -> Field:
+        """Return sums of values, each times its offset from the window's middle to a power.
+
+        ``x_power`` and ``y_power``: powers of the horizontal and the vertical offset.
+        """
+        if not (x_power or y_power):
             summed = self._cv2.boxFilter(
                 values, -1, self._side, normalize=False, borderType=self._border
             )
         else:
-            x, y = self._ramp**across, self._ramp**down
+            x, y = self._ramp**x_power, self._ramp**y_power
             summed = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
         return np.asarray(summed, dtype=np.float32)
 
@@ -141,79 +148,82 @@ class _WindowSums:
 class _DisparityPlane(NamedTuple):
     """The disparities in each window, as a plane; all are (H, W)."""
 
-    across: Field  # slope, pixels per pixel
-    down: Field
-    rough: Field  # RMS distance of the disparities from the plane, pixels
+    slope_x: Field  # pixels per pixel
+    slope_y: Field
+    roughness: Field  # RMS distance of the disparities from the plane, pixels
     pixels: Field  # number of pixels with a disparity
 
 
-def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _DisparityPlane:
+def _fit_planes(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _DisparityPlane:
     mask = known.astype(np.float32)
     # values near 0 keep the precision of the squares below
     values = (disparity - disparity.mean(where=known, dtype=np.float64).astype(np.float32)) * mask
     count = np.maximum(sums(mask), 1)
     total = sums(values)
-    left = sums(values * values) - total * total / count
+    residual_squares = sums(values * values) - total * total / count
     x, y = sums(mask, 1, 0), sums(mask, 0, 1)
     xx = np.maximum(sums(mask, 2, 0) - x * x / count, 1)
     yy = np.maximum(sums(mask, 0, 2) - y * y / count, 1)
     xy = sums(mask, 1, 1) - x * y / count
     xd, yd = sums(values, 1, 0) - total * x / count, sums(values, 0, 1) - total * y / count
-    scale = np.maximum(xx * yy - xy * xy, 1)
-    across: Field = (yy * xd - xy * yd) / scale
-    down: Field = (xx * yd - xy * xd) / scale
-    left -= across * xd + down * yd
-    return _DisparityPlane(across, down, np.sqrt(np.maximum(left, 0) / count), count)
+    determinant = np.maximum(xx * yy - xy * xy, 1)
+    slope_x: Field = (yy * xd - xy * yd) / determinant
+    slope_y: Field = (xx * yd - xy * xd) / determinant
+    residual_squares -= slope_x * xd + slope_y * yd
+    return _DisparityPlane(
+        slope_x, slope_y, np.sqrt(np.maximum(residual_squares, 0) / count), count
+    )
 
 
 class _LinearMatch(NamedTuple):
     """The difference of the pictures and its slope by disparity; 0 if unknown."""
 
     e: Field  # left minus right picture, grey levels
-    g: Field  # slope of both, grey levels per pixel
+    g: Field  # mean slope of both pictures, grey levels per pixel
     r: Field  # right picture, grey levels about the middle of their range
     mask: Field  # 1 where the other fields are known, else 0
 
 
-def _linearized(
+def _linearize(
     pictures: tuple[Field, Field], disparity: Field, known: NDArray[np.bool_]
 ) -> _LinearMatch:
     left, right = pictures
     width = left.shape[1]
-    matched = np.arange(width, dtype=np.float32) - disparity
-    inside = known & (matched >= 2) & (matched <= width - 4)  # interpolation uses six pixels
-    mask = inside.astype(np.float32)
-    moved, slope = _sampled(right, np.where(inside, matched, np.float32(2)))
+    right_columns = np.arange(width, dtype=np.float32) - disparity
+    # interpolation uses six pixels
+    is_inside = known & (right_columns >= 2) & (right_columns <= width - 4)
+    mask = is_inside.astype(np.float32)
+    right_levels, slope = _interpolate(right, np.where(is_inside, right_columns, np.float32(2)))
     slope += np.gradient(left, axis=1)
-    level = (moved - np.float32(MIDDLE_GREY)) * mask
-    return _LinearMatch((left - moved) * mask, slope * mask / 2, level, mask)
+    level = (right_levels - np.float32(MIDDLE_GREY)) * mask
+    return _LinearMatch((left - right_levels) * mask, slope * mask / 2, level, mask)
 
 
-class _Refined(NamedTuple):
+class _RefinedDisparity(NamedTuple):
     """Refined disparities, all (H, W); the sigma is infinite without texture."""
 
     disparity: Field  # disparities, pixels
     sigma: Field  # sigma from uncorrelated noise, pixels
     linear: _LinearMatch
-    # expected part of linear.e, by the constant and the gain of each window, grey levels
+    # part of linear.e that the constant and the gain of each window explain, grey levels
     expected: Field
     variance: Field  # variance of linear.e, grey levels^2
 
 
-def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
-    """Return the equations without outliers, such as pixels of another surface."""
-    fits = np.abs(linear.e - fit.expected) <= MAX_INLIER_SIGMAS * np.sqrt(fit.variance)
-    return _LinearMatch(*(term * fits for term in linear))
+def _drop_outliers(linear: _LinearMatch, fit: _RefinedDisparity) -> _LinearMatch:
+    """Return the equations with 0 for outliers, such as pixels of another surface."""
+    is_inlier = np.abs(linear.e - fit.expected) <= MAX_INLIER_SIGMAS * np.sqrt(fit.variance)
+    return _LinearMatch(*(term * is_inlier for term in linear))
 
 
-def _fitted(
+def _gauss_newton_step(
     linear: _LinearMatch,
     disparity: Field,
     trusted: NDArray[np.bool_] | None,
     plane: _DisparityPlane,
     sums: _WindowSums,
-) -> _Refined:
-    """Return one step of Gauss and Newton for every window.
+) -> _RefinedDisparity:
+    """Take a step of Gauss and Newton in every window, and return the new disparities.
 
     The noise is estimated from the ``trusted`` pixels.
     """
@@ -225,7 +235,7 @@ def _fitted(
     n = np.maximum(sums(mask), 1)
     sg, sr, mean = sums(g), sums(level), sums(level * level)
     sy, gy, ry = (
-        sums(constant_) + plane.across * sums(g_, 1) + plane.down * sums(g_, 0, 1)
+        sums(constant_) + plane.slope_x * sums(g_, 1) + plane.slope_y * sums(g_, 0, 1)
         for constant_, g_ in ((constant, g), (constant * g, gg), (constant * level, rg))
     )
     gy -= sg * sy / n
@@ -250,26 +260,26 @@ def _fitted(
     with np.errstate(divide="ignore", invalid="ignore"):
         correction = (gr * ry / rr - gy) / curvature
         sigma = np.sqrt(variance / texture)
-    usable = (texture > 0) & np.isfinite(correction) & (n >= MIN_WINDOW_PIXELS)
-    return _Refined(
-        np.where(usable, correction, disparity),
-        np.where(usable, sigma, np.inf),
+    is_usable = (texture > 0) & np.isfinite(correction) & (n >= MIN_WINDOW_PIXELS)
+    return _RefinedDisparity(
+        np.where(is_usable, correction, disparity),
+        np.where(is_usable, sigma, np.inf),
         linear,
         se / m + gain * (level - st / m),
         variance,
     )
 
 
-def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
+def _interpolate(picture: Field, columns: Field) -> tuple[Field, Field]:
     """Return brightness and slope at columns (H, W) of each row."""
     # Lagrange's polynomial through six pixels. OpenCV's remap is of no use here: its cubic kernel
     # (a = -0.75) moves a ramp by up to 0.03 pixels.
     height, width = picture.shape
-    wide = np.pad(picture, ((0, 0), (3, 3)), mode="edge").ravel()
+    padded = np.pad(picture, ((0, 0), (3, 3)), mode="edge").ravel()
     base = np.floor(columns)
     t = columns - base
     start = base.astype(np.int32) + (1 + np.arange(height, dtype=np.int32) * (width + 6))[:, None]
-    pixels = [wide[k:].take(start) for k in range(6)]  # at -2 to 3 from the column
+    pixels = [padded[k:].take(start) for k in range(6)]  # at -2 to 3 from the column
     factors = {node: t - np.float32(node) for node in range(-2, 4)}
     value = np.zeros_like(t)
     for node, pixel in zip(factors, pixels, strict=True):
@@ -283,7 +293,7 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
     return value, slope
 
 
-def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
+def _correlation_factor(fit: _RefinedDisparity, trusted: NDArray[np.bool_]) -> float:
     """Return the factor by which the neighbours' correlation changes the variance of sums of g e.
 
     The factor is 1 without correlation. Pixels of a rectified picture are correlated, since
@@ -300,18 +310,18 @@ def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
     e -= level * (float((e * level).sum()) / max(float((level * level).sum()), 1.0))
     height, width = e.shape
 
-    def products(one: Field, other: Field, u: int, v: int) -> float:
+    def lagged_product(one: Field, other: Field, u: int, v: int) -> float:
         first = one[v:, max(u, 0) : width + min(u, 0)]
         second = other[: height - v, max(-u, 0) : width + min(-u, 0)]
         return float(np.einsum("ij,ij->", first, second))
 
-    power = products(e, e, 0, 0) * products(g, g, 0, 0)
+    power = lagged_product(e, e, 0, 0) * lagged_product(g, g, 0, 0)
     if power <= 0:
         return 1.0
     total = 1.0
     for v in range(MAX_NOISE_LAG_PX + 1):
         for u in range(-MAX_NOISE_LAG_PX if v else 1, MAX_NOISE_LAG_PX + 1):
-            both = products(e, e, u, v) * products(g, g, u, v)
-            crossed = products(e, g, u, v) * products(g, e, u, v)
-            total += 2 * (both + crossed) / power
+            direct = lagged_product(e, e, u, v) * lagged_product(g, g, u, v)
+            crossed = lagged_product(e, g, u, v) * lagged_product(g, e, u, v)
+            total += 2 * (direct + crossed) / power
     return max(total, MIN_NOISE_FACTOR)

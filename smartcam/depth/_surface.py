@@ -1,4 +1,4 @@
-"""Fit a plane about each point of a cloud, and find the motions that planes leave undetermined."""
+"""Fit a plane around each point of a cloud, and find the motions that planes do not determine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POINTS_AT_A_TIME: Final = 1 << 15
 """Number of points whose neighbours are in memory at a time."""
 
 MIN_INFORMATION_FACTOR: Final = 12.0
-"""Least ratio of a direction's information to that from noise of the normals alone.
+"""Least ratio of a direction's information to the information from the normals' noise alone.
 
 On simulated clouds the ratio is 0.8 to 1.4 for the free directions of planes, edges and corridors,
 up to 11 for the free directions of cylinders and spheres, and 29 or more in a corner.
@@ -38,35 +38,35 @@ class SurfacePlanes(NamedTuple):
     tilts: Array
 
     def subset(self, index: Any) -> SurfacePlanes:
-        """Return the planes at an index."""
+        """Return the planes that an index selects."""
         return SurfacePlanes(*(column[index] for column in self))
 
 
-def planes_of(points: Array, tree: Any, neighbours: int, index: NDArray[np.intp]) -> SurfacePlanes:
-    """Fit a plane around each point of an index, through its nearest points and itself.
+def fit_planes(points: Array, tree: Any, neighbours: int, index: NDArray[np.intp]) -> SurfacePlanes:
+    """Fit a plane through each point that an index selects, and its nearest points.
 
     ``tree``: search tree of all points.
     """
     planes = []
     for start in range(0, len(index), POINTS_AT_A_TIME):
         _, nearest = tree.query(points[index[start : start + POINTS_AT_A_TIME]], k=neighbours)
-        planes.append(_fitted(points[nearest]))
+        planes.append(_fit_groups(points[nearest]))
     return SurfacePlanes(*(np.concatenate(parts) for parts in zip(*planes, strict=True)))
 
 
-def _fitted(groups: Array) -> SurfacePlanes:
+def _fit_groups(groups: Array) -> SurfacePlanes:
     """Fit planes through groups (N, K, 3) of points."""
     offsets = groups - groups.mean(axis=1, keepdims=True)
     spreads = offsets.transpose(0, 2, 1) @ offsets / groups.shape[1]
     values, vectors = np.linalg.eigh(spreads)
     # Noise turns an eigenvector towards another with variance l0 l1 / (K (l1 - l0)^2).
     # Source: Anderson, Asymptotic theory for principal component analysis (1963).
-    apart = np.maximum((values[:, 1:] - values[:, :1]) ** 2, np.finfo(float).tiny)
-    tilts = values[:, :1] * values[:, 1:] / (groups.shape[1] * apart)
+    squared_gaps = np.maximum((values[:, 1:] - values[:, :1]) ** 2, np.finfo(float).tiny)
+    tilts = values[:, :1] * values[:, 1:] / (groups.shape[1] * squared_gaps)
     return SurfacePlanes(vectors[:, :, 0], vectors[:, :, 1:], np.clip(tilts, 0.0, 1.0))
 
 
-def slopes(arms: Array, directions: Array) -> Array:
+def displacement_jacobian(arms: Array, directions: Array) -> Array:
     """Return the derivatives (N, 6) of displacements along directions (N, 3) by turn and shift.
 
     ``arms`` (N, 3): vectors to the points from the centre of the turn.
@@ -82,11 +82,13 @@ def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     """
     reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
     scaled = arms / reach
-    rows = slopes(scaled, planes.normals)
+    rows = displacement_jacobian(scaled, planes.normals)
     information = rows.T @ rows
     noise = np.zeros((6, 6))
     for axis in range(2):
-        part = slopes(scaled, planes.along[:, :, axis]) * np.sqrt(planes.tilts[:, axis, None])
+        part = displacement_jacobian(scaled, planes.along[:, :, axis]) * np.sqrt(
+            planes.tilts[:, axis, None]
+        )
         noise += part.T @ part
     # Rounding to float32 is noise, too: without it, a flat cloud would have no tilts.
     noise += 1e-7 * np.trace(information) * np.eye(6)

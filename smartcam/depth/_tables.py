@@ -39,7 +39,7 @@ def shown(data: bytes | str) -> str:
     return repr(text if len(text) <= 60 else f"{text[:60]}...")
 
 
-def header_line(data: bytes, start: int) -> tuple[str, int]:
+def read_header_line(data: bytes, start: int) -> tuple[str, int]:
     """Return a line of the header, without LF or CR LF, and the offset of the next line."""
     end = data.find(b"\n", start, MAX_HEADER_BYTES)
     if end < 0:
@@ -56,7 +56,7 @@ def header_line(data: bytes, start: int) -> tuple[str, int]:
         _fail("a header in ASCII", line)
 
 
-def count_of(text: str, label: str) -> int:
+def parse_count(text: str, label: str) -> int:
     """Return a count from text; raise BadTableError if the text is not a count."""
     if not (text.isascii() and text.isdigit() and len(text) <= 15):
         _fail(f"a number of {label}", text)
@@ -95,12 +95,12 @@ def from_text(
     if 2 * len(types) * count > len(data) - start + 1:
         raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
     columns = tuple(np.empty(count, kind) for kind in types)
-    done, offset, to_skip = 0, start, skip
-    while done < count:
+    row_count, offset, to_skip = 0, start, skip
+    while row_count < count:
         lines: list[list[bytes]] = []
-        while len(lines) < min(NUMBERS_AT_A_TIME // len(types), count - done):
+        while len(lines) < min(NUMBERS_AT_A_TIME // len(types), count - row_count):
             if offset >= len(data):
-                raise BadTableError(f"{count} lines of numbers", f"{done + len(lines)}")
+                raise BadTableError(f"{count} lines of numbers", f"{row_count + len(lines)}")
             end = data.find(b"\n", offset)
             end = len(data) if end < 0 else end
             if end - offset > MAX_LINE_BYTES:
@@ -111,15 +111,17 @@ def from_text(
             elif len(words) == len(types):
                 lines.append(words)
             elif words:
-                _fail(f"{len(types)} numbers in line {done + len(lines) + 1}", b" ".join(words))
+                _fail(
+                    f"{len(types)} numbers in line {row_count + len(lines) + 1}", b" ".join(words)
+                )
         for column, texts in zip(columns, zip(*lines, strict=True), strict=True):
-            column[done : done + len(lines)] = _numbers(texts, column.dtype)
-        done += len(lines)
+            column[row_count : row_count + len(lines)] = _parse_numbers(texts, column.dtype)
+        row_count += len(lines)
     return columns
 
 
-def _numbers(texts: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Return a column's numbers."""
+def _parse_numbers(texts: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Parse the numbers of a column."""
     try:
         if kind.kind == "f":
             values = np.array([float(text) for text in texts], np.float64)
@@ -135,7 +137,7 @@ def _numbers(texts: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
 
 
 def to_text(columns: Iterable[NDArray[Any]]) -> bytes:
-    """Return columns as lines of text; float32 values are exact when read again."""
+    """Return columns as lines of text, with digits that restore float32 values exactly."""
     words = [
         [f"{value:.9g}" for value in column.tolist()]
         if column.dtype.kind == "f"

@@ -1,7 +1,7 @@
 """A camera's lens: from directions to pixels and back.
 
 The camera's frame is that of OpenCV and ROS' optical frames: x to the right of the image, y down,
-z forward. Pixels count from the middle of the upper left one.
+z forward. The middle of the upper left pixel has the coordinates (0, 0).
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ COEFFICIENT_NAMES: dict[DistortionModel, tuple[str, ...]] = {
     "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "equidistant": ("k1", "k2", "k3", "k4"),
 }
-"""Names of each model's coefficients, in order; ``equidistant`` has powers of the angle."""
+"""Names of each model's coefficients, in order; those of ``equidistant`` belong to powers of the
+angle."""
 
 COEFFICIENTS: dict[DistortionModel, int] = {
     model: len(names) for model, names in COEFFICIENT_NAMES.items()
@@ -42,15 +43,15 @@ def coefficient_names(model: DistortionModel) -> tuple[str, ...]:
     return COEFFICIENT_NAMES[model]
 
 
-def _column(values: ArrayLike) -> Array:
-    """Return a copy (K,) of a row or column of coefficients; raise SHAPE or NOT_FINITE."""
+def _as_coefficients(values: ArrayLike) -> Array:
+    """Return coefficients from a row or a column as a copy (K,); raise SHAPE or NOT_FINITE."""
     try:
-        column = np.reshape(values, (-1, 1))
+        coefficients = np.reshape(values, (-1, 1))
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise Code.SHAPE.refusal(
             f"distortion: expected numbers of shape (K,): {exc!s:.200}", "(K,)"
         ) from exc
-    return as_points(column, 1, "distortion")[:, 0].copy()
+    return as_points(coefficients, 1, "distortion")[:, 0].copy()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,13 +77,13 @@ class CameraModel(Stored):
         check_size(self.size, "camera")
         matrix = as_points(self.matrix, 3, "camera matrix").copy()
         count = len(coefficient_names(self.distortion_model))
-        distortion = _column(self.distortion)
+        distortion = _as_coefficients(self.distortion)
         if len(distortion) != count:
             raise Code.SHAPE.unexpected(
                 f"{self.distortion_model}: expected {count} coefficients", count, len(distortion)
             )
-        plain = matrix.shape == (3, 3) and not (matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).any()
-        if not (plain and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[2, 2] == 1):
+        has_form = matrix.shape == (3, 3) and not (matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).any()
+        if not (has_form and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[2, 2] == 1):
             raise Code.SHAPE.unexpected(
                 "camera matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal "
                 "lengths and no skew",
@@ -114,8 +115,8 @@ class CameraModel(Stored):
         Raises:
             CalibrationError: SHAPE or NOT_FINITE.
         """
-        given = as_points(points, 3, "points before the camera")
-        if not len(given):
+        camera_points = as_points(points, 3, "points in front of the camera")
+        if not len(camera_points):
             return np.zeros((0, 2))
         cv2 = load("cv2")
         # u = fx x'' + cx, v = fy y'' + cy of the distorted direction. With x = X/Z, y = Y/Z and
@@ -125,14 +126,16 @@ class CameraModel(Stored):
         # equidistant, with a = atan(r): (x'', y'') = (x, y) a (1 + k1 a^2 + ... + k4 a^8) / r.
         # Source: Brown, Decentering Distortion of Lenses (1966); Kannala and Brandt, A Generic
         # Camera Model (2006); OpenCV's documentation of calib3d and of its fisheye part.
-        source = given.reshape(-1, 1, 3)
+        source = camera_points.reshape(-1, 1, 3)
         zero = np.zeros(3)
         if self.distortion_model == "equidistant":
-            seen = cv2.fisheye.projectPoints(source, zero, zero, self.matrix, self.distortion)[0]
+            projected, _ = cv2.fisheye.projectPoints(
+                source, zero, zero, self.matrix, self.distortion
+            )
         else:
-            seen = cv2.projectPoints(source, zero, zero, self.matrix, self.distortion)[0]
-        pixels: Array = np.array(seen, dtype=np.float64).reshape(-1, 2)
-        pixels[given[:, 2] <= 0] = np.nan
+            projected, _ = cv2.projectPoints(source, zero, zero, self.matrix, self.distortion)
+        pixels: Array = np.array(projected, dtype=np.float64).reshape(-1, 2)
+        pixels[camera_points[:, 2] <= 0] = np.nan
         return pixels
 
     def directions(self, pixels: ArrayLike) -> Array:
@@ -147,11 +150,11 @@ class CameraModel(Stored):
         Raises:
             CalibrationError: SHAPE or NOT_FINITE.
         """
-        given = as_points(pixels, 2, "pixels")
-        if not len(given):
+        image_points = as_points(pixels, 2, "pixels")
+        if not len(image_points):
             return np.zeros((0, 2))
         cv2 = load("cv2")
-        source = given.reshape(-1, 1, 2)
+        source = image_points.reshape(-1, 1, 2)
         if self.distortion_model == "equidistant":
             rays: Any = cv2.fisheye.undistortPoints(source, self.matrix, self.distortion)
         else:
@@ -167,5 +170,5 @@ class CameraModel(Stored):
     def undistort(self, pixels: ArrayLike) -> Array:
         """Return pixels (N, 2) without the lens' distortion, (N, 2)."""
         rays = self.directions(pixels)
-        straight: Array = rays @ self.matrix[:2, :2].T + self.matrix[:2, 2]
-        return straight
+        undistorted: Array = rays @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        return undistorted

@@ -1,4 +1,4 @@
-"""Check arguments of several types: words from a list, and sizes of images."""
+"""Check arguments: a text that must be one of a list, and the size of an image."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def check_choice(value: object, among: Sequence[str], label: str) -> None:
     word = plain(value)  # a user's class may hash and compare in any way
     if not isinstance(word, str) or word not in among:
         known = list(among)
-        text = f"{label}: expected one of {known}, got {shown(value)}"
-        raise Code.SHAPE.refusal(text, known, value)
+        message = f"{label}: expected one of {known}, got {shown(value)}"
+        raise Code.SHAPE.refusal(message, known, value)
 
 
-def check_size(values: Any, called: str) -> None:
+def check_size(values: Any, label: str) -> None:
     """Raise SHAPE unless a value is an image's width and height, pixels."""
     integers = (int, np.integer)
-    plain = isinstance(values, tuple | list) and len(values) == 2
-    if not plain or not all(isinstance(value, integers) and value > 0 for value in values):
-        expected = f"{called}: size: expected width and height in pixels"
+    is_pair = isinstance(values, tuple | list) and len(values) == 2
+    if not is_pair or not all(isinstance(value, integers) and value > 0 for value in values):
+        expected = f"{label}: size: expected width and height in pixels"
         raise Code.SHAPE.unexpected(expected, "(width, height)", values)

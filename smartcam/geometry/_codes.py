@@ -13,7 +13,7 @@ MAX_VALUE_CHARACTERS = 200
 
 
 class Code(enum.StrEnum):
-    """``code`` of a :class:`~smartcam.CalibrationError` and of a :class:`Remark`."""
+    """Value of ``code`` in a :class:`~smartcam.CalibrationError` or a :class:`Remark`."""
 
     # samples
     SHAPE = "SHAPE"
@@ -157,10 +157,10 @@ class Code(enum.StrEnum):
     ) -> CalibrationError:
         """Return an error; ``text`` names the expected value, and ``got`` is appended."""
         try:
-            described = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
+            shown_value = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
         except Exception:  # noqa: BLE001 - a foreign class may raise any
-            described = shown(got)
-        return self.refusal(f"{text}, got {described}", expected, got)
+            shown_value = shown(got)
+        return self.refusal(f"{text}, got {shown_value}", expected, got)
 
     def remark(self, text: str) -> Remark:
         """Return a remark with this code."""

@@ -87,9 +87,9 @@ class PlacePattern(Sequence[Transform]):
         height: float = 0.0,
         robot_frame: str = "robot",
     ) -> PlacePattern:
-        """Return the pattern with three corner places of the lowest layer as a robot touched them.
+        """Return the pattern whose lowest layer has three corners that a robot touched.
 
-        Layers are stacked towards the side from which the turn from row to column is to the left.
+        The layers' direction is the cross product of the row's and the column's direction.
 
         Args:
             first: (3,), the first place, metres.
@@ -109,12 +109,12 @@ class PlacePattern(Sequence[Transform]):
         caller = "PlacePattern.from_touches"
         rows = check_integer(rows, "rows", 2, MAX_PLACES, caller)
         columns = check_integer(columns, "columns", 2, MAX_PLACES, caller)
-        target = check_text(robot_frame, "robot_frame", caller)
+        frame_name = check_text(robot_frame, "robot_frame", caller)
         corner = as_vector(first, 3, "first")
-        along = as_vector(row_end, 3, "row_end") - corner
-        across = as_vector(column_end, 3, "column_end") - corner
-        normal = np.cross(along, across)
-        lengths = float(np.linalg.norm(along)), float(np.linalg.norm(across))
+        row_vector = as_vector(row_end, 3, "row_end") - corner
+        column_vector = as_vector(column_end, 3, "column_end") - corner
+        normal = np.cross(row_vector, column_vector)
+        lengths = float(np.linalg.norm(row_vector)), float(np.linalg.norm(column_vector))
         sine = float(np.linalg.norm(normal)) / max(lengths[0] * lengths[1], 1e-300)
         if not sine >= MIN_SINE:
             raise Code.NOT_RIGID.refusal(
@@ -123,10 +123,10 @@ class PlacePattern(Sequence[Transform]):
                 MIN_SINE,
                 sine,
             )
-        x, z = along / lengths[0], normal / np.linalg.norm(normal)
+        x, z = row_vector / lengths[0], normal / np.linalg.norm(normal)
         rotation = np.column_stack([x, np.cross(z, x), z])
         return cls(
-            frame=Transform(target, "place", rotation, corner),
+            frame=Transform(frame_name, "place", rotation, corner),
             rows=rows,
             columns=columns,
             layers=layers,
@@ -142,10 +142,10 @@ class PlacePattern(Sequence[Transform]):
     @overload
     def __getitem__(self, index: slice) -> list[Transform]: ...
     def __getitem__(self, index: int | slice) -> Transform | list[Transform]:
-        """Return the pose of a place by its number, from 0, or the poses of several places."""
+        """Return the pose of the place with an index, or the poses of a slice of places."""
         if isinstance(index, slice):
-            return [self._place(number) for number in range(len(self))[index]]
-        return self._place(range(len(self))[index])
+            return [self._pose_of(number) for number in range(len(self))[index]]
+        return self._pose_of(range(len(self))[index])
 
     def at(self, number: int) -> tuple[int, int, int]:
         """Return row, column and layer of a place, each from 0.
@@ -157,11 +157,11 @@ class PlacePattern(Sequence[Transform]):
             ConfigurationError: there is no such place.
         """
         number = check_integer(number, "number", 0, len(self) - 1, "PlacePattern.at")
-        layer, left = divmod(number, self.rows * self.columns)
-        row, column = divmod(left, self.columns)
+        layer, rest = divmod(number, self.rows * self.columns)
+        row, column = divmod(rest, self.columns)
         return row, column, layer
 
-    def _place(self, number: int) -> Transform:
+    def _pose_of(self, number: int) -> Transform:
         row, column, layer = self.at(number)
         steps: Array = np.array([column, row, layer]) * self.pitch
         return Transform(

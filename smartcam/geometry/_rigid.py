@@ -4,8 +4,8 @@ A motion is ``p' = R p + t``. Rotations are matrices, since points are multiplie
 their exponential and logarithm are those of SciPy's ``Rotation``.
 
 A small step ``(w, d)`` is a rotation vector and a shift. The shift is always added to ``t``, along
-the axes of the target frame. The turn is on either side of R: ``exp([w]x) R`` turns about the
-target frame's axes, ``R exp([w]x)`` about the source frame's axes.
+the axes of the target frame. The turn is multiplied to R from the left or from the right:
+``exp([w]x) R`` turns about the target frame's axes, ``R exp([w]x)`` about the source frame's axes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Index = NDArray[np.intp] | Sequence[int] | slice | int
 
 SMALL_ANGLE = 1e-4
-"""Angle, radians, below which the first term of a series is used; its error is 1e-9."""
+"""Angle, radians, below which the first term of a series replaces a formula; the error is 1e-9."""
 
 
 class Rigid(NamedTuple):
@@ -62,8 +62,8 @@ class Rigid(NamedTuple):
     def inverse(self) -> Rigid:
         """Return the inverse motions."""
         # p' = R p + t  <=>  p = R^T p' - R^T t
-        back = np.swapaxes(self.rotation, -1, -2)
-        return Rigid(back, -(back @ self.translation[..., None])[..., 0])
+        transposed = np.swapaxes(self.rotation, -1, -2)
+        return Rigid(transposed, -(transposed @ self.translation[..., None])[..., 0])
 
     def apply(self, points: Array) -> Array:
         """Return the moved points (..., N, 3)."""
@@ -71,7 +71,7 @@ class Rigid(NamedTuple):
         return moved
 
     def subset(self, index: Index) -> Rigid:
-        """Return the motions at an index."""
+        """Return the motions that an index selects."""
         return Rigid(self.rotation[index], self.translation[index])
 
     def scaled(self, scale: float) -> Rigid:
@@ -103,7 +103,7 @@ class Rigid(NamedTuple):
 
 
 IDENTITY = Rigid(np.eye(3), np.zeros(3))
-"""No motion."""
+"""The motion that moves nothing."""
 
 
 def cross_matrix(vectors: Array) -> Array:
@@ -140,9 +140,11 @@ def right_jacobian(vectors: Array) -> Array:
     # Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics
     # (arXiv 1812.01537), appendix B.
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    safe = np.where(angle < SMALL_ANGLE, 1.0, angle)
-    first = np.where(angle < SMALL_ANGLE, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(angle < SMALL_ANGLE, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    safe_angle = np.where(angle < SMALL_ANGLE, 1.0, angle)
+    first = np.where(angle < SMALL_ANGLE, 0.5, (1.0 - np.cos(safe_angle)) / safe_angle**2)
+    second = np.where(
+        angle < SMALL_ANGLE, 1.0 / 6.0, (safe_angle - np.sin(safe_angle)) / safe_angle**3
+    )
     cross = cross_matrix(vectors)
     jacobian: Array = np.eye(3) - first * cross + second * (cross @ cross)
     return jacobian

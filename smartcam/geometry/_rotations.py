@@ -22,9 +22,10 @@ Array: TypeAlias = NDArray[np.float64]
 """A float64 array; each function names its shape."""
 
 MIN_SINE = 0.17
-"""Sine of the least angle between two axes that are to span a plane: 10 degrees.
+"""Sine of the least angle between two axes that span a plane: 10 degrees.
 
-At 5 degrees, 0.5 mm of height tilt the normal by 2.2 degrees, at 1 degree by 10.8 (derived).
+An error of 0.5 mm in height tilts the plane's normal by 2.2 degrees if the axes are 5 degrees
+apart, and by 10.8 degrees if they are 1 degree apart (derived).
 """
 
 MAX_COORDINATE = 1e100
@@ -34,7 +35,7 @@ MAX_COORDINATE = 1e100
 def as_points(values: ArrayLike, columns: int, label: str) -> Array:
     """Return ``values`` as float64 of shape (N, ``columns``); raise SHAPE or NOT_FINITE.
 
-    ``label`` names the points in the text.
+    ``label`` names the points in the error's text.
     """
     try:
         if np.iscomplexobj(values):
@@ -72,7 +73,7 @@ def as_vector(values: ArrayLike, length: int, label: str) -> Array:
 
 
 def check_finite(values: Array, label: str) -> None:
-    """Raise NOT_FINITE if a calibration's result is not finite; ``label`` names the result."""
+    """Raise NOT_FINITE if a calibration's result is not finite; ``label`` names this result."""
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
         raise not_finite(label, np.atleast_1d(values[row]).tolist())
@@ -118,8 +119,8 @@ def rotate(quaternion: ArrayLike, vectors: ArrayLike) -> Array:
     """Return vectors (..., 3) turned by unit quaternions (..., 4); the zero vector stays zero."""
     q, v = np.asarray(quaternion, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
     # q v q^-1, multiplied out: v + 2 w (u x v) + 2 u x (u x v), where q = (u, w) has length 1.
-    twice = 2.0 * np.cross(q[..., :3], v)
-    return v + q[..., 3:] * twice + np.cross(q[..., :3], twice)
+    doubled_cross = 2.0 * np.cross(q[..., :3], v)
+    return v + q[..., 3:] * doubled_cross + np.cross(q[..., :3], doubled_cross)
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
@@ -140,18 +141,18 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     # short, so no root of a small difference is taken.
     # Source: Markley, Unit Quaternion from Rotation Matrix (2008); Shepperd, Quaternion from
     # Rotation Matrix (1978).
-    four = [
+    scaled_products = [
         [1 + xx - yy - zz, xy + yx, xz + zx, zy - yz],
         [xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx],
         [xz + zx, yz + zy, 1 - xx - yy + zz, yx - xy],
         [zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz],
     ]
-    products = np.moveaxis(np.array(four), (0, 1), (-2, -1))
+    products = np.moveaxis(np.array(scaled_products), (0, 1), (-2, -1))
     diagonal = np.diagonal(products, axis1=-2, axis2=-1)
-    best = np.argmax(diagonal, axis=-1)[..., None, None]
-    chosen = np.take_along_axis(products, best, axis=-2)[..., 0, :]
-    unit: Array = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
-    return unit
+    largest = np.argmax(diagonal, axis=-1)[..., None, None]
+    longest_column = np.take_along_axis(products, largest, axis=-2)[..., 0, :]
+    quaternion: Array = longest_column / np.linalg.norm(longest_column, axis=-1, keepdims=True)
+    return quaternion
 
 
 def frame_from_axes(x: ArrayLike, y: ArrayLike) -> Array:

@@ -1,8 +1,8 @@
-"""Objects as plain data: a class declares each field and its form in a file in one place.
+"""Objects as plain data: a class declares each field, and its form in a file, in one place.
 
 The annotations of a :class:`Stored` dataclass say how pydantic checks a field's data, how the value
-is made of these data, and how it is written as plain data. A :class:`Form` holds all three, such as
-nested lists of numbers for an array::
+is made from the data, and how the value is written as plain data. A :class:`Form` holds all three.
+An array, for example, has the form of nested lists of numbers::
 
     @dataclass(frozen=True, kw_only=True, eq=False)
     class CameraModel(Stored):
@@ -49,17 +49,18 @@ Context: TypeAlias = MutableMapping[str, Any]
 need."""
 
 Keys: TypeAlias = Mapping[str, str]
-"""Keys in a file by the names of fields; empty for a field that is made of other keys."""
+"""Key in a file for each field's name; the key is empty for a field made from other keys."""
 
 ExtraKeys: TypeAlias = Mapping[str, tuple[Any, Callable[[Any], Any]]]
-"""Additional keys of a file: the type of each, and the function that reads it from an object."""
+"""Additional keys of a file: for each key a type, and the function that computes its value from an
+object."""
 
 
 @dataclass(eq=False)
 class Form:
     """The form in a file of the annotated value."""
 
-    checked: Any  # type by which pydantic checks the data
+    checked: Any  # type with which pydantic checks the data
     read: Callable[[Any, Context], Any]  # makes the value from checked data and context
     write: Callable[[Any], Any]  # makes plain data of the value
 
@@ -80,7 +81,7 @@ class AsList:
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         items = handler.generate_schema(get_args(kind)[0])
         schema = core_schema.list_schema(items, min_length=self.least)
-        return _made_of(schema, read=lambda values, _: tuple(values), write=list)
+        return _schema_of_parts(schema, read=lambda values, _: tuple(values), write=list)
 
 
 class AsMapping:
@@ -92,17 +93,17 @@ class AsMapping:
             key: core_schema.typed_dict_field(handler.generate_schema(hint))
             for key, hint in hints.items()
         }
-        return _made_of(
+        return _schema_of_parts(
             core_schema.typed_dict_schema(fields, extra_behavior="forbid"),
             read=lambda values, _: kind(**values),
             write=lambda value: value._asdict(),
         )
 
 
-def _made_of(
+def _schema_of_parts(
     parts: CoreSchema, read: Callable[[Any, Context], Any], write: Callable[[Any], Any]
 ) -> CoreSchema:
-    """Return the schema of values that are made of parts with forms of their own."""
+    """Return the schema of values made of parts, each of which has a form of its own."""
     return core_schema.with_info_after_validator_function(
         lambda values, info: read(values, info.context),
         parts,
@@ -124,10 +125,10 @@ class Stored:
     """Keys that are written before the fields."""
 
     _shared: ClassVar[frozenset[str]] = frozenset({"target"})
-    """Keys whose values are in the context when later keys are read."""
+    """Keys whose values are put in the context, where the forms of later keys find them."""
 
     _later: ClassVar[frozenset[str]] = frozenset()
-    """Keys that may be missing in a file, which then get defaults."""
+    """Keys that may be missing in a file; their fields then have defaults."""
 
     def to_data(self) -> dict[str, Any]:
         """Return the object as data for JSON, None for NaN; :meth:`from_data` reads these data."""
@@ -137,7 +138,7 @@ class Stored:
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], **known: Any) -> Self:
-        """Return the object that :meth:`to_data` wrote, identical in every bit.
+        """Return the object that :meth:`to_data` wrote, bit for bit.
 
         Args:
             data: contents of a file.
@@ -147,7 +148,7 @@ class Stored:
             CalibrationError: SHAPE: the data have another structure; NOT_FINITE or NOT_RIGID:
                 numbers that are not possible.
         """
-        value: Self = _checked(cls, data, cls._called, **known)
+        value: Self = _validate(cls, data, cls._called, **known)
         return value
 
     @classmethod
@@ -166,28 +167,30 @@ class Stored:
             return core_schema.typed_dict_field(schema, required=key not in cls._later)
 
         def write(instance: Stored) -> dict[str, Any]:
-            others = {key: value(instance) for key, (_, value) in cls._extra_keys.items()}
-            return others | {key: getattr(instance, name) for key, name in names.items()}
+            extra_data = {key: value(instance) for key, (_, value) in cls._extra_keys.items()}
+            return extra_data | {key: getattr(instance, name) for key, name in names.items()}
 
         def read(values: dict[str, Any], context: Context) -> Stored:
-            return cls._read({names.get(key, key): part for key, part in values.items()}, context)
+            return cls._read({names.get(key, key): value for key, value in values.items()}, context)
 
         fields = {key: field(key) for key in types}
-        parts = core_schema.typed_dict_schema(fields, extra_behavior="forbid")
-        return _made_of(parts, read, write)
+        fields_schema = core_schema.typed_dict_schema(fields, extra_behavior="forbid")
+        return _schema_of_parts(fields_schema, read, write)
 
     @classmethod
     def _read(cls, fields: dict[str, Any], context: Context) -> Self:
-        """Return an object made of the values found for its fields and ``_extra_keys``.
+        """Return an object made from the values of its fields and of ``_extra_keys``.
 
-        Raises SHAPE: the fields do not fit together.
+        Raises SHAPE: the fields contradict each other.
         """
-        made = cls(**{name: value for name, value in fields.items() if name not in cls._extra_keys})
-        made._check(fields, context["called"])
-        return made
+        instance = cls(
+            **{name: value for name, value in fields.items() if name not in cls._extra_keys}
+        )
+        instance._check(fields, context["called"])
+        return instance
 
     def _check(self, fields: Mapping[str, Any], called: str) -> None:
-        """Raise if fields do not fit together, or do not fit the values of ``_extra_keys``."""
+        """Raise SHAPE if fields contradict each other or the values of ``_extra_keys``."""
 
 
 def _share(key: str) -> Callable[[Any, core_schema.ValidationInfo[Context]], Any]:
@@ -203,16 +206,18 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _checked(kind: Any, data: Any, called: str, **known: Any) -> Any:
+def _validate(kind: Any, data: Any, called: str, **known: Any) -> Any:
     try:
         return _adapter(kind).validate_python(data, context={"called": called, **known})
     except ValidationError as exc:
-        first = exc.errors()[0]
-        error = first.get("ctx", {}).get("error")
+        first_error = exc.errors()[0]
+        error = first_error.get("ctx", {}).get("error")
         if isinstance(error, CalibrationError):
             raise error from None
-        where = ".".join(map(str, first["loc"]))
-        raise invalid_data_error(called, f"{where}: {first['msg']}", first["input"]) from exc
+        location = ".".join(map(str, first_error["loc"]))
+        raise invalid_data_error(
+            called, f"{location}: {first_error['msg']}", first_error["input"]
+        ) from exc
 
 
 def invalid_data_error(called: str, text: str, actual: object) -> CalibrationError:
@@ -236,14 +241,14 @@ def check_shape(values: Array, shape: tuple[int, ...], called: str, name: str) -
 # ---------------------------------------------------------------------- numbers
 
 
-def _bounded(value: float) -> float:
+def _check_bound(value: float) -> float:
     if abs(value) > MAX_COORDINATE:
         raise ValueError(f"expected a number up to {MAX_COORDINATE:g}")
     return value
 
 
-Number = Annotated[FiniteFloat, AfterValidator(_bounded)]
-"""A number of a file, so bounded that products of a few are still finite."""
+Number = Annotated[FiniteFloat, AfterValidator(_check_bound)]
+"""A number of a file; its limit keeps products of a few numbers finite."""
 
 NonNegative = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -253,29 +258,31 @@ Triple = tuple[Number, Number, Number]
 NullableTriple = tuple[Number | None, Number | None, Number | None]
 
 
-def _opened(value: float | None) -> float:
+def _none_to_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _closed(value: float) -> float | None:
+def _nan_to_none(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-NumberOrNaN = Annotated[float, Form(Number | None, lambda value, _: _opened(value), _closed)]
+NumberOrNaN = Annotated[
+    float, Form(Number | None, lambda value, _: _none_to_nan(value), _nan_to_none)
+]
 """A number that may be NaN, which is stored as null."""
 
 PairOrNaN = Annotated[
     tuple[float, float],
     Form(
         tuple[Number | None, Number | None],
-        read=lambda values, _: (_opened(values[0]), _opened(values[1])),
-        write=lambda values: [*map(_closed, values)],
+        read=lambda values, _: (_none_to_nan(values[0]), _none_to_nan(values[1])),
+        write=lambda values: [*map(_nan_to_none, values)],
     ),
 ]
 
 
 def row(checked: Any, make: Callable[[Any], Any] = tuple) -> Form:
-    """Return the form of a tuple of fixed length, or of what ``make`` makes, stored as a list."""
+    """Return the form of a tuple of fixed length, stored as a list; ``make`` builds the value."""
     return Form(checked, read=lambda values, _: make(values), write=list)
 
 
@@ -293,39 +300,41 @@ def as_array(values: Any, _: Context | None = None) -> Array:
         return np.zeros(0)
 
 
-def _tolist(values: Array) -> Any:
+def _to_lists(values: Array) -> Any:
     return values.tolist()
 
 
-def _lists(values: Array) -> Any:
+def _to_nullable_lists(values: Array) -> Any:
     """Return an array as nested lists, None for NaN."""
     if not np.isnan(values).any():
         return values.tolist()
-    return [_lists(row) for row in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
+    if values.ndim > 1:
+        return [_to_nullable_lists(row) for row in values]
+    return [*map(_nan_to_none, values.tolist())]
 
 
-Vector2 = Annotated[Array, Form(Pair, as_array, _tolist)]
-Vector3 = Annotated[Array, Form(Triple, as_array, _tolist)]
-Matrix3 = Annotated[Array, Form(tuple[Triple, Triple, Triple], as_array, _tolist)]
-Matrix43 = Annotated[Array, Form(tuple[Triple, Triple, Triple, Triple], as_array, _tolist)]
+Vector2 = Annotated[Array, Form(Pair, as_array, _to_lists)]
+Vector3 = Annotated[Array, Form(Triple, as_array, _to_lists)]
+Matrix3 = Annotated[Array, Form(tuple[Triple, Triple, Triple], as_array, _to_lists)]
+Matrix43 = Annotated[Array, Form(tuple[Triple, Triple, Triple, Triple], as_array, _to_lists)]
 
 
 def matrix(count: int | None = None) -> Form:
     """Return the form of a matrix of ``count`` rows; its class checks the number of columns."""
     checked = Annotated[list[list[Number]], Field(min_length=count or 0, max_length=count)]
-    return Form(checked, as_array, _tolist)
+    return Form(checked, as_array, _to_lists)
 
 
 def rows(checked: Any, *shape: int, least: int = 0, nulls: bool = False) -> Form:
     """Return the form of an array (N, ``*shape``) that is stored as a list.
 
-    ``checked``: the type of an item that pydantic checks. ``least``: how many there are at least.
+    ``checked``: type with which pydantic checks an item. ``least``: least number of items.
     ``nulls``: whether values may be NaN, which is stored as null.
     """
     return Form(
         Annotated[list[checked], Field(min_length=least)],
         read=lambda values, _: as_array(values).reshape(-1, *shape),
-        write=_lists if nulls else _tolist,
+        write=_to_nullable_lists if nulls else _to_lists,
     )
 
 
@@ -348,7 +357,7 @@ class _Motion(NamedTuple):
 
 
 def motion(frames: Callable[[Context], tuple[str, str]]) -> Form:
-    """Return the form of a transform without the names of its frames, which ``frames`` gives."""
+    """Return the form of a transform stored without its frames' names, which ``frames`` gives."""
     return Form(
         Annotated[_Motion, AsMapping()],
         read=lambda values, context: Transform(*frames(context), *values),
@@ -364,4 +373,4 @@ def motion_to_data(transform: Transform) -> dict[str, Any]:
 
 def motion_from_data(data: Mapping[str, Any], target: str, source: str) -> Transform:
     """Return the motion that :func:`motion_to_data` wrote; raise SHAPE or NOT_RIGID."""
-    return Transform(target, source, *_checked(Annotated[_Motion, AsMapping()], data, "motion"))
+    return Transform(target, source, *_validate(Annotated[_Motion, AsMapping()], data, "motion"))

@@ -86,15 +86,16 @@ class Transform:
             )
         with np.errstate(all="ignore"):
             error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-            turn = float(np.linalg.det(rotation))
-        too_far = not np.abs(translation).max() <= MAX_COORDINATE
-        if not (error < _MAX_ORTHONORMAL_DEVIATION and turn > 0) or too_far:
-            mirror = " (a reflection: one of the frames is left-handed)" if turn < 0 else ""
+            determinant = float(np.linalg.det(rotation))
+        is_too_far = not np.abs(translation).max() <= MAX_COORDINATE
+        if not (error < _MAX_ORTHONORMAL_DEVIATION and determinant > 0) or is_too_far:
+            mirror = " (a reflection: one of the frames is left-handed)" if determinant < 0 else ""
             raise Code.NOT_RIGID.refusal(
                 f"{self.label}: expected a rotation and a finite translation, got a matrix of "
-                f"determinant {turn:.6g}{mirror}, off by {error:.3g}, and {translation.tolist()}",
+                f"determinant {determinant:.6g}{mirror}, off by {error:.3g}, and "
+                f"{translation.tolist()}",
                 "a rotation, determinant 1",
-                turn,
+                determinant,
             )
         if self.at is not None and getattr(self.at, "tzinfo", None) is None:
             raise Code.BAD_TIME.unexpected(
@@ -140,7 +141,7 @@ class Transform:
 
     @classmethod
     def from_pose(cls, pose: Pose, source: str) -> Transform:
-        """Return the transform of a pose in the frame that its header names, with its stamp.
+        """Return the transform into the frame in the pose's header, with the header's time.
 
         Raises:
             CalibrationError: ``NOT_RIGID``, ``BAD_TIME``.
@@ -242,11 +243,11 @@ class Transform:
             )
         if later.at == self.at:
             return self
-        part = (at - self.at) / (later.at - self.at)
+        fraction = (at - self.at) / (later.at - self.at)
         # R1 exp(s log(R1^T R2)) goes the shortest way from R1 to R2 at one speed: slerp.
         # Source: Shoemake, Animating Rotation with Quaternion Curves (1985).
-        step = exp_rotation(part * log_rotation(self.rotation.T @ later.rotation))
-        translation = self.translation + part * (later.translation - self.translation)
+        step = exp_rotation(fraction * log_rotation(self.rotation.T @ later.rotation))
+        translation = self.translation + fraction * (later.translation - self.translation)
         return Transform(self.target, self.source, self.rotation @ step, translation, at)
 
 
@@ -290,13 +291,13 @@ def as_motion(value: object, label: str, target: str, source: str) -> Transform:
 
 
 class PoseHistory:
-    """Poses of a moving frame by their times.
+    """Poses of a moving frame, each with its time.
 
     Args:
         size: largest number of poses that are kept; the oldest is dropped first.
-        max_gap: longest time, seconds, between two poses that are interpolated. A robot that
-            accelerates with ``a`` leaves the straight line between them by ``a * max_gap^2 / 8``: a
-            tenth of a second and 1 m/s^2 are 1.25 mm.
+        max_gap: longest time, seconds, between two poses that are interpolated. With an
+            acceleration ``a``, a robot is up to ``a * max_gap^2 / 8`` away from the straight line
+            between them: 1.25 mm for 0.1 s and 1 m/s^2.
     """
 
     @takes(max_gap=check_seconds)
@@ -313,19 +314,21 @@ class PoseHistory:
 
         Raises:
             CalibrationError: ``BAD_TIME``: the transform has no time; ``WRONG_FRAME``: its frames
-                differ from those of the transforms before.
+                differ from those of earlier transforms.
         """
         if transform.at is None:
             raise Code.BAD_TIME.refusal(f"{transform.label}: expected a time, got none", got=None)
         if self._transforms and transform.label != self._transforms[0].label:
-            wanted = self._transforms[0].label
+            expected_label = self._transforms[0].label
             raise Code.WRONG_FRAME.unexpected(
-                f"pose history: expected {wanted} as before", wanted, transform.label
+                f"pose history: expected {expected_label} as before",
+                expected_label,
+                transform.label,
             )
-        place = bisect.bisect_left(self._times, transform.at)
-        same = transform.at in self._times[place : place + 1]
-        self._times[place : place + same] = [transform.at]
-        self._transforms[place : place + same] = [transform]
+        index = bisect.bisect_left(self._times, transform.at)
+        has_same_time = transform.at in self._times[index : index + 1]
+        self._times[index : index + has_same_time] = [transform.at]
+        self._transforms[index : index + has_same_time] = [transform]
         del self._times[: -self._size], self._transforms[: -self._size]
 
     def at(self, moment: datetime) -> Transform:
@@ -335,10 +338,10 @@ class PoseHistory:
             CalibrationError: ``BAD_TIME``: before the first or after the last known moment (nothing
                 is extrapolated), or in a gap longer than ``max_gap``.
         """
-        place = bisect.bisect_left(self._times, moment)
-        if moment in self._times[place : place + 1]:
-            return self._transforms[place]
-        if place in (0, len(self._times)):
+        index = bisect.bisect_left(self._times, moment)
+        if moment in self._times[index : index + 1]:
+            return self._transforms[index]
+        if index in (0, len(self._times)):
             known = (
                 f"from {self._times[0]} to {self._times[-1]}" if self._times else "that is known"
             )
@@ -347,8 +350,8 @@ class PoseHistory:
                 known,
                 moment,
             )
-        before, after = self._transforms[place - 1 : place + 1]
-        gap = self._times[place] - self._times[place - 1]
+        before, after = self._transforms[index - 1 : index + 1]
+        gap = self._times[index] - self._times[index - 1]
         if gap > self._max_gap:
             raise Code.BAD_TIME.refusal(
                 f"{before.label}: expected two poses at most {self._max_gap.total_seconds():g} s "

@@ -64,10 +64,10 @@ class ApplicationEntry(BaseModel):
         return dict(self.model_extra or {})
 
 
-def _folder(given: str) -> str:
-    if "\0" in given:
+def _check_folder(folder: str) -> str:
+    if "\0" in folder:
         raise ValueError("expected the path of a folder, which has no zero in it")
-    return given
+    return folder
 
 
 class Keep(BaseModel):
@@ -77,7 +77,7 @@ class Keep(BaseModel):
         extra="forbid", frozen=True, hide_input_in_errors=True
     )
 
-    folder: Annotated[str, AfterValidator(_folder)] = Field(
+    folder: Annotated[str, AfterValidator(_check_folder)] = Field(
         min_length=1, description="folder beside this file, which is created if needed"
     )
     which: Literal["bad", "all"] = Field("bad", description="keep bad pictures only, or all")
@@ -129,7 +129,7 @@ class Software(BaseModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellCamera:
-    """A software camera loaded from its file, with no open source.
+    """A software camera as its file describes it; the source of its pictures is not open.
 
     Attributes:
         name: name of the camera.
@@ -166,7 +166,7 @@ class CellCamera:
 
 
 class _CellEntry(BaseModel):
-    """A camera in a file; the fleet reads the other keys of a fleet file."""
+    """The part of a camera's entry that describes a software camera; other keys are ignored."""
 
     software: Software | None = None
 
@@ -229,11 +229,11 @@ def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
     folder = check_path(folder, "folder", "make_camera")
     name = check_text(name, "name", "make_camera")
     setup = ToolSetup(folder=folder, calibration=_calibration(software, folder))
-    names = _names(software)
-    made: dict[int, list[ProgramStep]] = {}
+    names = _numbers_by_name(software)
+    steps_by_number: dict[int, list[ProgramStep]] = {}
     programs: dict[int, Program] = {}
     for number, entry in software.applications.items():
-        steps = _steps(number, software, names, setup, made, ())
+        steps = _make_steps(number, software, names, setup, steps_by_number, ())
         try:
             programs[number] = Program(
                 number, entry.name or str(number), steps, sequence=entry.sequence
@@ -266,8 +266,8 @@ def _calibration(software: Software, folder: Path) -> AnyCalibration | None:
         raise ProgramError(str(exc), ("calibration",)) from exc
 
 
-def _names(software: Software) -> dict[str, int]:
-    """Return the numbers of named applications by name."""
+def _numbers_by_name(software: Software) -> dict[str, int]:
+    """Return the numbers of the applications that have a name, by this name."""
     names: dict[str, int] = {}
     for number, entry in software.applications.items():
         if not 0 <= number <= 0xFFFFFFFF:
@@ -280,17 +280,21 @@ def _names(software: Software) -> dict[str, int]:
     return names
 
 
-def _steps(
+def _make_steps(
     number: int,
     software: Software,
     names: Mapping[str, int],
     setup: ToolSetup,
-    made: dict[int, list[ProgramStep]],
-    waiting: tuple[int, ...],
+    steps_by_number: dict[int, list[ProgramStep]],
+    followers: tuple[int, ...],
 ) -> list[ProgramStep]:
-    """Return the steps of an application, after the steps of followed applications."""
-    if number in made:
-        return made[number]
+    """Return the steps of an application, which begin with the steps of followed applications.
+
+    ``steps_by_number``: steps that were made already. ``followers``: applications that follow this
+    one, to find circles.
+    """
+    if number in steps_by_number:
+        return steps_by_number[number]
     place = ("applications", number)
     entry = software.applications[number]
     if not 1 <= len(entry.tools) <= MAX_TOOLS:
@@ -305,19 +309,23 @@ def _steps(
             raise ProgramError(str(exc), (*place, *exc.place)) from exc
         follow = step.tool.settings.follow
         if follow is not None and follow not in steps:
-            where = (*place, key, "follow")
+            follow_place = (*place, key, "follow")
             other = names.get(follow)
             if other is None:
                 known = [*steps, *names]
                 raise ProgramError(
                     f"no tool before this one and no application is called {follow!r:.60}"
                     f"{did_you_mean(follow, known)}",
-                    where,
+                    follow_place,
                 )
-            if other == number or other in waiting:
-                raise ProgramError("the applications follow each other in a circle", where)
-            followed = _steps(other, software, names, setup, made, (*waiting, number))
-            steps[follow] = ProgramStep(follow, FollowedApplication(followed, setup), own=False)
+            if other == number or other in followers:
+                raise ProgramError("the applications follow each other in a circle", follow_place)
+            followed = _make_steps(
+                other, software, names, setup, steps_by_number, (*followers, number)
+            )
+            steps[follow] = ProgramStep(
+                follow, FollowedApplication(followed, setup), in_result=False
+            )
         if step.name in steps:
             raise ProgramError(
                 f"there is a tool {step.name!r} already: expected a name after the tool's, such "
@@ -325,5 +333,5 @@ def _steps(
                 (*place, key),
             )
         steps[step.name] = step
-    made[number] = [*steps.values()]
-    return made[number]
+    steps_by_number[number] = [*steps.values()]
+    return steps_by_number[number]

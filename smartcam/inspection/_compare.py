@@ -39,7 +39,7 @@ EDGE_TOLERANCE_PX: Final = 0.75
 """Largest distance of an edge from its taught place, in pixels."""
 
 MAX_ITERATIONS: Final = 30
-"""Largest number of steps of the alignment."""
+"""Largest number of iterations of the alignment."""
 
 MIN_LIGHT_CORRELATION: Final = 0.5
 """Least correlation of taught and current levels at which a change of light is assumed."""
@@ -127,29 +127,30 @@ class Compare(Tool[CompareSettings]):
                 reason=f"the picture has {view.picture.size[0]} x {view.picture.size[1]} pixels, "
                 f"the taught one {self._size[0]} x {self._size[1]}",
             )
-        patch = self._patch(view)
-        motion = self._motion(patch)
+        patch = self._cut_patch(view)
+        motion = self._find_motion(patch)
         size = self._size
-        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpAffine(patch, motion, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
-        covered = cv2.warpAffine(np.full_like(patch, 255), motion, size, flags=how) == 255
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        current = cv2.warpAffine(patch, motion, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        is_covered = cv2.warpAffine(np.full_like(patch, 255), motion, size, flags=flags) == 255
         taught, level = self._taught, float(self.settings.level)
-        hidden = np.zeros(covered.shape, bool)
+        is_hidden = np.zeros(is_covered.shape, bool)
         too_light = True
         if self.settings.light:
-            gain, offset = _light(taught[covered], seen[covered])
-            lit = (gain * taught + offset).astype(np.float32)
-            taught = np.clip(np.rint(lit), 0, 255).astype(np.uint8)
+            gain, offset = _fit_light(taught[is_covered], current[is_covered])
+            relit = (gain * taught + offset).astype(np.float32)
+            taught = np.clip(np.rint(relit), 0, 255).astype(np.uint8)
             level *= min(gain, 1.0)
-            hidden = _saturated(lit, level) & covered
-            too_light = lit[hidden].mean() > 127 if hidden.any() else True
-        # a residual shift is no difference: it changes levels at edges in proportion to their slope
-        steep = cv2.morphologyEx(taught, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
-        over = cv2.absdiff(taught, seen) - EDGE_TOLERANCE_PX * steep
-        differs = (over >= level) & covered
-        large, allowed = self._large(differs), self.settings.allowed
+            is_hidden = _find_hidden(relit, level) & is_covered
+            too_light = relit[is_hidden].mean() > 127 if is_hidden.any() else True
+        # a remaining shift changes levels at edges in proportion to their slope: it is no
+        # difference
+        slopes = cv2.morphologyEx(taught, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
+        excess = cv2.absdiff(taught, current) - EDGE_TOLERANCE_PX * slopes
+        differs = (excess >= level) & is_covered
+        large, allowed = self._large_areas(differs), self.settings.allowed
         differing = int(large[:, cv2.CC_STAT_AREA].sum())
-        unknown = int(self._large(hidden & ~differs)[:, cv2.CC_STAT_AREA].sum())
+        unknown = int(self._large_areas(is_hidden & ~differs)[:, cv2.CC_STAT_AREA].sum())
         ok = differing + unknown <= allowed
         reason = f"{differing} pixels differ, allowed {allowed}"
         if differing <= allowed:
@@ -163,45 +164,48 @@ class Compare(Tool[CompareSettings]):
             values={
                 "differing": differing,
                 "count": min(len(large), 0xFFFF),
-                **self._moved(motion),
+                **self._shift_values(motion),
             },
             drawings=[
                 Drawing(
                     "polygon", tuple((float(x), float(y)) for x, y in view.region.corners), "region"
                 ),
-                *(self._drawn(row, motion, view) for row in large[:MAX_DRAWN_DIFFERENCES]),
+                *(
+                    self._draw_difference(row, motion, view)
+                    for row in large[:MAX_DRAWN_DIFFERENCES]
+                ),
             ],
         )
 
-    def _large(self, mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return the statistics of the connected areas of at least the set size."""
+    def _large_areas(self, mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """Return OpenCV's statistics of the connected areas that are large enough to count."""
         cv2 = load("cv2", "inspection needs")
         _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         large: NDArray[Any] = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= self.settings.area]
         return large
 
-    def _patch(self, view: View) -> NDArray[np.uint8]:
-        """Return the upright region in the size of the taught picture."""
+    def _cut_patch(self, view: View) -> NDArray[np.uint8]:
+        """Return the region's pixels, upright and in the size of the taught picture."""
         width, height = self._size
         if not view.follows:
             x, y = (round(coordinate) for coordinate in self._corner)
             return view.picture.grey[y : y + height, x : x + width]
         cv2 = load("cv2", "inspection needs")
         corners = self._to_picture(np.array([(0, 0), (1, 0), (0, 1)], float), view)
-        turn = np.column_stack([corners[1] - corners[0], corners[2] - corners[0], corners[0]])
-        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        affine = np.column_stack([corners[1] - corners[0], corners[2] - corners[0], corners[0]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         patch: NDArray[np.uint8] = cv2.warpAffine(
-            view.picture.grey, turn, (width, height), flags=how, borderMode=cv2.BORDER_REPLICATE
+            view.picture.grey, affine, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
         return patch
 
     def _to_picture(self, points: NDArray[Any], view: View) -> NDArray[Any]:
-        """Return points of the upright region in the picture's pixels."""
+        """Convert points of the upright region to the picture's pixels."""
         if not view.follows:
             return points + np.rint(self._corner)
         return view.reference.to_picture(points + self._corner + 0.5)
 
-    def _motion(self, patch: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def _find_motion(self, patch: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the small motion (2, 3) of the part between the taught and the current picture."""
         shift = self.settings.shift
         motion = np.eye(2, 3, dtype=np.float32)
@@ -214,25 +218,33 @@ class Compare(Tool[CompareSettings]):
         if score[row, column] < MIN_LIGHT_CORRELATION:
             return motion
         motion[:, 2] = column - shift, row - shift
-        end = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, MAX_ITERATIONS, 1e-4)
-        fine = motion.copy()
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, MAX_ITERATIONS, 1e-4)
+        refined = motion.copy()
         try:
-            cv2.findTransformECC(self._taught, patch, fine, cv2.MOTION_EUCLIDEAN, end, None, 5)
+            cv2.findTransformECC(
+                self._taught, patch, refined, cv2.MOTION_EUCLIDEAN, criteria, None, 5
+            )
         except cv2.error:  # the registration did not converge
             return motion
-        turn = abs(math.atan2(fine[1, 0], fine[0, 0]))
+        turn = abs(math.atan2(refined[1, 0], refined[0, 0]))
         middle = np.array(self._size) / 2
-        moved = np.abs(fine[:, :2] @ middle + fine[:, 2] - middle)
-        good = np.isfinite(fine).all() and turn <= MAX_ROTATION and (moved <= shift + 0.5).all()
-        return fine if good else motion
+        shift_of_middle = np.abs(refined[:, :2] @ middle + refined[:, 2] - middle)
+        is_plausible = (
+            np.isfinite(refined).all()
+            and turn <= MAX_ROTATION
+            and (shift_of_middle <= shift + 0.5).all()
+        )
+        return refined if is_plausible else motion
 
-    def _moved(self, motion: NDArray[np.float32]) -> dict[str, float]:
+    def _shift_values(self, motion: NDArray[np.float32]) -> dict[str, float]:
         """Return the shift of the region's middle."""
         middle = (np.array(self._size) - 1) / 2
         x, y = motion[:, :2] @ middle + motion[:, 2] - middle
         return {"shift_x": float(x), "shift_y": float(y)}
 
-    def _drawn(self, stats: NDArray[Any], motion: NDArray[np.float32], view: View) -> Drawing:
+    def _draw_difference(
+        self, stats: NDArray[Any], motion: NDArray[np.float32], view: View
+    ) -> Drawing:
         left, top, width, height, area = map(int, stats)
         x, y = left - 0.5, top - 0.5
         box = np.array([(x, y), (x + width, y), (x + width, y + height), (x, y + height)])
@@ -242,54 +254,57 @@ class Compare(Tool[CompareSettings]):
         )
 
 
-def _saturated(lit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
-    """Return a mask of the pixels whose difference to their surroundings is lost by saturation.
+def _find_hidden(relit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
+    """Return a mask of pixels whose difference from their surroundings is lost by saturation.
 
     Args:
-        lit: taught levels in the current light, (H, W), also below 0 and above 255.
+        relit: taught levels in the current light, (H, W), not limited to 0 to 255.
         level: least difference, grey levels, of a differing pixel.
     """
-    if lit.min() >= 0 and lit.max() <= 255:
-        return np.zeros(lit.shape, bool)
+    if relit.min() >= 0 and relit.max() <= 255:
+        return np.zeros(relit.shape, bool)
     cv2 = load("cv2", "inspection needs")
 
-    def differs(levels: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        steep = cv2.morphologyEx(levels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
-        least = level + EDGE_TOLERANCE_PX * steep
-        around = np.ones((SURROUNDINGS_PX, SURROUNDINGS_PX), np.uint8)
+    def compare_surroundings(
+        levels: NDArray[np.float32],
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        slopes = cv2.morphologyEx(levels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
+        min_difference = level + EDGE_TOLERANCE_PX * slopes
+        surroundings = np.ones((SURROUNDINGS_PX, SURROUNDINGS_PX), np.uint8)
         return (
-            cv2.dilate(levels, around) - levels >= least,
-            levels - cv2.erode(levels, around) >= least,
+            cv2.dilate(levels, surroundings) - levels >= min_difference,
+            levels - cv2.erode(levels, surroundings) >= min_difference,
         )
 
-    shown = np.clip(lit, 0, 255)
-    (darker, lighter), (seen_darker, seen_lighter) = differs(lit), differs(shown)
+    clipped = np.clip(relit, 0, 255)
+    darker, lighter = compare_surroundings(relit)
+    still_darker, still_lighter = compare_surroundings(clipped)
     # beside a visible edge, a pixel is between the levels of both sides
-    edge = cv2.morphologyEx(shown, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
-    plain = edge * (1 - EDGE_TOLERANCE_PX / 2) < level
-    mask: NDArray[np.bool_] = ((darker & ~seen_darker) | (lighter & ~seen_lighter)) & plain
+    edge = cv2.morphologyEx(clipped, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
+    is_flat = edge * (1 - EDGE_TOLERANCE_PX / 2) < level
+    mask: NDArray[np.bool_] = ((darker & ~still_darker) | (lighter & ~still_lighter)) & is_flat
     return mask
 
 
-def _light(taught: NDArray[np.uint8], seen: NDArray[np.uint8]) -> tuple[float, float]:
+def _fit_light(taught: NDArray[np.uint8], current: NDArray[np.uint8]) -> tuple[float, float]:
     """Return gain and offset of the current light relative to the taught light.
 
-    They are 1 and 0 if the pictures do not correlate: otherwise a missing part could pass as a part
-    in bad light.
+    They are 1 and 0 if the pictures do not correlate: otherwise a missing part could be mistaken
+    for a part in bad light.
     """
     step = max(taught.size // MAX_LIGHT_PIXELS, 1) | 1  # an odd step samples all columns
-    x, y = (picture.ravel()[::step].astype(np.float64) for picture in (taught, seen))
-    chosen = np.ones(x.shape, bool)
+    x, y = (picture.ravel()[::step].astype(np.float64) for picture in (taught, current))
+    is_inlier = np.ones(x.shape, bool)
     gain, offset = 1.0, 0.0
     for _ in range(LIGHT_FIT_ROUNDS):
-        a, b = x[chosen], y[chosen]
+        a, b = x[is_inlier], y[is_inlier]
         da, db = a - a.mean(), b - b.mean()
-        both, one, other = float(da @ db), float(da @ da), float(db @ db)
-        alike = both > MIN_LIGHT_CORRELATION * math.sqrt(one * other) and one > len(a)
-        if not alike:
+        sum_xy, sum_xx, sum_yy = float(da @ db), float(da @ da), float(db @ db)
+        correlates = sum_xy > MIN_LIGHT_CORRELATION * math.sqrt(sum_xx * sum_yy) and sum_xx > len(a)
+        if not correlates:
             return 1.0, 0.0
-        gain = min(max(both / one, 1 / MAX_GAIN), MAX_GAIN)
+        gain = min(max(sum_xy / sum_xx, 1 / MAX_GAIN), MAX_GAIN)
         offset = float(np.median(b - gain * a))
         residuals = np.abs(y - gain * x - offset)
-        chosen = residuals <= max(OUTLIER_SIGMAS * 1.4826 * float(np.median(residuals)), 3.0)
+        is_inlier = residuals <= max(OUTLIER_SIGMAS * 1.4826 * float(np.median(residuals)), 3.0)
     return gain, offset

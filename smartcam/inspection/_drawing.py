@@ -23,30 +23,30 @@ def draw(inspection: Inspection) -> NDArray[Any]:
     canvas = inspection.picture.rgb.copy()
     thick = stroke_width(*inspection.picture.size)
     for mark in inspection.drawings:
-        _draw(canvas, mark, thick)
+        _draw_mark(canvas, mark, thick)
     return canvas
 
 
-def _draw(canvas: NDArray[Any], mark: Drawing, thick: int) -> None:
+def _draw_mark(canvas: NDArray[Any], mark: Drawing, thick: int) -> None:
     cv2 = load("cv2", "inspection needs")
     colour = COLOURS[mark.role]
     if not mark.points or not np.isfinite(mark.points).all():
         return
     limit = 4.0 * max(canvas.shape)  # keeps OpenCV's coordinates within 32 bits
-    places = np.clip(np.asarray(mark.points, np.float64), -limit, limit)
-    fixed = np.rint(places * (1 << _SHIFT)).astype(np.int32)
+    points = np.clip(np.asarray(mark.points, np.float64), -limit, limit)
+    fixed_point = np.rint(points * (1 << _SHIFT)).astype(np.int32)
     if mark.kind in ("line", "polygon"):
         closed = mark.kind == "polygon"
-        cv2.polylines(canvas, [fixed], closed, colour, thick, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(canvas, [fixed_point], closed, colour, thick, cv2.LINE_AA, _SHIFT)
     elif mark.kind == "points":
-        for x, y in fixed:
+        for x, y in fixed_point:
             cv2.circle(canvas, (int(x), int(y)), 3 * thick << _SHIFT, colour, thick, 16, _SHIFT)
     if mark.text:
-        x, y = places[0]
-        _write(canvas, mark.text, (int(x) + 4 * thick, int(y) - 4 * thick), colour, thick)
+        x, y = points[0]
+        _draw_text(canvas, mark.text, (int(x) + 4 * thick, int(y) - 4 * thick), colour, thick)
 
 
-def _write(
+def _draw_text(
     canvas: NDArray[Any],
     text: str,
     place: tuple[int, int],
@@ -54,7 +54,7 @@ def _write(
     thick: int,
 ) -> None:
     cv2 = load("cv2", "inspection needs")
-    plain = text[:120].encode("ascii", "replace").decode()
+    ascii_text = text[:120].encode("ascii", "replace").decode()
     font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * thick
-    cv2.putText(canvas, plain, place, font, size, (0, 0, 0), thick + 2, cv2.LINE_AA)
-    cv2.putText(canvas, plain, place, font, size, colour, thick, cv2.LINE_AA)
+    cv2.putText(canvas, ascii_text, place, font, size, (0, 0, 0), thick + 2, cv2.LINE_AA)
+    cv2.putText(canvas, ascii_text, place, font, size, colour, thick, cv2.LINE_AA)

@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.inspection._measure.tolerances import UNITS, Tolerance
-from smartcam.inspection._program import split_name
+from smartcam.inspection._program import split_tool_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -25,7 +25,8 @@ DIFFERENCE_MARGIN: Final = 1.5
 """Ratio of the allowed number of differing pixels to the largest number in a good picture."""
 
 MIN_VALUES: Final = 5
-"""Least number of good pictures with a value to learn a tolerance: fewer do not show outliers."""
+"""Least number of good pictures with a value to learn a tolerance: with fewer, outliers are not
+found."""
 
 TOLERANCE_COVERAGE: Final = 0.997
 """Share of all good parts that a learned tolerance contains."""
@@ -66,7 +67,7 @@ class _Learned(NamedTuple):
     remark: str
 
 
-_NOTHING: Final = _Learned({}, "no picture has a value: all settings stay as they are.")
+_NO_VALUES: Final = _Learned({}, "no picture has a value: all settings stay as they are.")
 
 
 def learn_tolerances(
@@ -83,7 +84,7 @@ def learn_tolerances(
     learned_tools = {key: dict(given) for key, given in tools.items()}
     remarks = []
     for key, settings in learned_tools.items():
-        kind, name = split_name(key)
+        kind, name = split_tool_key(key)
         if kind not in _LEARNERS:
             remarks.append(f"{key}: a tool of this kind has no tolerance to learn.")
             continue
@@ -100,9 +101,9 @@ def learn_tolerances(
         left_out = {
             picture: finding.reason for picture, finding in seen.items() if picture not in measured
         }
-        changes, remark = _LEARNERS[kind](measured, settings) if measured else _NOTHING
+        changes, remark = _LEARNERS[kind](measured, settings) if measured else _NO_VALUES
         settings.update(changes)
-        remarks.append(f"{key}: {remark}{_left_out(left_out)}")
+        remarks.append(f"{key}: {remark}{_left_out_text(left_out)}")
     return Lesson(learned_tools, remarks)
 
 
@@ -110,8 +111,12 @@ def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
     findings = [*seen.values()]
     counts = [int(finding.values.get("count", 0)) for finding in findings]
     tolerances: dict[str, Any] = {"count": [min(counts), max(counts)]}
-    many = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{max(counts)}"
-    remark = f"{many} spots in {'each of ' if len(seen) > 1 else ''}{_pictures(len(seen))}"
+    counts_text = (
+        f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{max(counts)}"
+    )
+    remark = (
+        f"{counts_text} spots in {'each of ' if len(seen) > 1 else ''}{_pictures_text(len(seen))}"
+    )
     each = [finding.records or (finding.values,) for finding in findings]
     areas = [float(record["area"]) for records in each for record in records if record.get("area")]
     if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
@@ -132,7 +137,7 @@ def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
 def _learn_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     most = max(int(finding.values.get("differing", 0)) for finding in seen.values())
     allowed = math.ceil(DIFFERENCE_MARGIN * most)
-    remark = f"at most {most} pixels differ in {_pictures(len(seen))}; {allowed} are allowed."
+    remark = f"at most {most} pixels differ in {_pictures_text(len(seen))}; {allowed} are allowed."
     return _Learned({"allowed": allowed}, remark)
 
 
@@ -146,7 +151,8 @@ def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
     if len(texts) != 1:
         return _Learned(
             {},
-            f"{len(texts)} texts in {_pictures(len(seen))}: the setting `expect` stays as it is.",
+            f"{len(texts)} texts in {_pictures_text(len(seen))}: the setting `expect` stays as it "
+            "is.",
         )
     text = texts.pop()
     return _Learned({"expect": re.escape(text)}, f"the text {text!r:.60} in all that was read.")
@@ -165,35 +171,37 @@ def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> 
         for name, finding in seen.items()
         if name not in measured
     }
-    before = settings.get("tolerance")
-    old = Tolerance.parse(before) if isinstance(before, str) else None
-    unit, factor = _unit(old, next((measurement.unit for measurement in measured.values()), "px"))
+    old_text = settings.get("tolerance")
+    old = Tolerance.parse(old_text) if isinstance(old_text, str) else None
+    unit, factor = _choose_unit(
+        old, next((measurement.unit for measurement in measured.values()), "px")
+    )
     values = np.array([measurement.value for measurement in measured.values()]) / factor
     sigmas = np.array([measurement.sigma for measurement in measured.values()]) / factor
     if unit == "deg":
-        values = _unwrapped(values)
-    outlying = _outliers(values, sigmas)
+        values = _unwrap_degrees(values)
+    is_outlier = _find_outliers(values, sigmas)
     names = np.array([*measured], dtype=object)
     left_out |= {
         name: f"{value:.6g} {unit} is far from the others"
-        for name, value in zip(names[outlying], values[outlying], strict=True)
+        for name, value in zip(names[is_outlier], values[is_outlier], strict=True)
     }
-    values, sigmas = values[~outlying], sigmas[~outlying]
+    values, sigmas = values[~is_outlier], sigmas[~is_outlier]
     if len(values) < MIN_VALUES:
         return _Learned(
             {},
             f"expected {MIN_VALUES} good pictures with a value or more, got {len(values)}: the "
-            f"setting `tolerance` stays as it is.{_left_out(left_out)}",
+            f"setting `tolerance` stays as it is.{_left_out_text(left_out)}",
         )
     guard = float(settings.get("guard", 2.0)) * float(sigmas.max())
     mean, spread = float(values.mean()), float(values.std(ddof=1))
     noise = float(np.sqrt(np.mean(sigmas**2)))
-    text = _text(values, max(spread, noise), guard, old, unit)
+    text = _tolerance_text(values, max(spread, noise), guard, old, unit)
     remark = (
-        f"tolerance {text}, from {_pictures(len(values))}: mean {mean:.6g} {unit}, standard "
+        f"tolerance {text}, from {_pictures_text(len(values))}: mean {mean:.6g} {unit}, standard "
         f"deviation {spread:.2g} {unit}, of which the measurement causes "
         f"{noise:.2g} {unit}. The tolerance contains {TOLERANCE_COVERAGE:.1%} of all such "
-        f"parts, with a confidence of {CONFIDENCE:.0%}.{_left_out(left_out)}"
+        f"parts, with a confidence of {CONFIDENCE:.0%}.{_left_out_text(left_out)}"
     )
     return _Learned({"tolerance": text}, remark)
 
@@ -202,15 +210,15 @@ def _is_number(details: Any) -> bool:
     return math.isfinite(details.value) and math.isfinite(details.sigma) if details else False
 
 
-def _unit(old: Tolerance | None, measured_unit: str) -> tuple[str, float]:
+def _choose_unit(old: Tolerance | None, measured_unit: str) -> tuple[str, float]:
     """Return the unit to write, and its ratio to the measured unit."""
     written = measured_unit if old is None else old.written_unit
     name, factor = UNITS[written]
     return (written, factor) if name == measured_unit else (measured_unit, 1.0)
 
 
-def _unwrapped(values: Array) -> Array:
-    """Return directions in degrees without jumps of 360."""
+def _unwrap_degrees(values: Array) -> Array:
+    """Return directions in degrees, without jumps of 360 between them."""
     if not len(values):
         return values
     turns = np.array([math.remainder(angle - values[0], 360.0) for angle in values.tolist()])
@@ -219,24 +227,26 @@ def _unwrapped(values: Array) -> Array:
     return unwrapped
 
 
-def _outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _find_outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return a mask of the outliers among values (N,)."""
     if not len(values):
         return np.zeros(0, dtype=bool)
-    away = np.abs(values - np.median(values))
+    distances = np.abs(values - np.median(values))
     # for normal values the median distance is 0.6745 standard deviations
-    spread = max(float(np.median(away)) / 0.6745, float(np.median(sigmas)))
-    outlying: np.ndarray[Any, np.dtype[np.bool_]] = (
-        away > OUTLIER_SPREADS * (1 + SMALL_SAMPLE / len(values)) * spread
+    spread = max(float(np.median(distances)) / 0.6745, float(np.median(sigmas)))
+    is_outlier: np.ndarray[Any, np.dtype[np.bool_]] = (
+        distances > OUTLIER_SPREADS * (1 + SMALL_SAMPLE / len(values)) * spread
     )
-    return outlying
+    return is_outlier
 
 
-def _text(values: Array, spread: float, guard: float, old: Tolerance | None, unit: str) -> str:
-    """Return the tolerance of values (N,), one-sided if the old tolerance was."""
+def _tolerance_text(
+    values: Array, spread: float, guard: float, old: Tolerance | None, unit: str
+) -> str:
+    """Return the text of a tolerance for values (N,); it is one-sided if the old one is."""
     mean, one_sided = float(values.mean()), old is not None and math.inf in (-old.least, old.most)
-    wide = _tolerance_factor(len(values), one_sided=one_sided) * spread
-    half = max(wide, float(np.abs(values - mean).max())) + guard
+    sigma_width = _tolerance_factor(len(values), one_sided=one_sided) * spread
+    half = max(sigma_width, float(np.abs(values - mean).max())) + guard
     digits = min(max(1 - math.floor(math.log10(half)), 0), MAX_DIGITS) if half > 0 else 3
     step = 10.0**-digits
 
@@ -251,40 +261,40 @@ def _text(values: Array, spread: float, guard: float, old: Tolerance | None, uni
     return f"{middle:.{digits}f} +- {round_outwards(half + abs(middle - mean)):.{digits}f} {unit}"
 
 
-def _tolerance_factor(number: int, *, one_sided: bool) -> float:
-    """Return the tolerance factor of ``number`` normal values, in standard deviations.
+def _tolerance_factor(count: int, *, one_sided: bool) -> float:
+    """Return the tolerance factor of ``count`` normal values, in standard deviations.
 
     The formulas are Howe's for two sides, and Natrella's approximation for one side.
     """
     special = load("scipy.special", "teaching measure needs")
-    degrees = number - 1
+    degrees = count - 1
     if one_sided:
         # quantiles of the normal distribution
-        z_coverage, z_sure = (
+        z_coverage, z_confidence = (
             float(special.ndtri(probability)) for probability in (TOLERANCE_COVERAGE, CONFIDENCE)
         )
-        a, b = 1 - z_sure**2 / (2 * degrees), z_coverage**2 - z_sure**2 / number
+        a, b = 1 - z_confidence**2 / (2 * degrees), z_coverage**2 - z_confidence**2 / count
         return (z_coverage + math.sqrt(z_coverage**2 - a * b)) / a
     z_coverage = float(special.ndtri((1 + TOLERANCE_COVERAGE) / 2))
-    least = float(special.chdtri(degrees, CONFIDENCE))  # lower quantile of chi squared
-    return z_coverage * math.sqrt(degrees * (1 + 1 / number) / least)
+    chi_squared = float(special.chdtri(degrees, CONFIDENCE))  # lower quantile of chi squared
+    return z_coverage * math.sqrt(degrees * (1 + 1 / count) / chi_squared)
 
 
-def _left_out(left_out: Mapping[str, str]) -> str:
+def _left_out_text(left_out: Mapping[str, str]) -> str:
     """Return the sentence about pictures that were left out; "" if there are none."""
     if not left_out:
         return ""
-    named = [f"{name} ({why})" for name, why in left_out.items()][:MAX_PICTURES_IN_REMARK]
-    more = (
+    named_pictures = [f"{name} ({why})" for name, why in left_out.items()][:MAX_PICTURES_IN_REMARK]
+    more_text = (
         f" and {len(left_out) - MAX_PICTURES_IN_REMARK} more"
         if len(left_out) > MAX_PICTURES_IN_REMARK
         else ""
     )
-    return f" Not learned from: {', '.join(named)}{more}."
+    return f" Not learned from: {', '.join(named_pictures)}{more_text}."
 
 
-def _pictures(number: int) -> str:
-    return "1 picture" if number == 1 else f"{number} pictures"
+def _pictures_text(count: int) -> str:
+    return "1 picture" if count == 1 else f"{count} pictures"
 
 
 _LEARNERS: Final[dict[str, Callable[[Mapping[str, Finding], Mapping[str, Any]], _Learned]]] = {

@@ -24,6 +24,8 @@ MAX_FILE_BYTES: Final = 1 << 28
 """Largest size of a picture's file, bytes."""
 
 LIMITED_BLACK: Final = 16
+"""Level of black in video's limited range of 8 bits (ITU-R BT.601)."""
+
 LIMITED_WHITE: Final = 235
 """Level of white in video's limited range of 8 bits (ITU-R BT.601)."""
 
@@ -86,11 +88,11 @@ class Picture:
             return cls(source)
         if not isinstance(source, Frame):
             raise wrong_argument("picture", "a Frame, a Picture or an array", source)
-        grey = source.format.grey_is_sent
-        pixels = source.grey() if grey else source.rgb()
+        sends_grey = source.format.grey_is_sent
+        pixels = source.grey() if sends_grey else source.rgb()
         depth = min(source.format.depth, 8 * pixels.dtype.itemsize)
         picture = cls(pixels, depth=depth, frame=source)
-        if grey and source.format.name.startswith("Mono"):
+        if sends_grey and source.format.name.startswith("Mono"):
             picture._has_colours = False
         return picture
 
@@ -111,9 +113,9 @@ class Picture:
             raise FrameFormatError(f"picture {path}: {exc}", source=str(path)) from exc
         if len(data) > MAX_FILE_BYTES:
             raise FrameFormatError(f"picture {path}: expected {MAX_FILE_BYTES} bytes at most")
-        how = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         try:
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error:  # empty files, and more pixels than OpenCV's limit
             pixels = None
         if pixels is None:
@@ -135,21 +137,21 @@ class Picture:
 
     @cached_property
     def levels(self) -> NDArray[Any]:
-        """Brightness without conversion, (H, W), uint8 or uint16 of :attr:`depth` bits."""
+        """Brightness, (H, W), uint8 or uint16 with :attr:`depth` significant bits."""
         if self._pixels.ndim == 2:
             return self._pixels
         cv2 = load("cv2", "inspection needs")
-        mixed: NDArray[Any] = cv2.cvtColor(self._pixels, cv2.COLOR_RGB2GRAY)
-        return mixed
+        brightness: NDArray[Any] = cv2.cvtColor(self._pixels, cv2.COLOR_RGB2GRAY)
+        return brightness
 
     @cached_property
     def ends(self) -> tuple[int, int]:
         """Saturation levels of black and white in :attr:`levels`.
 
-        They are the least and the largest possible level; or video's limits, 16 and 235 of 8 bits,
-        if the picture has many bright or dark levels and none beyond these limits.
+        These are the least and the largest possible level. If the picture's least level is 16 of 8
+        bits, or its largest level is 235, that limit of video is the saturation level.
         """
-        return _ends(self.levels, self.depth)
+        return _saturation_levels(self.levels, self.depth)
 
     @cached_property
     def clipped(self) -> NDArray[np.bool_] | None:
@@ -161,16 +163,16 @@ class Picture:
         """
         if not self.has_colours:
             return None
-        sent = self._pixels.ndim == 3
-        colours = self._pixels if sent or self.frame is None else self.frame.rgb()
+        is_rgb = self._pixels.ndim == 3
+        colours = self._pixels if is_rgb or self.frame is None else self.frame.rgb()
         depth = min(self.depth, 8 * colours.dtype.itemsize)
-        off_by = 0 if sent else 1  # converted colours may be off by one level
+        tolerance = 0 if is_rgb else 1  # converted colours may be off by one level
         bright = colours.max(axis=2) > 2**depth // 4
         mask = np.zeros(bright.shape, dtype=bool)
         for channel in range(3):
-            black, white = _ends(colours[:, :, channel], depth)
-            mask |= colours[:, :, channel] >= white - off_by
-            mask |= bright & (colours[:, :, channel] <= black + off_by)
+            black, white = _saturation_levels(colours[:, :, channel], depth)
+            mask |= colours[:, :, channel] >= white - tolerance
+            mask |= bright & (colours[:, :, channel] <= black + tolerance)
         return mask
 
     @cached_property
@@ -189,7 +191,7 @@ class Picture:
         return np.repeat(self.grey[:, :, np.newaxis], 3, axis=2)
 
 
-def _ends(levels: NDArray[Any], depth: int) -> tuple[int, int]:
+def _saturation_levels(levels: NDArray[Any], depth: int) -> tuple[int, int]:
     """Return the saturation levels of samples of ``depth`` bits."""
     top, step = 2**depth - 1, 2 ** (depth - 8) if depth >= 8 else 0
     black, white = LIMITED_BLACK * step, LIMITED_WHITE * step

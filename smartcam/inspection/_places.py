@@ -48,15 +48,15 @@ class PixelPose(NamedTuple):
     def to_picture(self, points: ArrayLike) -> NDArray[np.float64]:
         """Convert points (..., 2) of this frame to the picture's pixels."""
         cos, sin = self.scale * math.cos(self.angle), self.scale * math.sin(self.angle)
-        turn = np.array([[cos, sin], [-sin, cos]])
-        moved: NDArray[np.float64] = np.asarray(points, np.float64) @ turn + (self.x, self.y)
+        rotation = np.array([[cos, sin], [-sin, cos]])
+        moved: NDArray[np.float64] = np.asarray(points, np.float64) @ rotation + (self.x, self.y)
         return moved
 
     def from_picture(self, points: ArrayLike) -> NDArray[np.float64]:
         """Convert points (..., 2) of the picture to this frame."""
         cos, sin = math.cos(self.angle) / self.scale, math.sin(self.angle) / self.scale
-        turn = np.array([[cos, -sin], [sin, cos]])
-        moved: NDArray[np.float64] = (np.asarray(points, np.float64) - (self.x, self.y)) @ turn
+        rotation = np.array([[cos, -sin], [sin, cos]])
+        moved: NDArray[np.float64] = (np.asarray(points, np.float64) - (self.x, self.y)) @ rotation
         return moved
 
 
@@ -75,7 +75,7 @@ class Region(tuple[tuple[float, float], ...]):
     __slots__ = ()
 
 
-def _region(given: object) -> Region:
+def _parse_region(given: object) -> Region:
     if isinstance(given, Region):
         return given
     items: list[Any] = list(given) if isinstance(given, (list, tuple)) else []
@@ -107,7 +107,7 @@ def _is_coordinate(value: object) -> bool:
 _PLACE: Final = {"type": "array", "items": {"type": "number"}, "minItems": 2}
 RegionSetting = Annotated[
     Region,
-    PlainValidator(_region),
+    PlainValidator(_parse_region),
     WithJsonSchema(
         {
             "anyOf": [
@@ -130,7 +130,7 @@ class PlacedRegion:
         top: first row.
         right: column after the last.
         below: row after the last.
-        outside: distance by which the region reaches out of the picture, pixels.
+        outside: largest distance by which the region reaches out of the picture, pixels.
     """
 
     corners: NDArray[np.float64]
@@ -164,7 +164,9 @@ class PlacedRegion:
         return mask
 
 
-def place(region: Region | None, pose: PixelPose | None, size: tuple[int, int]) -> PlacedRegion:
+def place_region(
+    region: Region | None, pose: PixelPose | None, size: tuple[int, int]
+) -> PlacedRegion:
     """Place a region in a picture.
 
     Args:
@@ -175,20 +177,20 @@ def place(region: Region | None, pose: PixelPose | None, size: tuple[int, int]) 
     """
     if region is None or pose is None:
         return _place_fixed(region, size)
-    return _placed(pose.to_picture(region), size)
+    return _bound_region(pose.to_picture(region), size)
 
 
 @lru_cache(maxsize=MAX_FIXED_PLACES)
 def _place_fixed(region: Region | None, size: tuple[int, int]) -> PlacedRegion:
-    """Return the place of a region that follows nothing; its corners cannot be changed."""
+    """Place a region that follows no tool; its corners cannot be changed."""
     if region is None:
-        region = _region([0, 0, *size])
+        region = _parse_region([0, 0, *size])
     corners = np.asarray(region) - 0.5
     corners.flags.writeable = False
-    return _placed(corners, size)
+    return _bound_region(corners, size)
 
 
-def _placed(corners: NDArray[np.float64], size: tuple[int, int]) -> PlacedRegion:
+def _bound_region(corners: NDArray[np.float64], size: tuple[int, int]) -> PlacedRegion:
     width, height = size
     (left, top), (right, below) = corners.min(axis=0) + 0.5, corners.max(axis=0) + 0.5
     return PlacedRegion(

@@ -29,10 +29,10 @@ MAX_AREA_PX: Final = 1_000_000_000
 """Largest area of a spot in the settings, in pixels."""
 
 
-def _rising(given: tuple[int, int]) -> tuple[int, int]:
-    if given[0] > given[1]:
-        raise ValueError(f"expected the smaller number first, got {list(given)}")
-    return given
+def _check_order(limits: tuple[int, int]) -> tuple[int, int]:
+    if limits[0] > limits[1]:
+        raise ValueError(f"expected the smaller number first, got {list(limits)}")
+    return limits
 
 
 Level = Annotated[int, Field(ge=0, le=255)]
@@ -43,7 +43,7 @@ Number = Annotated[int, Field(ge=0, le=MAX_SPOTS)]
 class PresentSettings(ToolSettings):
     """Colours and sizes of the wanted spots, and the expected number."""
 
-    grey: Annotated[tuple[Level, Level], AfterValidator(_rising)] | None = Field(
+    grey: Annotated[tuple[Level, Level], AfterValidator(_check_order)] | None = Field(
         None, description="smallest and largest grey level of a spot, 0 to 255"
     )
     colour: ColourRange | None = Field(
@@ -51,10 +51,10 @@ class PresentSettings(ToolSettings):
         description="colours of a spot: {hue: [from, to], saturation: [from, to], value: [from, "
         "to]}, as the page of smartcam frames colours finds them",
     )
-    area: Annotated[tuple[Area, Area], AfterValidator(_rising)] = Field(
+    area: Annotated[tuple[Area, Area], AfterValidator(_check_order)] = Field(
         (20, MAX_AREA_PX), description="least and largest area of a spot, pixels"
     )
-    count: Annotated[tuple[Number, Number], AfterValidator(_rising)] | Number = Field(
+    count: Annotated[tuple[Number, Number], AfterValidator(_check_order)] | Number = Field(
         (1, MAX_SPOTS), description="expected number of spots, or its two limits"
     )
     most: int = Field(1, ge=1, le=MAX_SPOTS, description="largest number of spots in the result")
@@ -74,7 +74,7 @@ class Spot(NamedTuple):
         x: centre of gravity, pixels of the picture.
         y: centre of gravity.
         angle: direction of the long axis, radians from x towards y, above -pi/2, up to pi/2; NaN if
-            the spot is as wide as long.
+            the spot is not longer than wide.
         area: pixels.
         box: left, top, width, height.
     """
@@ -117,22 +117,26 @@ class Present(Tool[PresentSettings]):
 
     def inspect(self, view: View) -> Finding:
         """Return the spots, the largest first."""
-        blind = self.settings.colour is not None and not view.picture.has_colours
-        spots = [] if blind else self._spots(view)
+        lacks_colours = self.settings.colour is not None and not view.picture.has_colours
+        spots = [] if lacks_colours else self._find_spots(view)
         count = len(spots)
-        ok = not blind and self._least <= count <= self._most
+        ok = not lacks_colours and self._least <= count <= self._most
         wanted = f"{self._least}" if self._least == self._most else f"{self._least} to {self._most}"
-        reason = "the picture has no colours" if blind else f"{count} spots, expected {wanted}"
+        reason = (
+            "the picture has no colours" if lacks_colours else f"{count} spots, expected {wanted}"
+        )
         spots_kept = spots[: self.settings.most]
-        alone = dict(spots_kept[0].values()) if spots_kept and self.settings.most == 1 else {}
+        single_values = (
+            dict(spots_kept[0].values()) if spots_kept and self.settings.most == 1 else {}
+        )
         return Finding(
             ok=ok,
             reason="" if ok else reason,
-            values={"count": min(count, 0xFFFF), **alone},
+            values={"count": min(count, 0xFFFF), **single_values},
             records=[] if self.settings.most == 1 else [spot.values() for spot in spots_kept],
             drawings=[
                 Drawing("polygon", _corners(view.region.corners), "region"),
-                *(_drawn(spot, ok=ok) for spot in spots[:MAX_SPOTS]),
+                *(_draw_spot(spot, ok=ok) for spot in spots[:MAX_SPOTS]),
             ],
             reference=PixelPose(spots_kept[0].x, spots_kept[0].y, _or_zero(spots_kept[0].angle))
             if spots_kept
@@ -140,7 +144,7 @@ class Present(Tool[PresentSettings]):
             details=tuple(spots_kept),
         )
 
-    def _spots(self, view: View) -> list[Spot]:
+    def _find_spots(self, view: View) -> list[Spot]:
         cv2 = load("cv2", "inspection needs")
         if self.settings.colour is not None:
             mask = self.settings.colour.mask(view.rgb).view(np.uint8)
@@ -155,16 +159,17 @@ class Present(Tool[PresentSettings]):
         labels_kept = 1 + np.flatnonzero((areas >= least) & (areas <= most))
         labels_kept = labels_kept[np.argsort(-stats[labels_kept, cv2.CC_STAT_AREA], kind="stable")]
         return [
-            _spot(labels, int(label), stats[label], centres[label], view) for label in labels_kept
+            _make_spot(labels, int(label), stats[label], centres[label], view)
+            for label in labels_kept
         ]
 
 
-def _spot(
+def _make_spot(
     labels: NDArray[Any], label: int, stats: NDArray[Any], centre: NDArray[Any], view: View
 ) -> Spot:
     left, top, width, height, area = map(int, stats)
-    cut = labels[top : top + height, left : left + width] == label
-    moments = load("cv2", "inspection needs").moments(cut.view(np.uint8), binaryImage=True)
+    is_spot = labels[top : top + height, left : left + width] == label
+    moments = load("cv2", "inspection needs").moments(is_spot.view(np.uint8), binaryImage=True)
     xx, yy, xy = moments["mu20"], moments["mu02"], moments["mu11"]
     spread = math.hypot(xx - yy, 2 * xy)
     long, short = xx + yy + spread, max(xx + yy - spread, 0.0)
@@ -187,7 +192,7 @@ def _corners(corners: NDArray[Any]) -> tuple[tuple[float, float], ...]:
     return tuple((float(x), float(y)) for x, y in corners)
 
 
-def _drawn(spot: Spot, *, ok: bool) -> Drawing:
+def _draw_spot(spot: Spot, *, ok: bool) -> Drawing:
     left, top, width, height = spot.box
     right, below = left + width - 0.5, top + height - 0.5
     corners = ((left - 0.5, top - 0.5), (right, top - 0.5), (right, below), (left - 0.5, below))

@@ -14,7 +14,7 @@ from smartcam._suggestions import did_you_mean, hint
 from smartcam.exceptions import ConfigurationError, InspectionError, PluginError, SmartCamError
 from smartcam.inspection._finding import Finding, Inspection
 from smartcam.inspection._picture import Picture
-from smartcam.inspection._places import IDENTITY, place
+from smartcam.inspection._places import IDENTITY, place_region
 from smartcam.inspection._tool import Tool, ToolSettings, View
 from smartcam.layout import Layout
 from smartcam.layout._inside import Field
@@ -34,8 +34,8 @@ MAX_TOOLS: Final = 50
 MAX_REASON_BYTES: Final = 80
 """Largest number of bytes of the reason in a result container; longer reasons are cut."""
 
-OWN_FIELDS: Final = ("ok", "reason")
-"""Fields of the program, which no tool may have."""
+PROGRAM_FIELDS: Final = ("ok", "reason")
+"""Fields that the program itself adds; no tool may have them."""
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,29}")
 
@@ -61,15 +61,15 @@ class ProgramStep:
     Attributes:
         name: name of the tool in its program, unique there.
         tool: the tool.
-        own: False for a tool of a followed application: it runs, but its values are not in the
-            result.
+        in_result: whether the tool's values are in the result; False for the tools of a followed
+            application.
         fields: fields of the values, with their names in the result.
         records: fields of each record.
     """
 
     name: str
     tool: AnyTool
-    own: bool
+    in_result: bool
     fields: tuple[Field, ...] = ()
     records: tuple[Field, ...] = ()
 
@@ -100,22 +100,23 @@ class Program:
     ) -> None:
         self.application = application
         self.name = name
-        several = sum(step.own for step in steps) > 1
+        several = sum(step.in_result for step in steps) > 1
         self.steps: tuple[ProgramStep, ...] = tuple(
-            _with_fields(step, several=several) for step in steps
+            _add_fields(step, several=several) for step in steps
         )
-        head = [Field("sequence", "int32", sequence=True)] if sequence else []
-        head += [Field("ok", "bool"), Field("reason", "string", MAX_REASON_BYTES)]
-        head += (field for step in self.steps for field in step.fields)
-        text = ", ".join(map(str, head))
-        groups = [step for step in self.steps if step.records]
-        if len(groups) > 1:
+        fields = [Field("sequence", "int32", sequence=True)] if sequence else []
+        fields += [Field("ok", "bool"), Field("reason", "string", MAX_REASON_BYTES)]
+        fields += (field for step in self.steps for field in step.fields)
+        text = ", ".join(map(str, fields))
+        listing = [step for step in self.steps if step.records]
+        if len(listing) > 1:
             raise ConfigurationError(
-                f"{groups[0].name} and {groups[1].name} each find several things, and a result has "
-                "room for one list: expected one of them, and the other one in another application"
+                f"{listing[0].name} and {listing[1].name} each find several things, and a "
+                "result has room for one list: expected one of them, and the other one in another "
+                "application"
             )
-        if groups:
-            text += f", {groups[0].name}: ({', '.join(map(str, groups[0].records))})*"
+        if listing:
+            text += f", {listing[0].name}: ({', '.join(map(str, listing[0].records))})*"
         self.layout: Layout = Layout(text)
         self._several = several
 
@@ -146,9 +147,9 @@ class Program:
         if self.layout.sequence_field is not None:
             values["sequence"] = 0
         for step in self.steps:
-            values |= _values(step, findings[step.name], several=self._several)
-        reason = _reason(findings)
-        values["reason"] = _cut(reason)
+            values |= _result_values(step, findings[step.name], several=self._several)
+        reason = _first_reason(findings)
+        values["reason"] = _shorten(reason)
         return Inspection(
             application=self.application,
             name=self.name,
@@ -167,7 +168,7 @@ class Program:
         for step in self.steps:
             started = time.perf_counter()
             try:
-                findings[step.name] = _finding_of(step.tool, picture, input, findings)
+                findings[step.name] = _run_tool(step.tool, picture, input, findings)
             except SmartCamError:
                 raise
             except Exception as exc:
@@ -184,7 +185,7 @@ class Program:
 class FollowedApplication(Tool[ToolSettings]):
     """The tools of a followed application as one tool.
 
-    Its frame of reference is the last that one of these tools found.
+    The frame of reference is the last one that one of these tools found.
     """
 
     settings_model = ToolSettings
@@ -197,19 +198,19 @@ class FollowedApplication(Tool[ToolSettings]):
         """Return the common verdict, and the last frame of reference."""
         findings: dict[str, Finding] = {}
         for step in self._steps:
-            findings[step.name] = _finding_of(step.tool, view.picture, view.input, findings)
+            findings[step.name] = _run_tool(step.tool, view.picture, view.input, findings)
         references = [
             finding.reference for finding in findings.values() if finding.reference is not None
         ]
         return Finding(
             ok=all(finding.ok for finding in findings.values()),
-            reason=_reason(findings),
+            reason=_first_reason(findings),
             drawings=[mark for finding in findings.values() for mark in finding.drawings],
             reference=references[-1] if references else None,
         )
 
 
-def _reason(findings: Mapping[str, Finding]) -> str:
+def _first_reason(findings: Mapping[str, Finding]) -> str:
     """Return the first reason among findings; "" if all are ok."""
     for name, finding in findings.items():
         if not finding.ok:
@@ -218,19 +219,19 @@ def _reason(findings: Mapping[str, Finding]) -> str:
     return ""
 
 
-def _finding_of(
+def _run_tool(
     tool: AnyTool, picture: Picture, input: bytes, earlier: Mapping[str, Finding]
 ) -> Finding:
-    """Return the finding of a tool, or a finding with the reason why it cannot run."""
+    """Run a tool; if it cannot run, return a finding with the reason."""
     settings: ToolSettings = tool.settings
     reference = None
     if settings.follow is not None:
         reference = earlier[settings.follow].reference
         if reference is None:
             return Finding(ok=False, reason=f"{settings.follow} was not found, which it follows")
-    region = place(settings.region, reference, picture.size)
-    outside = region.outside > 0.5 and tool.needs_whole_region
-    if region.is_empty or outside:
+    region = place_region(settings.region, reference, picture.size)
+    is_outside = region.outside > 0.5 and tool.needs_whole_region
+    if region.is_empty or is_outside:
         width, height = picture.size
         return Finding(
             ok=False,
@@ -248,13 +249,13 @@ def _finding_of(
     return tool.inspect(view)
 
 
-def _with_fields(step: ProgramStep, *, several: bool) -> ProgramStep:
-    if not step.own:
+def _add_fields(step: ProgramStep, *, several: bool) -> ProgramStep:
+    if not step.in_result:
         return step
     fields = Layout(step.tool.fields).fields if step.tool.fields else ()
     records = Layout(step.tool.records).fields if step.tool.records else ()
     for field in (*fields, *records):
-        if field.name in OWN_FIELDS or field.sequence:
+        if field.name in PROGRAM_FIELDS or field.sequence:
             raise ConfigurationError(f"{step.name}: a tool may not have the field {field.name!r}")
     if several:
         verdict = Field("ok", "bool")
@@ -264,14 +265,14 @@ def _with_fields(step: ProgramStep, *, several: bool) -> ProgramStep:
     return replace(step, fields=fields, records=records)
 
 
-def _values(step: ProgramStep, finding: Finding, *, several: bool) -> dict[str, Any]:
+def _result_values(step: ProgramStep, finding: Finding, *, several: bool) -> dict[str, Any]:
     """Return a finding's values by their names in the result; missing values are left empty."""
-    if not step.own:
+    if not step.in_result:
         return {}
     prefix = f"{step.name}_" if several else ""
-    given = {**finding.values, "ok": finding.ok} if several else finding.values
+    values_by_field = {**finding.values, "ok": finding.ok} if several else finding.values
     values = {
-        field.name: given.get(field.name.removeprefix(prefix), _empty_value(field))
+        field.name: values_by_field.get(field.name.removeprefix(prefix), _empty_value(field))
         for field in step.fields
     }
     if step.records:
@@ -293,7 +294,7 @@ def _empty_value(field: Field) -> Any:
     return 0
 
 
-def _cut(reason: str) -> str:
+def _shorten(reason: str) -> str:
     data = reason.encode()
     if len(data) <= MAX_REASON_BYTES:
         return reason
@@ -303,25 +304,27 @@ def _cut(reason: str) -> str:
 # ---------------------------------------------------------------------- making programs
 
 
-def split_name(key: str) -> tuple[str, str]:
-    """Split a key of an application, ``read`` or ``read left``, into the tool and its name."""
+def split_tool_key(key: str) -> tuple[str, str]:
+    """Split a key of an application, ``read`` or ``read left``, into kind and name of the tool."""
     kind, _, name = key.partition(" ")
     return kind, name.strip() or kind
 
 
-def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] = ()) -> ProgramStep:
+def make_step(
+    key: str, given: object, setup: ToolSetup, other_keys: Iterable[str] = ()
+) -> ProgramStep:
     """Return the step of an application's entry.
 
     Args:
         key: ``TOOL``, or ``TOOL NAME`` if a program has several of one kind.
         given: settings of the tool, as in YAML.
         setup: folder and calibration for the tool.
-        others: other keys of the entry, for hints at misspelled names.
+        other_keys: other keys of the entry, for hints at misspelled names.
 
     Raises:
         ProgramError: the tool is unknown, or a setting is wrong.
     """
-    kind, name = split_name(key)
+    kind, name = split_tool_key(key)
     if _NAME.fullmatch(name) is None:
         raise ProgramError(
             f"expected a name of small letters, digits and _, such as 'read left'; got "
@@ -332,7 +335,7 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
         tools = [info.name for info in TOOLS.available()]
         raise ProgramError(
             f"no tool is called {kind!r:.60}; tools are {', '.join(tools)}"
-            f"{did_you_mean(kind, [*tools, *others])}",
+            f"{did_you_mean(kind, [*tools, *other_keys])}",
             (key,),
         )
     try:
@@ -345,14 +348,14 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
     try:
         settings = model.model_validate({} if given is None else given)
     except ValidationError as exc:
-        errors = exc.errors(include_url=False)  # a missing key may be a misspelled one
+        errors = exc.errors(include_url=False)  # a misspelled key explains a missing key
         first = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
         text = first["msg"].removeprefix("Value error, ") + hint(
             first, _known_settings(model, first["loc"])
         )
         raise ProgramError(text, (key, *first["loc"])) from exc
     try:
-        return ProgramStep(name, tool_class(settings, setup), own=True)
+        return ProgramStep(name, tool_class(settings, setup), in_result=True)
     except ProgramError as exc:
         raise ProgramError(str(exc), (key, *exc.place)) from exc
     except (SmartCamError, OSError) as exc:
@@ -363,8 +366,8 @@ def _known_settings(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
     """Return the names of the settings at an error's place."""
     for key in place[:-1]:
         field = getattr(model, "model_fields", {}).get(key)
-        inner = () if field is None else (field.annotation, *get_args(field.annotation))
-        model = next((model for model in inner if hasattr(model, "model_fields")), None)
+        types = () if field is None else (field.annotation, *get_args(field.annotation))
+        model = next((model for model in types if hasattr(model, "model_fields")), None)
     return getattr(model, "model_fields", ())
 
 

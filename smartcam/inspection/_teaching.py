@@ -41,7 +41,7 @@ MAX_FILE_BYTES: Final = 1 << 22
 LINE_WIDTH: Final = 4096
 """Width of written lines, in characters, which is large enough to wrap none."""
 
-OWN_KEYS: Final = ("name", "sequence", "rate")
+NON_TOOL_KEYS: Final = ("name", "sequence", "rate")
 """Keys of an application that do not name tools."""
 
 
@@ -69,8 +69,8 @@ class Teaching:
         self.path: Path = check_path(path, "path", "Teaching")
         self.camera: str = check_text(camera, "camera", "Teaching")
         application = check_application_or_name(application, owner="Teaching")
-        software = self._software(self._read())
-        self.application: int = self._number(software["applications"], application)
+        software = self._find_software(self._read_document())
+        self.application: int = self._find_number(software["applications"], application)
         self.frames: str = Software.model_validate(software).frames_address(self.path.parent)
         stored = software["applications"].get(self.application, {})
         self._entry: dict[str, Any] = stored if isinstance(stored, dict) else {}
@@ -83,7 +83,9 @@ class Teaching:
     @property
     def tools(self) -> dict[str, dict[str, Any]]:
         """Settings of the application's tools by their keys, as in the file."""
-        return {key: dict(given or {}) for key, given in self._entry.items() if key not in OWN_KEYS}
+        return {
+            key: dict(given or {}) for key, given in self._entry.items() if key not in NON_TOOL_KEYS
+        }
 
     def program(self, tools: Mapping[str, Mapping[str, Any]]) -> Program:
         """Return the program of these tools, which may follow the file's other applications.
@@ -93,25 +95,25 @@ class Teaching:
         """
         if not isinstance(tools, Mapping):
             raise wrong_argument("tools", "a mapping from tools to their settings", tools)
-        software = self._software(self._read())
-        software["applications"][self.application] = self._changed(tools)
+        software = self._find_software(self._read_document())
+        software["applications"][self.application] = self._entry_with(tools)
         try:
             checked = Software.model_validate(software)
         except ValidationError as exc:
             first = exc.errors(include_url=False)[0]
             raise ConfigurationError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from exc
         try:
-            made = make_camera(self.camera, checked, self.path.parent)
+            camera = make_camera(self.camera, checked, self.path.parent)
         except ProgramError as exc:
             place = [str(key) for key in exc.place if key not in {"applications", self.application}]
             text = f"{'.'.join(place)}: {exc}" if place else str(exc)
             raise ConfigurationError(text) from exc
-        return made.programs[self.application]
+        return camera.programs[self.application]
 
-    def _changed(self, tools: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    def _entry_with(self, tools: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         """Return the application's entry with the given tools."""
-        own_entries = {key: value for key, value in self._entry.items() if key in OWN_KEYS}
-        return {**own_entries, **{key: dict(given) for key, given in tools.items()}}
+        other_entries = {key: value for key, value in self._entry.items() if key in NON_TOOL_KEYS}
+        return {**other_entries, **{key: dict(given) for key, given in tools.items()}}
 
     def save(self, tools: Mapping[str, Mapping[str, Any]]) -> None:
         """Write the tools into the file, and leave the rest, comments included, unchanged.
@@ -122,19 +124,19 @@ class Teaching:
             MissingExtraError: the extra ``inspection`` is not installed.
         """
         self.program(tools)
-        entry = self._changed(tools)
+        entry = self._entry_with(tools)
         yaml: Any = load("ruamel.yaml", "teaching needs").YAML()
         yaml.preserve_quotes = True
         yaml.width = LINE_WIDTH
-        text = self._text()
+        text = self._read_text()
         if re.search(r"^( *)[^\s#-].*:\s*(#.*)?\n\1 +- ", text, re.MULTILINE):
             yaml.indent(mapping=2, sequence=4, offset=2)
         document = yaml.load(text)
         applications = document["cameras"][self.camera]["software"]["applications"]
         if isinstance(applications.get(self.application), dict):
-            _update(applications[self.application], entry)
+            _update_mapping(applications[self.application], entry)
         else:
-            applications[self.application] = _flow(entry)
+            applications[self.application] = _as_flow(entry)
         written = io.StringIO()
         yaml.dump(document, written)
         self._check_written(written.getvalue(), entry)
@@ -145,16 +147,16 @@ class Teaching:
         self._entry = entry
 
     def _check_written(self, text: str, entry: dict[str, Any]) -> None:
-        """Raise if another YAML reader would read other settings from the text."""
-        wanted = self._read()
-        self._software(wanted)["applications"][self.application] = entry
-        if _plain(load_yaml(text, label=str(self.path))) != _plain(wanted):
+        """Raise if the package's own YAML reader reads other settings from the text."""
+        expected = self._read_document()
+        self._find_software(expected)["applications"][self.application] = entry
+        if _as_plain(load_yaml(text, label=str(self.path))) != _as_plain(expected):
             raise ConfigurationError(
                 f"{self.path}: the settings cannot be written without changing other lines; write "
                 f"them by hand: {entry!r}"
             )
 
-    def _text(self) -> str:
+    def _read_text(self) -> str:
         try:
             with self.path.open("rb") as file:
                 data = file.read(MAX_FILE_BYTES + 1)
@@ -164,13 +166,13 @@ class Teaching:
         except (OSError, UnicodeDecodeError) as exc:
             raise ConfigurationError(f"{self.path} cannot be read: {exc}") from exc
 
-    def _read(self) -> Any:
+    def _read_document(self) -> Any:
         try:
-            return load_yaml(self._text(), label=str(self.path))
+            return load_yaml(self._read_text(), label=str(self.path))
         except BadYamlError as exc:
             raise ConfigurationError(f"{self.path}: {exc}") from exc
 
-    def _number(self, applications: dict[Any, Any], application: int | str) -> int:
+    def _find_number(self, applications: dict[Any, Any], application: int | str) -> int:
         """Return the number of an application, which may be named by number, digits or name."""
         if not isinstance(application, str) or (application.isascii() and application.isdigit()):
             number = int(application)
@@ -189,7 +191,7 @@ class Teaching:
             )
         return names[application]
 
-    def _software(self, document: Any) -> dict[str, Any]:
+    def _find_software(self, document: Any) -> dict[str, Any]:
         """Return the mapping ``software:`` of the camera in a file."""
         cameras = document.get("cameras") if isinstance(document, dict) else None
         entry = cameras.get(self.camera) if isinstance(cameras, dict) else None
@@ -203,37 +205,37 @@ class Teaching:
         return cast("dict[str, Any]", software)
 
 
-def _plain(value: Any) -> Any:
+def _as_plain(value: Any) -> Any:
     """Return a value as a YAML reader returns it: tuples become lists."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _as_plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [_as_plain(item) for item in value]
     return value
 
 
-def _update(old: Any, new: Mapping[str, Any]) -> None:
+def _update_mapping(old: Any, new: Mapping[str, Any]) -> None:
     """Change the differing values of a file's mapping; equal values keep their notation."""
     for key in [key for key in old if key not in new]:
         del old[key]
     for key, value in new.items():
         if isinstance(value, dict) and isinstance(old.get(key), dict):
-            _update(old[key], value)
-        elif key not in old or _plain(old[key]) != _plain(value):
-            old[key] = _flow(value)
+            _update_mapping(old[key], value)
+        elif key not in old or _as_plain(old[key]) != _as_plain(value):
+            old[key] = _as_flow(value)
 
 
-def _flow(value: Any) -> Any:
-    """Return a value that YAML writes on one line."""
+def _as_flow(value: Any) -> Any:
+    """Return a value in ruamel's types, which YAML writes on one line."""
     kinds = load("ruamel.yaml.comments", "teaching needs")
     if isinstance(value, dict):
-        made = kinds.CommentedMap({key: _flow(item) for key, item in value.items()})
+        node = kinds.CommentedMap({key: _as_flow(item) for key, item in value.items()})
     elif isinstance(value, (list, tuple)):
-        made = kinds.CommentedSeq([_flow(item) for item in value])
+        node = kinds.CommentedSeq([_as_flow(item) for item in value])
     else:
         return value
-    made.fa.set_flow_style()
-    return made
+    node.fa.set_flow_style()
+    return node
 
 
 # ---------------------------------------------------------------------- settings

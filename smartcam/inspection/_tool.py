@@ -72,7 +72,7 @@ class View:
         reference: frame of reference that the tool follows; the picture's if it follows none.
         follows: True if the tool follows another tool.
         input: input data of the trigger.
-        earlier: findings of the tools before, by their names.
+        earlier: findings of the tools that ran before this one, by the tools' names.
     """
 
     picture: Picture
@@ -123,7 +123,7 @@ class Tool(ABC, Generic[S]):
     """Pydantic model of the tool's settings in a program file."""
 
     needs_whole_region: ClassVar[bool] = True
-    """If True and the region reaches out of the picture, the tool is not called and not ok."""
+    """If True, a region that reaches out of the picture gives a finding that is not ok."""
 
     def __init__(self, settings: S, setup: ToolSetup) -> None:
         self.settings = settings

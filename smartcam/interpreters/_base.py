@@ -41,17 +41,17 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(slots=True)
 class Context:
-    """The facts about a container, beside its bytes, that an interpreter may use.
+    """The facts about a container that an interpreter may use, in addition to the bytes.
 
     Attributes:
         camera: name of the camera.
-        application: id of the application that made it.
+        application: id of the application that made the container.
         number: the client's own count of containers.
-        received_at: when its last byte arrived, UTC.
+        received_at: time at which the container's last byte arrived, UTC.
         byte_order: order of the bytes of a number, from the camera's status.
-        y_down: whether the camera's y axis points down; poses are turned to y up.
-        lenient: take any byte but zero for a true bool.
-        empty_slots: number of records of zeros that were skipped; the interpreter counts them.
+        y_down: whether the camera's y axis points down; poses are then converted to y up.
+        lenient: whether any byte except zero is a true bool.
+        empty_slots: number of skipped records of zeros, which the interpreter counts.
     """
 
     camera: str = ""
@@ -65,7 +65,7 @@ class Context:
 
 
 @functools.lru_cache(maxsize=64)
-def _number(code: str, byte_order: str) -> struct.Struct:
+def _number_struct(code: str, byte_order: str) -> struct.Struct:
     return struct.Struct(("<" if byte_order == "little" else ">") + code)
 
 
@@ -98,7 +98,7 @@ class Reader:
 
     def get_bool(self, first_byte: int) -> bool:
         """Return a bool: 0xFF is true, 0x00 false; other bytes are errors unless ``lenient``."""
-        raw = self._take(first_byte, 1, "a bool")[0]
+        raw = self._slice(first_byte, 1, "a bool")[0]
         if raw not in (0x00, 0xFF) and not self.context.lenient:
             raise InterpretationError(
                 f"offset {first_byte}: expected 0x00 or 0xFF for a bool, got 0x{raw:02X}",
@@ -110,47 +110,47 @@ class Reader:
 
     def get_int8(self, first_byte: int) -> int:
         """Return an integer of one byte with a sign."""
-        return int(self._get(first_byte, "b", "an int8"))
+        return int(self._unpack(first_byte, "b", "an int8"))
 
     def get_int16(self, first_byte: int) -> int:
         """Return an integer of two bytes with a sign."""
-        return int(self._get(first_byte, "h", "an int16"))
+        return int(self._unpack(first_byte, "h", "an int16"))
 
     def get_int32(self, first_byte: int) -> int:
         """Return an integer of four bytes with a sign."""
-        return int(self._get(first_byte, "i", "an int32"))
+        return int(self._unpack(first_byte, "i", "an int32"))
 
     def get_int64(self, first_byte: int) -> int:
         """Return an integer of eight bytes with a sign."""
-        return int(self._get(first_byte, "q", "an int64"))
+        return int(self._unpack(first_byte, "q", "an int64"))
 
     def get_uint8(self, first_byte: int) -> int:
         """Return an integer of one byte."""
-        return int(self._get(first_byte, "B", "a uint8"))
+        return int(self._unpack(first_byte, "B", "a uint8"))
 
     def get_uint16(self, first_byte: int) -> int:
         """Return an integer of two bytes."""
-        return int(self._get(first_byte, "H", "a uint16"))
+        return int(self._unpack(first_byte, "H", "a uint16"))
 
     def get_uint32(self, first_byte: int) -> int:
         """Return an integer of four bytes."""
-        return int(self._get(first_byte, "I", "a uint32"))
+        return int(self._unpack(first_byte, "I", "a uint32"))
 
     def get_uint64(self, first_byte: int) -> int:
         """Return an integer of eight bytes."""
-        return int(self._get(first_byte, "Q", "a uint64"))
+        return int(self._unpack(first_byte, "Q", "a uint64"))
 
     def get_real32(self, first_byte: int) -> float:
         """Return an IEEE number of four bytes; it may be NaN or infinite."""
-        return float(self._get(first_byte, "f", "a real32"))
+        return float(self._unpack(first_byte, "f", "a real32"))
 
     def get_real64(self, first_byte: int) -> float:
         """Return an IEEE number of eight bytes; it may be NaN or infinite."""
-        return float(self._get(first_byte, "d", "a real64"))
+        return float(self._unpack(first_byte, "d", "a real64"))
 
     def get_string(self, first_byte: int, length: int) -> str:
         """Return a text of ``length`` bytes, cut at the first zero and decoded as UTF-8."""
-        raw = self._take(first_byte, length, "a string").partition(b"\0")[0]
+        raw = self._slice(first_byte, length, "a string").partition(b"\0")[0]
         try:
             return raw.decode()
         except UnicodeDecodeError as exc:
@@ -164,7 +164,7 @@ class Reader:
 
     def get_bytes(self, first_byte: int, length: int) -> bytes:
         """Return ``length`` bytes as they are."""
-        return self._take(first_byte, length, "bytes")
+        return self._slice(first_byte, length, "bytes")
 
     def records(self, size: int) -> range:
         """Return the offsets of records of ``size`` bytes, which fill the container.
@@ -186,11 +186,11 @@ class Reader:
             )
         return range(0, len(self.data), size)
 
-    def _get(self, first_byte: int, code: str, label: str) -> Any:
-        number = _number(code, self.context.byte_order)
-        return number.unpack(self._take(first_byte, number.size, label))[0]
+    def _unpack(self, first_byte: int, code: str, label: str) -> Any:
+        number = _number_struct(code, self.context.byte_order)
+        return number.unpack(self._slice(first_byte, number.size, label))[0]
 
-    def _take(self, first_byte: int, length: int, label: str) -> bytes:
+    def _slice(self, first_byte: int, length: int, label: str) -> bytes:
         end = first_byte + length
         if first_byte < 0 or length < 0 or end > len(self.data):
             available = max(0, len(self.data) - max(0, first_byte))
@@ -205,7 +205,7 @@ class Reader:
 
 
 class Interpreter(ABC):
-    """Turns a container's bytes into a value; keeps nothing between two of them.
+    """Turns a container's bytes into a value; keeps nothing between two containers.
 
     Args:
         layout: layout of the container's fields; default :attr:`default_layout`.
@@ -218,7 +218,7 @@ class Interpreter(ABC):
     """Text of the layout that is used if the user gives no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "optional"
-    """Use of a layout: it must not, may or must be given."""
+    """``none``: no layout must be given; ``optional``: one may be; ``required``: one must be."""
 
     def __init__(self, layout: Layout | None = None) -> None:
         name = type(self).__name__.removesuffix("Interpreter").lower()
@@ -259,7 +259,7 @@ class PlainInterpreter(Interpreter):
     """
 
     def __init_subclass__(cls) -> None:
-        """Replace an inherited :meth:`read_all` that is older than the class's :meth:`read`."""
+        """Use the default :meth:`read_all` if only :meth:`read` is overridden."""
         read, read_all = (
             next(place for place, base in enumerate(cls.__mro__) if name in vars(base))
             for name in ("read", "read_all")
@@ -276,9 +276,10 @@ class PlainInterpreter(Interpreter):
         """
 
     def read_all(self, containers: Sequence[bytes], context: Context) -> Sequence[object]:
-        """Return the values of several containers that came together; as :meth:`read` for each.
+        """Return the values of several containers that came together, each as from :meth:`read`.
 
-        Override it for a quicker way. If it raises, the containers are read again, one by one.
+        Override this method to read faster. If it raises, the containers are read again, one by
+        one.
         """
         values: list[object] = []
         for data in containers:
@@ -287,7 +288,7 @@ class PlainInterpreter(Interpreter):
         return values
 
     def interpret(self, reader: Reader) -> object:
-        """Return the value of a container by :meth:`read`."""
+        """Return the value that :meth:`read` returns."""
         return self.read(reader.data, reader.context)
 
 
@@ -312,7 +313,7 @@ class _FunctionInterpreter(Interpreter):
         self._function = function
 
     def interpret(self, reader: Reader) -> object:
-        """Return the value of a container by the function."""
+        """Return the value that the function returns."""
         return self._function(reader)
 
     def __repr__(self) -> str:
@@ -342,7 +343,7 @@ class _ClassInterpreter(PlainInterpreter):
 
 
 def run(interpreter: Interpreter, reader: Reader) -> object:
-    """Return the value of a container by an interpreter.
+    """Run an interpreter, and return the value of a container.
 
     Any error of an interpreter becomes an InterpretationError, so a mistake in a plug-in is an
     outcome like any other.
@@ -364,7 +365,7 @@ def run(interpreter: Interpreter, reader: Reader) -> object:
 
 
 def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
-    """Return the container's sequence number, None without one; raises as :func:`run`."""
+    """Return the container's sequence number, or None; raise the errors of :func:`run`."""
     try:
         return interpreter.sequence(reader)
     except InterpretationError:
@@ -384,7 +385,7 @@ def plain(interpreter: Interpreter) -> PlainInterpreter | None:
 
 
 def run_plain(interpreter: PlainInterpreter, data: bytes, context: Context) -> object:
-    """Return the value of a container by a plain interpreter; raises as :func:`run`."""
+    """Run a plain interpreter on a container; raise the errors of :func:`run`."""
     try:
         return interpreter.read(data, context)
     except InterpretationError:
@@ -410,7 +411,7 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
             (``"table: x: real32 mm"``), a :class:`~smartcam.Layout`, an interpreter, its class,
             a function of a :class:`Reader`, or a class that declares a layout
             (:meth:`smartcam.Layout.of`).
-        lenient: take any byte but zero for a true bool.
+        lenient: whether any byte except zero is a true bool.
 
     Raises:
         PluginError: the name is unknown, or its plug-in cannot be loaded.
@@ -428,8 +429,10 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
     elif describes_layout(spec):
         return _ClassInterpreter(spec, lenient=lenient)
     else:
-        return _make(getattr(spec, "__name__", None) or shown(spec), spec, None, lenient=lenient)
-    return _make(name, INTERPRETERS.load(name), layout, lenient=lenient)
+        return _make_interpreter(
+            getattr(spec, "__name__", None) or shown(spec), spec, None, lenient=lenient
+        )
+    return _make_interpreter(name, INTERPRETERS.load(name), layout, lenient=lenient)
 
 
 def _split_text(spec: str, *, lenient: bool) -> tuple[str, Layout | None]:
@@ -444,53 +447,55 @@ def _split_text(spec: str, *, lenient: bool) -> tuple[str, Layout | None]:
     return "record", Layout(spec, lenient=lenient)
 
 
-SURE_SLIP = 0.8
-"""Score of a group's name above which the name counts as a misspelled interpreter."""
+MISSPELLED_SCORE = 0.8
+"""Score of a group's name above which it counts as the misspelled name of an interpreter."""
 
 _FIRST_WORD = re.compile(r"\s*([^\W\d]\w*)\s*(:?)")
 
 
 def _is_type(tail: str) -> bool:
-    """Return True if a field's type follows: ``table: int32`` is a field named ``table``."""
+    """Return True if ``tail`` begins with a field's type, as in ``table: int32``."""
     word = _FIRST_WORD.match(tail)
     return word is not None and word[1] in TYPES and not word[2]
 
 
 def _check_name(spec: str, name: str, tail: str) -> None:
-    """Raise for a mistyped interpreter's name, if no layout text would begin with it."""
+    """Raise PluginError if a layout text begins with a misspelled name of an interpreter."""
     word = _FIRST_WORD.match(tail)
     another_colon = word is not None and word[2] and word[1] not in TYPES
     if re.fullmatch(r"[\w.-]+", name) and (another_colon or not name.isidentifier()):
-        _fail_name(spec, name)
-    # "localization: (...)*" is a valid layout text with a named group, but surely a slip
+        _raise_unknown_name(spec, name)
+    # "localization: (...)*" is a valid layout text with a named group, but surely a mistake
     if tail.lstrip().startswith("(") and name != "records":
         known = [info.name for info in INTERPRETERS.available()]
-        close = closest(name, known, least=SURE_SLIP)
-        if close:
+        suggestion = closest(name, known, least=MISSPELLED_SCORE)
+        if suggestion:
             raise PluginError(
-                f"interpreter {shown(name)} is unknown, did you mean {close!r}? "
+                f"interpreter {shown(name)} is unknown, did you mean {suggestion!r}? "
                 f"known are {', '.join(known)} (a group may have that name in a "
                 f"Layout({shown(spec)}))",
                 name=name,
             )
 
 
-def _fail_name(spec: str, name: str) -> NoReturn:
-    """Raise: ``spec`` is no interpreter, with the known names, and no layout text."""
-    nor = ""
+def _raise_unknown_name(spec: str, name: str) -> NoReturn:
+    """Raise PluginError: ``spec`` neither names an interpreter nor is a layout text."""
+    layout_text_error = ""
     try:
         Layout(spec)
     except LayoutError as exc:
-        nor = f"; nor is it a layout text: {exc}"
+        layout_text_error = f"; nor is it a layout text: {exc}"
     known = [info.name for info in INTERPRETERS.available()]
     raise PluginError(
         f"interpreter {shown(name)} is unknown; known are {', '.join(known)}"
-        f"{did_you_mean(name, known)}{nor}",
+        f"{did_you_mean(name, known)}{layout_text_error}",
         name=name,
     )
 
 
-def _make(name: str, loaded: object, layout: Layout | None, *, lenient: bool) -> Interpreter:
+def _make_interpreter(
+    name: str, loaded: object, layout: Layout | None, *, lenient: bool
+) -> Interpreter:
     if isinstance(loaded, Interpreter):
         if layout is not None:
             raise ConfigurationError(f"interpreter {name}: expected no layout, got '{layout}'")

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from smartcam.interpreters._base import Context
     from smartcam.layout import Layout
 
-WIDTH = 50
-_TEXT = struct.Struct(f"{WIDTH}s")
+TEXT_BYTES = 50
+_TEXT = struct.Struct(f"{TEXT_BYTES}s")
 
 
 class RawInterpreter(PlainInterpreter):
@@ -44,8 +44,8 @@ class Strings50Interpreter(PlainInterpreter):
             return [raw.partition(b"\0")[0].decode() for (raw,) in _TEXT.iter_unpack(data)]
         except (struct.error, UnicodeDecodeError):
             pass
-        reader = Reader(data)  # the reader's error names the offset
-        return [reader.get_string(offset, WIDTH) for offset in reader.records(WIDTH)]
+        reader = Reader(data)  # for an error that names the offset
+        return [reader.get_string(offset, TEXT_BYTES) for offset in reader.records(TEXT_BYTES)]
 
 
 class RecordInterpreter(PlainInterpreter):

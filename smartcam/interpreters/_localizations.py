@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.interpreters._base import PlainInterpreter
-from smartcam.layout._inside import UNITS, misfit, split_rows
+from smartcam.layout._inside import UNITS, misfit_error, split_rows
 from smartcam.models import Header, Localization, Pose, PoseSigma, Position, Quaternion
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ MAX_NAMES = 64
 """Largest number of feature names that are kept as texts. An application has a handful, but a peer
 could send any number."""
 
-# takes half the time of a NamedTuple's own constructor; a bare tuple is generic, so it is cast
+# takes half the time of a NamedTuple's own constructor; cast, since a bare tuple is generic
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
@@ -96,14 +96,16 @@ class LocalizationsInterpreter(PlainInterpreter):
                     f"interpreter localizations: expected a field {name!r} in the layout, "
                     f"got '{self.layout}'"
                 )
-        use = _use_of(self.layout.fields)
-        self._missing = repeat(use.missing) if use.missing else None
-        self._pick = use.pick
-        self._z = use.z
-        self._scales = use.scales
-        self._checks = use.checks
-        self._sigmas = use.sigmas
-        self._unusual = use.z is not None or use.checks or use.sigmas is not None
+        field_use = _field_use(self.layout.fields)
+        self._defaults = repeat(field_use.defaults) if field_use.defaults else None
+        self._reorder = field_use.reorder
+        self._z_index = field_use.z_index
+        self._scales = field_use.scales
+        self._checks = field_use.checks_unused
+        self._sigmas = field_use.sigmas
+        self._is_unusual = (
+            field_use.z_index is not None or field_use.checks_unused or field_use.sigmas is not None
+        )
         self._empty = bytes(self.layout.size)
         self._names: dict[bytes, str] = {}  # names of features, by their bytes on the wire
 
@@ -119,25 +121,25 @@ class LocalizationsInterpreter(PlainInterpreter):
         """
         header = _new_tuple(Header, (context.number, context.received_at, context.camera))
         sin, cos, new = math.sin, math.cos, _new_tuple
-        scales, y_down, best, names = self._scales, context.y_down, MAX_QUALITY, self._names
+        scales, y_down, max_quality, names = self._scales, context.y_down, MAX_QUALITY, self._names
         rows: Iterable[Any] = self.layout.wire_records(data, context.byte_order)
-        if self._missing is not None:
-            rows = map(operator.concat, rows, self._missing)
-        if self._pick is not None:
-            rows = map(self._pick, rows)
-        heights = self._heights(data, context) if self._z is not None else None
+        if self._defaults is not None:
+            rows = map(operator.concat, rows, self._defaults)
+        if self._reorder is not None:
+            rows = map(self._reorder, rows)
+        z_values = self._wire_z_values(data, context) if self._z_index is not None else None
         total, skipped, z = 0.0, 0, 0.0
         parts: list[Localization] = []
         try:
             for text, quality, photo_index, x, y, theta in rows:
-                if heights is not None:
-                    z = next(heights)
+                if z_values is not None:
+                    z = next(z_values)
                 if not x and self._is_empty(data, len(parts) + skipped):
                     skipped += 1
                     continue
                 if scales is not None:
-                    quality, x, y, theta, z = _scaled((quality, x, y, theta, z), scales)
-                if not 0.0 <= quality <= best:
+                    quality, x, y, theta, z = _to_si((quality, x, y, theta, z), scales)
+                if not 0.0 <= quality <= max_quality:
                     self._check_numbers(data, context)
                 if y_down:
                     y, theta = 0.0 - y, 0.0 - theta  # avoids minus zero
@@ -147,39 +149,41 @@ class LocalizationsInterpreter(PlainInterpreter):
                 pose = new(Pose, (header, new(Position, (x, y, z)), orientation))
                 feature_id = names.get(text)
                 if feature_id is None:
-                    feature_id = self._name(text)
+                    feature_id = self._feature_name(text)
                 parts.append(new(Localization, (feature_id, quality, photo_index, pose)))
         except ValueError:  # a text that is not UTF-8, the sine of infinity
             self._check_numbers(data, context)
             raise
-        if not math.isfinite(total):  # large numbers may sum up to infinity
+        if not math.isfinite(total):  # but large, valid numbers may sum up to infinity
             self._check_numbers(data, context)
         elif self._checks:
             self.layout.parse_records(data, context.byte_order)
         if skipped:
             context.empty_slots += skipped
-        return parts if self._sigmas is None else self._with_sigmas(parts, data, context)
+        return parts if self._sigmas is None else self._add_sigmas(parts, data, context)
 
     def read_all(self, containers: Sequence[bytes], context: Context) -> Sequence[object]:
-        """Return the parts of each container: by columns, if nothing about them is unusual."""
-        found = None if self._unusual else self.layout.wire_rows(containers, context.byte_order)
-        parts = None if found is None else self._by_columns(*found, context)
-        if found is None or parts is None:
+        """Return the parts of each container; read them by columns if the layout allows it."""
+        unpacked = (
+            None if self._is_unusual else self.layout.wire_rows(containers, context.byte_order)
+        )
+        parts = None if unpacked is None else self._read_columns(*unpacked, context)
+        if unpacked is None or parts is None:
             return super().read_all(containers, context)
         context.number += len(containers)
-        return split_rows(parts, found[1])
+        return split_rows(parts, unpacked[1])
 
-    def _by_columns(
+    def _read_columns(
         self, rows: Iterable[Any], counts: list[int], context: Context
     ) -> list[Localization] | None:
-        """Return the parts of all containers; None if one is empty or invalid, or there are none.
+        """Return the parts of all containers; None if a part is empty or invalid, or none came.
 
         ``counts``: number of rows of each container.
         """
-        if self._missing is not None:
-            rows = map(operator.concat, rows, self._missing)
-        if self._pick is not None:
-            rows = map(self._pick, rows)
+        if self._defaults is not None:
+            rows = map(operator.concat, rows, self._defaults)
+        if self._reorder is not None:
+            rows = map(self._reorder, rows)
         columns: list[Sequence[Any]] = list(zip(*rows, strict=True))
         if not columns:
             return None
@@ -188,30 +192,35 @@ class LocalizationsInterpreter(PlainInterpreter):
             return None
         if self._scales is not None:
             scales = zip((quality, x, y, theta), *self._scales, strict=False)
-            quality, x, y, theta = ([value * by / over for value in of] for of, by, over in scales)
+            quality, x, y, theta = (
+                [value * factor / divisor for value in column] for column, factor, divisor in scales
+            )
         if context.y_down:
-            y, theta = ([0.0 - value for value in of] for of in (y, theta))  # avoids minus zero
+            # a difference, since a negation would give minus zero
+            y, theta = ([0.0 - value for value in column] for column in (y, theta))
         total = sum(quality) + sum(x) + sum(y) + sum(theta)  # not finite if one is not
         if not math.isfinite(total) or min(quality) < 0.0 or max(quality) > MAX_QUALITY:
             return None
         feature_ids: list[str | None] = list(map(self._names.get, texts))
         if None in feature_ids:
-            feature_ids = list(map(self._name, texts))
-        new, none, half = _new_tuple, repeat(0.0), [0.5 * angle for angle in theta]
+            feature_ids = list(map(self._feature_name, texts))
+        new, zeros, half = _new_tuple, repeat(0.0), [0.5 * angle for angle in theta]
         numbers = range(context.number, context.number + len(counts))
-        about = zip(numbers, repeat(context.received_at), repeat(context.camera), strict=False)
-        headers: Iterable[Any] = map(new, repeat(Header), about)
+        header_values = zip(
+            numbers, repeat(context.received_at), repeat(context.camera), strict=False
+        )
+        headers: Iterable[Any] = map(new, repeat(Header), header_values)
         if counts.count(1) != len(counts):
             headers = itertools.chain.from_iterable(map(repeat, headers, counts))
-        places = map(new, repeat(Position), zip(x, y, none, strict=False))
-        turns = zip(none, none, map(math.sin, half), map(math.cos, half), strict=False)
-        orientations = map(new, repeat(Quaternion), turns)
-        poses = map(new, repeat(Pose), zip(headers, places, orientations, strict=True))
-        each = zip(feature_ids, quality, photo_index, poses, strict=True)
-        return list(map(new, repeat(Localization), each))
+        positions = map(new, repeat(Position), zip(x, y, zeros, strict=False))
+        quaternions = zip(zeros, zeros, map(math.sin, half), map(math.cos, half), strict=False)
+        orientations = map(new, repeat(Quaternion), quaternions)
+        poses = map(new, repeat(Pose), zip(headers, positions, orientations, strict=True))
+        part_values = zip(feature_ids, quality, photo_index, poses, strict=True)
+        return list(map(new, repeat(Localization), part_values))
 
-    def _name(self, text: bytes) -> str:
-        """Return the name of a feature; the first ones are kept."""
+    def _feature_name(self, text: bytes) -> str:
+        """Return the name of a feature; the first names are kept."""
         name = self._names.get(text)
         if name is None:
             name = text.partition(b"\0")[0].decode()
@@ -219,52 +228,52 @@ class LocalizationsInterpreter(PlainInterpreter):
                 self._names[text] = name
         return name
 
-    def _with_sigmas(
+    def _add_sigmas(
         self, localizations: list[Localization], data: bytes, context: Context
     ) -> list[Localization]:
-        """Return localizations with the errors of their poses, if these are numbers."""
+        """Return localizations to whose poses the errors are added, if the errors are valid."""
         use = cast("_SigmaUse", self._sigmas)
         rows = self.layout.wire_records(data, context.byte_order)
-        taken = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
+        used_rows = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
         result: list[Localization] = []
-        for part, row in zip(localizations, taken, strict=True):
-            x, y, theta = (row[place] * scale for place, scale in use.sigmas)
-            xy, xt, yt = (0.0 if place is None else row[place] for place in use.correlations)
+        for part, row in zip(localizations, used_rows, strict=True):
+            x, y, theta = (row[index] * scale for index, scale in use.sigmas)
+            xy, xt, yt = (0.0 if index is None else row[index] for index in use.correlations)
             if context.y_down:
                 xy, xt = -xy, -xt
             sigma = PoseSigma(x, y, theta, xy, xt, yt)
-            known = min(x, y, theta) >= 0 and math.isfinite(x + y + theta)
-            if known and max(abs(xy), abs(xt), abs(yt)) <= MAX_QUALITY:
+            is_known = min(x, y, theta) >= 0 and math.isfinite(x + y + theta)
+            if is_known and max(abs(xy), abs(xt), abs(yt)) <= MAX_QUALITY:
                 result.append(part._replace(pose=part.pose.with_sigma(sigma)))
             else:
                 result.append(part)
         return result
 
-    def _heights(self, data: bytes, context: Context) -> Iterator[float]:
+    def _wire_z_values(self, data: bytes, context: Context) -> Iterator[float]:
         """Return the values of ``z`` as they are on the wire."""
         rows = self.layout.wire_records(data, context.byte_order)
-        return map(operator.itemgetter(self._z), rows)
+        return map(operator.itemgetter(self._z_index), rows)
 
     def _is_empty(self, data: bytes, number: int) -> bool:
         begin = self.layout.head_size + number * self.layout.size
         return data[begin : begin + self.layout.size] == self._empty
 
     def _check_numbers(self, data: bytes, context: Context) -> None:
-        """Raise for the first invalid number, or for an invalid text or bool before it.
+        """Raise InterpretationError for the first invalid number, text or bool.
 
-        Invalid are NaN and infinity in a pose, and a quality that is not between 0 and 1.
+        NaN and infinity in a pose are invalid, as is a quality that is not between 0 and 1.
         """
         offset = self.layout.head_size
         for number, record in enumerate(self.layout.parse_records(data, context.byte_order)):
             for field, value in zip(self.layout.fields, record, strict=True):
-                wrong = _wrong(field, value)
-                if wrong and not self._is_empty(data, number):
-                    raise misfit(field, offset, wrong, value)
+                expected = _expectation(field, value)
+                if expected and not self._is_empty(data, number):
+                    raise misfit_error(field, offset, expected, value)
                 offset += field.size
 
 
-def _wrong(field: Field, value: float) -> str:
-    """Return a description of the valid numbers for an invalid number; "" for a valid one."""
+def _expectation(field: Field, value: float) -> str:
+    """Return a description of the valid numbers if a number is invalid; "" if it is valid."""
     if field.name in _POSE and not math.isfinite(value):
         return "a finite number"
     if field.name == "quality" and not 0.0 <= value <= MAX_QUALITY:
@@ -273,36 +282,36 @@ def _wrong(field: Field, value: float) -> str:
     return ""
 
 
-class _Use(NamedTuple):
+class _FieldUse(NamedTuple):
     """The use of each field of a record.
 
     Attributes:
-        missing: defaults of the fields that the record lacks; they are put after its own fields.
-        pick: function that puts the values into the order of use; None if they are in order.
-        z: place of ``z``, which is rare; None without it.
-        scales: factors that turn the values into SI; None if they are SI.
-        checks: True if unused texts and bools have to be checked, too.
-        sigmas: places of the errors of poses; None without them.
+        defaults: defaults of the fields that the record lacks, which are appended to its values.
+        reorder: function that puts the values into the order of use; None if they are in order.
+        z_index: index of ``z``; None: the record has no ``z``, as is usual.
+        scales: factors that convert the values to SI; None if they are in SI.
+        checks_unused: whether unused texts and bools have to be checked, too.
+        sigmas: indices of the errors of poses; None: the record has none.
     """
 
-    missing: tuple[Any, ...]
-    pick: Callable[[Any], Any] | None
-    z: int | None
+    defaults: tuple[Any, ...]
+    reorder: Callable[[Any], Any] | None
+    z_index: int | None
     scales: _Scales | None
-    checks: bool
+    checks_unused: bool
     sigmas: _SigmaUse | None
 
 
 class _SigmaUse(NamedTuple):
     """The fields of a record with the errors of its pose."""
 
-    sigmas: tuple[tuple[int, float], ...]  # places of those in _SIGMAS, and their factors for SI
-    # places of those in _CORRELATIONS; None if it is missing
+    sigmas: tuple[tuple[int, float], ...]  # indices of the fields in _SIGMAS, and factors for SI
+    # indices of the fields in _CORRELATIONS; None: the field is missing
     correlations: tuple[int | None, ...]
 
 
 @functools.lru_cache(maxsize=64)
-def _use_of(layout: tuple[Field, ...]) -> _Use:
+def _field_use(layout: tuple[Field, ...]) -> _FieldUse:
     """Return the use of each field of a layout's record.
 
     Raises:
@@ -310,13 +319,13 @@ def _use_of(layout: tuple[Field, ...]) -> _Use:
     """
     fields = {field.name: field for field in layout}
     for field in layout:
-        _check(field)
-    missing = [name for name in _DEFAULTS if name not in fields]
-    names = [*fields, *missing]
-    places = [names.index(name) for name in _DEFAULTS]
-    return _Use(
-        tuple(_DEFAULTS[name] for name in missing),
-        None if places == [*range(len(names))] else operator.itemgetter(*places),
+        _check_field(field)
+    missing_names = [name for name in _DEFAULTS if name not in fields]
+    names = [*fields, *missing_names]
+    indices = [names.index(name) for name in _DEFAULTS]
+    return _FieldUse(
+        tuple(_DEFAULTS[name] for name in missing_names),
+        None if indices == [*range(len(names))] else operator.itemgetter(*indices),
         [*fields].index("z") if "z" in fields else None,
         _scales(fields),
         any(field.type in {"string", "bool"} and field.name != "feature_id" for field in layout),
@@ -344,36 +353,36 @@ class _Scales(NamedTuple):
 
 
 def _scales(fields: dict[str, Field]) -> _Scales | None:
-    """Return the scales, None if the values on the wire are floats in SI already."""
+    """Return the scales; None if the values on the wire are floats in SI."""
     used = [fields.get(name) for name in ("quality", "x", "y", "theta", "z")]
     units = [UNITS[field.unit] if field and field.unit else None for field in used]
     multiply = tuple(unit.multiply if unit else 1.0 for unit in units)
     divide = tuple(unit.divide if unit else 1.0 for unit in units)
-    integers = any(field is not None and field.wire.is_integer for field in used)
-    return _Scales(multiply, divide) if integers or {*multiply, *divide} != {1.0} else None
+    has_integers = any(field is not None and field.wire.is_integer for field in used)
+    return _Scales(multiply, divide) if has_integers or {*multiply, *divide} != {1.0} else None
 
 
-def _scaled(values: Iterable[float], scales: _Scales) -> Iterable[float]:
+def _to_si(values: Iterable[float], scales: _Scales) -> Iterable[float]:
     """Return floats in SI; integers become floats."""
     return map(operator.truediv, map(operator.mul, values, scales.multiply), scales.divide)
 
 
-def _check(field: Field) -> None:
+def _check_field(field: Field) -> None:
     """Raise if a field has a type or a unit that its name cannot have."""
     wire = field.wire
     if field.name in _QUANTITIES:
         quantities = _QUANTITIES[field.name]
-        fits = wire.is_number
-        fits = fits and (field.unit is None or UNITS[field.unit].quantity in quantities)
+        is_valid = wire.is_number
+        is_valid = is_valid and (field.unit is None or UNITS[field.unit].quantity in quantities)
         units = [name for name, unit in UNITS.items() if unit.quantity in quantities]
         expected = f"a number without a unit or in {', '.join(units)}"
     elif field.name in _CORRELATIONS:
-        fits, expected = wire.is_number and field.unit is None, "a number without a unit"
+        is_valid, expected = wire.is_number and field.unit is None, "a number without a unit"
     elif field.name == "photo_index":
-        fits, expected = wire.is_integer and field.unit is None, "an integer without a unit"
+        is_valid, expected = wire.is_integer and field.unit is None, "an integer without a unit"
     elif field.name == "feature_id":
-        fits, expected = field.type == "string", "a string"
+        is_valid, expected = field.type == "string", "a string"
     else:
         return
-    if not fits:
+    if not is_valid:
         raise ConfigurationError(f"interpreter localizations: {field.label}: expected {expected}")

@@ -3,10 +3,10 @@
 A container carries no types and no names (SC manual p. 33, published), so the user describes the
 fields that were configured on the camera::
 
-    "passed: bool, x: real32 mm, code: string[20]"      exactly one record "(x: real32 mm, y: real32
-    mm)*"                     records to the end: a list "(x: real32 mm, y: real32 mm)[32]"
-    exactly 32 records "n: int32, (x: real32 mm, y: real32 mm)[n]"         n records, then unused
-    ones
+    "passed: bool, x: real32 mm, code: string[20]"      exactly one record
+    "(x: real32 mm, y: real32 mm)*"                     records to the end: a list
+    "(x: real32 mm, y: real32 mm)[32]"                  exactly 32 records
+    "n: int32, (x: real32 mm, y: real32 mm)[n]"         n records, then unused ones
 
 One :class:`Layout` has many uses: values (:meth:`~Layout.parse`), bytes (:meth:`~Layout.build`),
 numpy (:attr:`~Layout.dtype`, :meth:`~Layout.parse_table`), pydantic, JSON Schema and YAML. Heavy
@@ -28,12 +28,12 @@ from smartcam.layout._codec import (
     Record,
     RecordCodec,
     check_names,
-    named,
     record_class,
     split_rows,
+    values_by_name,
 )
 from smartcam.layout._compiled import compile_text
-from smartcam.layout._text import misfit
+from smartcam.layout._text import misfit_error
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,7 +48,7 @@ __all__ = ["Layout", "Record"]
 
 
 class Layout:
-    """The fields of a result container; immutable, equal to every layout of the same text.
+    """The fields of a result container; immutable, and equal to every layout with the same text.
 
     Args:
         text: the layout text; new lines are white space, ``#`` begins a comment.
@@ -63,7 +63,7 @@ class Layout:
 
     __slots__ = (
         *("_codecs", "_compiled", "_lenient", "_model", "_spec", "_text"),
-        *("_fixed", "_is_list", "_record_word", "_sequence_index", "_to_end"),
+        *("_fills_payload", "_fixed_count", "_is_list", "_record_word", "_sequence_index"),
         *("_frombuffer", "_tables", "_views"),
     )
 
@@ -71,21 +71,21 @@ class Layout:
         if not isinstance(text, str):  # errors in the text are reported with their place in it
             raise wrong_argument("layout", "a text", text)
         lenient, start = check_flag(lenient, "lenient"), check_integer(start, "start", 0, len(text))
-        made = compile_text(text, start, lenient=lenient)
-        self._compiled = made  # the cache finds it as long as this object exists
-        self._spec = made.spec
-        self._text = made.text
+        compiled = compile_text(text, start, lenient=lenient)
+        self._compiled = compiled  # the cache keeps this entry as long as a layout refers to it
+        self._spec = compiled.spec
+        self._text = compiled.text
         self._lenient = lenient
-        self._codecs = made.codecs
-        self._fixed = made.fixed
-        self._to_end = made.to_end
-        self._is_list = made.is_list
-        self._record_word = made.record_word
-        self._sequence_index = made.sequence_index
-        # each layout has its own of these: a user may change a model, or the names of a dtype
+        self._codecs = compiled.codecs
+        self._fixed_count = compiled.fixed_count
+        self._fills_payload = compiled.fills_payload
+        self._is_list = compiled.is_list
+        self._record_word = compiled.record_word
+        self._sequence_index = compiled.sequence_index
+        # each layout has its own model and dtypes, since a user may change them
         self._model: type[BaseModel] | None = None
         self._tables: dict[ByteOrder, TableCodec] = {}
-        # for tables that are all of the payload: the dtype, and the function that makes one
+        # for tables that fill the payload: the dtype, and the function that makes a table
         self._views: dict[ByteOrder, np.dtype[np.void]] = {}
         self._frombuffer: Any = None
 
@@ -135,8 +135,8 @@ class Layout:
     def repeat(self) -> str | int | None:
         """Number of records.
 
-        None: exactly one. ``"*"``: as many as there are up to the end. A number: that many. A name:
-        the value of this field of the head.
+        None: exactly one record. ``"*"``: the records up to the end. A number: exactly so many
+        records. A name: as many records as the value of this field of the head.
         """
         return self._spec.repeat
 
@@ -204,14 +204,14 @@ class Layout:
         """
         head, records = self._codecs[byte_order]
         if self._spec.repeat is None:
-            self._count(payload, head, records)
+            self._count_records(payload, head, records)
             return records.read_one(payload)
         rows = self.wire_records(payload, byte_order)
         values = records.read(rows, payload, head.size, label="record")
         if self._is_list:
             return values
-        front = head.read_one(payload) if self.head else ()
-        result: Record = Record.__new__(self._whole_class(), (*front, values))
+        head_values = head.read_one(payload) if self.head else ()
+        result: Record = Record.__new__(self._value_class(), (*head_values, values))
         return result
 
     def parse_all(self, payloads: Sequence[bytes], byte_order: ByteOrder = "little") -> list[Any]:
@@ -226,26 +226,26 @@ class Layout:
             try:
                 records = self._codecs[byte_order][1].convert(rows)
             except (KeyError, UnicodeDecodeError):
-                pass  # to read one after the other finds the place
+                pass  # reading one payload after the other finds the place of the error
             else:
                 if self._spec.repeat is None:
                     return list(records)
                 lists = split_rows(records, counts)
                 if self._is_list:
                     return lists
-                whole = self._whole_class()
-                return [Record.__new__(whole, (items,)) for items in lists]
+                value_class = self._value_class()
+                return [Record.__new__(value_class, (items,)) for items in lists]
         return [self.parse(payload, byte_order) for payload in payloads]
 
     def wire_rows(
         self, payloads: Sequence[bytes], byte_order: ByteOrder = "little"
     ) -> tuple[Rows, list[int]] | None:
-        """Return the rows of several payloads as :meth:`wire_records` does, and each one's number.
+        """Return the rows of all payloads, as :meth:`wire_records` does, and the row counts.
 
-        None if the layout has a head, or the size of a payload does not fit.
+        None if the layout has a head, or if the size of a payload does not fit.
         """
         codec = self._codecs[byte_order][1]
-        size, fixed = codec.size, self._fixed
+        size, fixed = codec.size, self._fixed_count
         if self._spec.head:
             return None
         counts = [len(payload) // size for payload in payloads]
@@ -257,7 +257,7 @@ class Layout:
         return codec.unpack_all(data), counts
 
     def parse_records(self, payload: Payload, byte_order: ByteOrder = "little") -> list[Record]:
-        """Return only the records, without the head; without a group there is one.
+        """Return only the records, without the head; one record if the layout has no group.
 
         Record ``i`` begins at byte ``head_size + i * size``.
 
@@ -269,7 +269,7 @@ class Layout:
         return records.read(rows, payload, head.size, label=self._record_word)
 
     def wire_records(self, payload: Payload, byte_order: ByteOrder = "little") -> Rows:
-        """Return the unconverted values of the same records, one record after the other.
+        """Return the unconverted values of each record of :meth:`parse_records`.
 
         Units are those of the wire, texts are bytes as the camera sent them, bools are unchecked
         numbers from 0 to 255.
@@ -279,12 +279,12 @@ class Layout:
         """
         head, records = self._codecs[byte_order]
         data = payload if type(payload) is bytes else bytes(payload)
-        if self._to_end:
+        if self._fills_payload:
             try:
                 return records.unpack_all(data)
             except struct.error:
                 pass  # not whole records: the checks below find the place
-        return records.unpack(data, head.size, self._count(data, head, records))
+        return records.unpack(data, head.size, self._count_records(data, head, records))
 
     def parse_table(
         self, payload: Payload, byte_order: ByteOrder = "little"
@@ -306,20 +306,20 @@ class Layout:
             except ValueError:
                 pass  # not whole records: the checks below find the place
             else:
-                if self._fixed is None or len(rows) == self._fixed:
+                if self._fixed_count is None or len(rows) == self._fixed_count:
                     return rows
         head, records = self._codecs[byte_order]
-        count = self._count(payload, head, records)
+        count = self._count_records(payload, head, records)
         return self._table(byte_order).read(payload, head.size, count, label=self._record_word)
 
     def parse_tables(
         self, payloads: Sequence[bytes], byte_order: ByteOrder = "little"
     ) -> list[np.ndarray[tuple[int], np.dtype[np.void]]]:
         """Return the tables of several payloads, each as from :meth:`parse_table`."""
-        view, make = self._views.get(byte_order), self._frombuffer
-        if view is not None and self._fixed is None:
+        view, view_table = self._views.get(byte_order), self._frombuffer
+        if view is not None and self._fixed_count is None:
             try:
-                return [make(payload, view) for payload in payloads]
+                return [view_table(payload, view) for payload in payloads]
             except ValueError:
                 pass  # a payload has no whole records, or is empty
         return [self.parse_table(payload, byte_order) for payload in payloads]
@@ -328,20 +328,20 @@ class Layout:
         """Return the value of the ``@sequence`` field.
 
         Returns:
-            The value in the head, or that in the first record; None without such a field, or if it
-            is in the record and there are no records.
+            The value in the head, or the value in the first record; None if the layout has no such
+            field, or if the field is in the record and there are no records.
 
         Raises:
             InterpretationError: the payload's size does not fit.
         """
         head, records = self._codecs[byte_order]
-        count = self._count(payload, head, records)
-        index, front = self._sequence_index, len(head.fields)
+        count = self._count_records(payload, head, records)
+        index, head_length = self._sequence_index, len(head.fields)
         if index is None:
             return None
-        if index < front:
+        if index < head_length:
             return int(head.read_field(payload, 0, index))
-        return int(records.read_field(payload, head.size, index - front)) if count else None
+        return int(records.read_field(payload, head.size, index - head_length)) if count else None
 
     def build(
         self,
@@ -367,17 +367,17 @@ class Layout:
             ConfigurationError: a value does not fit its field, or is missing or unknown.
         """
         head, codec = self._codecs[byte_order]
-        forced = self._forced(sequence)
+        forced = self._forced_values(sequence)
         if self._spec.repeat is None:
             if slots is not None:
                 raise ConfigurationError("layout: slots= is for layouts with a group")
-            return codec.write(codec.take(value, "", forced), "")
-        front, records = self._split(value, forced)
-        padding = self._padding(len(records), slots)
-        parts = [head.write(front, "")] if self.head else []
+            return codec.write(codec.values_in_order(value, "", forced), "")
+        head_values, records = self._split_value(value, forced)
+        padding = self._count_padding(len(records), slots)
+        parts = [head.write(head_values, "")] if self.head else []
         for number, record in enumerate(records):
             prefix = f"record {number}: "
-            parts.append(codec.write(codec.take(record, prefix, forced), prefix))
+            parts.append(codec.write(codec.values_in_order(record, prefix, forced), prefix))
         return b"".join((*parts, bytes(padding * codec.size)))
 
     # -- numpy, pydantic, files --------------------------------------------------------------
@@ -458,7 +458,7 @@ class Layout:
         loaded = load_yaml(text)
         return cls.from_dict(loaded) if isinstance(loaded, Mapping) else cls(loaded)
 
-    def _whole_class(self) -> type[Record]:
+    def _value_class(self) -> type[Record]:
         """Return the class of values that have the head's fields, and the list of records."""
         names = (*(field.name for field in self.head), self._spec.group_field)
         return record_class(names, (*(field.symbol for field in self.head), ""))
@@ -479,36 +479,38 @@ class Layout:
 
     # -- sizes -------------------------------------------------------------------------------
 
-    def _count(self, payload: Payload, head: RecordCodec, codec: RecordCodec) -> int:
+    def _count_records(self, payload: Payload, head: RecordCodec, codec: RecordCodec) -> int:
         """Check the size of a payload, and return the number of records to read."""
         size = len(payload)
         count, remainder = divmod(size - head.size, codec.size)
-        fixed, repeat = self._fixed, self._spec.repeat
+        fixed, repeat = self._fixed_count, self._spec.repeat
         if size < head.size:
-            raise self._misfit(head, size, 0, None)
+            raise self._size_error(head, size, 0, None)
         if remainder or (fixed is not None and fixed != count):
-            raise self._misfit(codec, size, head.size, fixed)
+            raise self._size_error(codec, size, head.size, fixed)
         if not isinstance(repeat, str) or repeat == "*":
             return count
         index = next(i for i, field in enumerate(head.fields) if field.name == repeat)
         given = int(head.read_field(payload, 0, index))
         if not 0 <= given <= count:
             more = f", as many records of {codec.size} bytes as the container holds"
-            raise misfit(head.fields[index], head.offsets[index], f"0 to {count}", given, more=more)
+            raise misfit_error(
+                head.fields[index], head.offsets[index], f"0 to {count}", given, more=more
+            )
         return given
 
-    def _misfit(
+    def _size_error(
         self, codec: RecordCodec, size: int, start: int, count: int | None
     ) -> InterpretationError:
-        """Return the error for a payload of the wrong length: a truncated field or surplus bytes.
+        """Return the error for a payload of a wrong size: a truncated field or surplus bytes.
 
         ``codec``: codec of the record (or the head) that does not fit. ``size``: number of bytes
         of the payload. ``start``: offset of the first record. ``count``: required number of
         records, or None for any.
         """
-        full = max(0, size - start) // codec.size
-        at = start + codec.size * (full if count is None else min(full, count))
-        if count is not None and full >= count:
+        whole_records = max(0, size - start) // codec.size
+        at = start + codec.size * (whole_records if count is None else min(whole_records, count))
+        if count is not None and whole_records >= count:
             hint = "; for several records write ( ... )*" if self._spec.repeat is None else ""
             expected = start + count * codec.size
             return InterpretationError(
@@ -521,7 +523,9 @@ class Layout:
         field, offset = codec.field_at(size - at)
         expected = at + codec.size if count is None else start + count * codec.size
         record = (
-            "" if self._spec.repeat is None or codec.fields is self.head else f"record {full}: "
+            ""
+            if self._spec.repeat is None or codec.fields is self.head
+            else f"record {whole_records}: "
         )
         return InterpretationError(
             f"{record}{field.label} at offset {at + offset}: expected {field.size} bytes, "
@@ -534,7 +538,7 @@ class Layout:
 
     # -- building ----------------------------------------------------------------------------
 
-    def _forced(self, sequence: int | None) -> dict[str, Any]:
+    def _forced_values(self, sequence: int | None) -> dict[str, Any]:
         if sequence is None:
             return {}
         field = self.sequence_field
@@ -545,7 +549,7 @@ class Layout:
             )
         return {field.name: sequence}
 
-    def _split(self, value: object, forced: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
+    def _split_value(self, value: object, forced: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
         """Split a value into the head's values and the records."""
         count = self.repeat if self.repeat != "*" else None
         if self._spec.is_list:
@@ -555,7 +559,7 @@ class Layout:
             given.update({name: len(records) for name in given if name == count})
             return list(given.values()), records
         names = [*(field.name for field in self.head), self._spec.group_field]
-        given = named(value, names, "")
+        given = values_by_name(value, names, "")
         records = _list_of_records(given.get(names[-1], ()))  # a missing group is reported below
         if isinstance(count, str):
             given.setdefault(count, len(records))
@@ -568,16 +572,16 @@ class Layout:
             )
         return [given[name] for name in names[:-1]], records
 
-    def _padding(self, count: int, slots: int | None) -> int:
+    def _count_padding(self, count: int, slots: int | None) -> int:
         repeat = self._spec.repeat
-        wanted = count if slots is None else slots
-        if wanted < count:
+        slot_count = count if slots is None else slots
+        if slot_count < count:
             raise ConfigurationError(f"layout: expected at most {slots} records, got {count}")
-        if isinstance(repeat, int) and wanted != repeat:
+        if isinstance(repeat, int) and slot_count != repeat:
             raise ConfigurationError(
                 f"layout: expected {repeat} records, got {count}; slots={repeat} pads with zeros"
             )
-        return wanted - count
+        return slot_count - count
 
 
 def _list_of_records(value: object) -> list[Any]:

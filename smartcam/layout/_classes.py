@@ -4,7 +4,7 @@
 
     @dataclass
     class Measured:
-        passed: bool                                  # bools need nothing
+        passed: bool                                  # a bool needs no layout text
         x: Annotated[float, "real32 mm"]
         parts: Annotated[list[Part], "*"]             # a group: records of another class
 
@@ -59,65 +59,72 @@ class _Member(NamedTuple):
     text: str | None
 
 
-def describes_layout(kind: object) -> bool:
-    """Return True if ``kind`` is a class whose fields can describe a layout, or a list of one."""
-    return _is_record(kind) or _list_item(kind) is not None
+def describes_layout(described: object) -> bool:
+    """Return True for a class whose fields can describe a layout, or a list of such a class."""
+    return _is_record(described) or _list_item(described) is not None
 
 
 @functools.lru_cache(maxsize=128)
-def read_class(kind: Any) -> ClassLayout:
+def read_class(described: Any) -> ClassLayout:
     """Return the layout that a class, or a list of one, describes.
 
     Raises:
         LayoutError: the layout text of a field is missing, is wrong, or does not match its type.
     """
-    record = _list_item(kind)
-    if record is None and not _is_record(kind):
+    record = _list_item(described)
+    if record is None and not _is_record(described):
         raise LayoutError(
             "layout: expected a dataclass, a pydantic model or a NamedTuple, or a list of one, "
-            f"got {kind!r:.200}"
+            f"got {described!r:.200}"
         )
     if record is None:
-        return _read_record(kind)
-    repeat = next((text for text in _metadata(kind) if isinstance(text, str)), "*")
-    inner = _read_record(record, nested=True)
-    return ClassLayout(_checked(record, f"({inner.text}){repeat}"), _make_list(inner.make))
+        return _read_record(described)
+    repeat = next((text for text in _metadata(described) if isinstance(text, str)), "*")
+    item_layout = _read_record(record, nested=True)
+    return ClassLayout(
+        _canonical_text(record, f"({item_layout.text}){repeat}"), _make_list(item_layout.make)
+    )
 
 
-def _read_record(kind: type, *, nested: bool = False) -> ClassLayout:
+def _read_record(described: type, *, nested: bool = False) -> ClassLayout:
     fields: list[str] = []
     group: ClassLayout | None = None
-    members = _members(kind)
+    members = _members(described)
     for member in members:
         record = _list_item(member.hint)
         if record is None:
-            fields.append(str(_field(kind, member)))
+            fields.append(str(_read_field(described, member)))
         elif nested or member is not members[-1]:
             problem = "groups do not nest" if nested else "a list comes last"
-            raise _error(kind, member, f"expected no list here: {problem}")
+            raise _member_error(described, member, f"expected no list here: {problem}")
         else:
             group = _read_record(record, nested=True)
             fields.append(f"{member.name}: ({group.text}){member.text or '*'}")
     if not fields:
-        raise LayoutError(f"class {kind.__name__}: expected a field with a layout text, got none")
+        raise LayoutError(
+            f"class {described.__name__}: expected a field with a layout text, got none"
+        )
     names = [member.name for member in members]
     make_list = None if group is None else _make_list(group.make)
-    return ClassLayout(_checked(kind, ", ".join(fields)), _maker(kind, names, make_list))
+    return ClassLayout(
+        _canonical_text(described, ", ".join(fields)),
+        _make_constructor(described, names, make_list),
+    )
 
 
-def _members(kind: type) -> list[_Member]:
+def _members(described: type) -> list[_Member]:
     """Return the fields of a class that its constructor takes, in order."""
-    if dataclasses.is_dataclass(kind):
-        names = [field.name for field in dataclasses.fields(kind) if field.init]
-    elif _is_model(kind):
-        names = [*kind.model_fields]
+    if dataclasses.is_dataclass(described):
+        names = [field.name for field in dataclasses.fields(described) if field.init]
+    elif _is_model(described):
+        names = [*described.model_fields]
     else:
-        names = [*cast("Any", kind)._fields]
+        names = [*cast("Any", described)._fields]
     try:
-        hints = get_type_hints(kind, include_extras=True)
+        hints = get_type_hints(described, include_extras=True)
     except NameError as exc:
         raise LayoutError(
-            f"class {kind.__name__}: its annotations cannot be resolved: {exc}; "
+            f"class {described.__name__}: its annotations cannot be resolved: {exc}; "
             "define what they name at the top of the module"
         ) from exc
     members: list[_Member] = []
@@ -127,28 +134,34 @@ def _members(kind: type) -> list[_Member]:
     return members
 
 
-def _field(kind: type, member: _Member) -> Field:
+def _read_field(described: type, member: _Member) -> Field:
     """Return the layout's field for a member of a class."""
     text = member.text
     if text is None:
         if member.hint is not bool:
-            raise _error(kind, member, 'expected a layout text, as in Annotated[float, "real32"]')
+            raise _member_error(
+                described, member, 'expected a layout text, as in Annotated[float, "real32"]'
+            )
         text = "bool"
-    spec = _parsed(kind, f"{member.name}: {text}")
+    spec = _parse_class_text(described, f"{member.name}: {text}")
     if spec.repeat is not None or len(spec.fields) != 1:
-        raise _error(kind, member, f"expected the layout text of one field, got {text!r}")
+        raise _member_error(
+            described, member, f"expected the layout text of one field, got {text!r}"
+        )
     field = spec.fields[0]
-    fitting = _types(field)
+    allowed = _allowed_types(field)
     # a model converts values by itself
-    if not _is_model(kind) and member.hint not in (*fitting, Any, object):
-        expected = " or ".join(type_.__name__ for type_ in fitting)
+    if not _is_model(described) and member.hint not in (*allowed, Any, object):
+        expected = " or ".join(type_.__name__ for type_ in allowed)
         actual = getattr(member.hint, "__name__", member.hint)
-        raise _error(kind, member, f"expected the type {expected} for {text!r}, got {actual}")
+        raise _member_error(
+            described, member, f"expected the type {expected} for {text!r}, got {actual}"
+        )
     return field
 
 
-def _types(field: Field) -> tuple[type, ...]:
-    """Return the types that the value of a field may be annotated with."""
+def _allowed_types(field: Field) -> tuple[type, ...]:
+    """Return the types that may annotate the value of a field."""
     if field.type == "bool":
         return (bool,)
     if field.type == "string":
@@ -159,50 +172,50 @@ def _types(field: Field) -> tuple[type, ...]:
 
 
 def _list_item(hint: Any) -> type | None:
-    """Return the class of a list's items; None if it is no list of a class."""
+    """Return the class of a list's items; None if the annotation is no list of such a class."""
     hint = _without_metadata(hint)
     item = get_args(hint)[0] if get_origin(hint) is list else None
     return item if _is_record(item) else None
 
 
-def _is_record(kind: Any) -> bool:
-    """Return True if ``kind`` is a class whose fields can describe a layout."""
-    if not isinstance(kind, type):
+def _is_record(described: Any) -> bool:
+    """Return True if ``described`` is a class whose fields can describe a layout."""
+    if not isinstance(described, type):
         return False
-    is_named_tuple = issubclass(kind, tuple) and hasattr(kind, "_fields")
-    return dataclasses.is_dataclass(kind) or _is_model(kind) or is_named_tuple
+    is_named_tuple = issubclass(described, tuple) and hasattr(described, "_fields")
+    return dataclasses.is_dataclass(described) or _is_model(described) or is_named_tuple
 
 
 def _metadata(hint: Any) -> tuple[Any, ...]:
     return tuple(hint.__metadata__) if get_origin(hint) is Annotated else ()
 
 
-def _is_model(kind: type) -> TypeIs[type[BaseModel]]:
+def _is_model(described: type) -> TypeIs[type[BaseModel]]:
     """Return True if a class is a pydantic model; pydantic is not imported to find out."""
     pydantic = sys.modules.get("pydantic")
-    return pydantic is not None and issubclass(kind, pydantic.BaseModel)
+    return pydantic is not None and issubclass(described, pydantic.BaseModel)
 
 
 def _without_metadata(hint: Any) -> Any:
     return hint.__origin__ if get_origin(hint) is Annotated else hint
 
 
-def _checked(kind: type, text: str) -> str:
+def _canonical_text(described: type, text: str) -> str:
     """Return the canonical form of a layout text."""
-    return to_text(_parsed(kind, text))
+    return to_text(_parse_class_text(described, text))
 
 
-def _parsed(kind: type, text: str) -> LayoutSpec:
+def _parse_class_text(described: type, text: str) -> LayoutSpec:
     try:
         return parse_text(text)
     except LayoutError as exc:
         raise LayoutError(
-            f"class {kind.__name__}: {exc}", text=exc.text, position=exc.position
+            f"class {described.__name__}: {exc}", text=exc.text, position=exc.position
         ) from exc
 
 
-def _error(kind: type, member: _Member, problem: str) -> LayoutError:
-    return LayoutError(f"class {kind.__name__}, field {member.name!r}: {problem}")
+def _member_error(described: type, member: _Member, problem: str) -> LayoutError:
+    return LayoutError(f"class {described.__name__}, field {member.name!r}: {problem}")
 
 
 # ---------------------------------------------------------------------- objects
@@ -212,41 +225,45 @@ def _make_list(make: Make) -> Make:
     return lambda records: [*map(make, records)]
 
 
-def _maker(kind: type, names: list[str], make_list: Make | None) -> Make:
-    """Return a function that makes ``kind`` from a record; ``make_list`` makes its last field."""
-    build = _model_maker(kind, names) if _is_model(kind) else _plain_maker(kind, names)
-    if make_list is None:
-        return build
-    return lambda record: build((*record[:-1], make_list(record[-1])))
-
-
-def _plain_maker(kind: type, names: list[str]) -> Make:
-    keywords = dataclasses.is_dataclass(kind) and any(
-        field.kw_only for field in dataclasses.fields(kind)
+def _make_constructor(described: type, names: list[str], make_list: Make | None) -> Make:
+    """Return a function that makes an object from a record; ``make_list`` makes its last field."""
+    construct = (
+        _model_constructor(described, names)
+        if _is_model(described)
+        else _plain_constructor(described, names)
     )
-    if keywords:
-        return lambda values: kind(**dict(zip(names, values, strict=True)))
-    return lambda values: kind(*values)
+    if make_list is None:
+        return construct
+    return lambda record: construct((*record[:-1], make_list(record[-1])))
 
 
-def _model_maker(kind: type[BaseModel], names: list[str]) -> Make:
+def _plain_constructor(described: type, names: list[str]) -> Make:
+    needs_keywords = dataclasses.is_dataclass(described) and any(
+        field.kw_only for field in dataclasses.fields(described)
+    )
+    if needs_keywords:
+        return lambda values: described(**dict(zip(names, values, strict=True)))
+    return lambda values: described(*values)
+
+
+def _model_constructor(described: type[BaseModel], names: list[str]) -> Make:
     from pydantic import ValidationError
 
-    fields = kind.model_fields
+    fields = described.model_fields
     keys = [fields[name].alias or name for name in names]
 
     def make(values: Any) -> BaseModel:
         try:
-            return kind.model_validate(dict(zip(keys, values, strict=True)))
+            return described.model_validate(dict(zip(keys, values, strict=True)))
         except ValidationError as exc:
-            first = exc.errors()[0]
-            where = ".".join(map(str, first["loc"]))
+            first_error = exc.errors()[0]
+            location = ".".join(map(str, first_error["loc"]))
             raise InterpretationError(
-                f"{kind.__name__}{'.' if where else ''}{where}: {first['msg']}, "
-                f"got {first['input']!r:.80}",
-                field=where,
-                expected=first["msg"],
-                got=first["input"],
+                f"{described.__name__}{'.' if location else ''}{location}: {first_error['msg']}, "
+                f"got {first_error['input']!r:.80}",
+                field=location,
+                expected=first_error["msg"],
+                got=first_error["input"],
             ) from exc
 
     return make
@@ -256,7 +273,7 @@ def values_of(value: object) -> dict[str, Any] | None:
     """Return the fields of an object of a layout's class by name; None for other objects."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-    kind = type(value)
-    if _is_model(kind):
-        return {name: getattr(value, name) for name in kind.model_fields}
+    described = type(value)
+    if _is_model(described):
+        return {name: getattr(value, name) for name in described.model_fields}
     return None

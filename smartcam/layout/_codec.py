@@ -1,9 +1,9 @@
 """Convert records of a layout from bytes to values and back, in plain Python.
 
-There are two ways to read. The fast one unpacks all records with one ``struct.Struct``, turns the
-rows into columns, converts the columns that need it, and turns them back into rows; it does not
-know fields and offsets. If it fails, the slow one goes through the bytes in order and finds the
-place of the error.
+There are two ways to read. The fast way unpacks all records with one ``struct.Struct``, turns the
+rows into columns, converts the columns that need a conversion, and turns the columns back into
+rows. It does not know the place of an error. If it fails, the slow way goes through the bytes in
+order and finds this place.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, SupportsIndex, TypeVar, overload
 
 from smartcam.exceptions import ConfigurationError, hex_excerpt
 from smartcam.layout._classes import values_of
-from smartcam.layout._text import UNITS, misfit
+from smartcam.layout._text import UNITS, misfit_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -42,15 +42,15 @@ Payload = bytes | bytearray | memoryview
 _BOOLS = {0x00: False, 0xFF: True}
 
 MIN_SHARED_TEXTS = 8
-"""Least number of texts of a column that are compared before they are decoded."""
+"""Least number of texts of a column for which equal texts are decoded only once."""
 
 
 class Record(tuple[Any, ...]):
     """The values of one record, by name and by index.
 
     A tuple with the layout's field names as attributes: ``record.x``, ``record["x"]`` and
-    ``record[0]`` are the same. A field's name overrides the tuple's own, so ``record.count`` is the
-    field if the layout has one. Equal to a plain tuple of the same values.
+    ``record[0]`` are the same. A field's name overrides a method of tuples, so ``record.count``
+    is the field if the layout has one. Equal to a plain tuple of the same values.
     """
 
     __slots__ = ()
@@ -99,14 +99,14 @@ class Record(tuple[Any, ...]):
         return _make_record, (self._fields, units, tuple(self))
 
 
-# one class per layout; a class that is evicted from the cache is simply made again
+# one class for each list of fields; a class that the cache has dropped is made again
 @functools.lru_cache(maxsize=256)
 def record_class(names: tuple[str, ...], units: tuple[str, ...]) -> type[Record]:
     """Return the record class with these field names and SI units, "" for none."""
-    # getters written in C; their class must live until they are taken from it
+    # a namedtuple's getters are written in C; its class must live until they are copied
     make: Any = namedtuple  # noqa: PYI024  names known at run time, so no checker can follow
-    maker = make("Fields", names)
-    attributes: dict[str, Any] = {name: vars(maker)[name] for name in names}
+    field_tuple = make("Fields", names)
+    attributes: dict[str, Any] = {name: vars(field_tuple)[name] for name in names}
     return type(
         "Record",
         (Record,),
@@ -150,7 +150,9 @@ class RecordCodec:
         order = "<" if byte_order == "little" else ">"
         codes = (f"{field.length or ''}{field.wire.code}" for field in fields)
         self._struct = struct.Struct(order + "".join(codes))
-        self._singles = [struct.Struct(f"{order}{f.length or ''}{f.wire.code}") for f in fields]
+        self._field_structs = [
+            struct.Struct(f"{order}{f.length or ''}{f.wire.code}") for f in fields
+        ]
         self._converters = [
             (index, *converters)
             for index, field in enumerate(fields)
@@ -175,7 +177,7 @@ class RecordCodec:
         try:
             return self.convert(rows)
         except (KeyError, UnicodeDecodeError) as exc:
-            raise self.locate(payload, offset, label) from exc
+            raise self.conversion_error(payload, offset, label) from exc
 
     def convert(self, rows: Rows) -> list[Record]:
         """Return the records with the unconverted values ``rows``.
@@ -203,13 +205,13 @@ class RecordCodec:
                 for index, convert, _ in self._converters:
                     values[index] = convert(values[index])
             except (KeyError, UnicodeDecodeError) as exc:
-                raise self.locate(payload, 0, "") from exc
+                raise self.conversion_error(payload, 0, "") from exc
         record: Record = self.make(values)
         return record
 
     def read_field(self, payload: Payload, offset: int, index: int) -> Any:
         """Return the unconverted value of one field of the record at ``offset``."""
-        return self._singles[index].unpack_from(payload, offset + self.offsets[index])[0]
+        return self._field_structs[index].unpack_from(payload, offset + self.offsets[index])[0]
 
     def write(self, values: Sequence[Any], label: str) -> bytes:
         """Return the bytes of one record; ``values`` are in the order of the fields.
@@ -222,13 +224,13 @@ class RecordCodec:
                 wire.append(_to_wire(field, value))
             except (ArithmeticError, TypeError, ValueError) as exc:
                 raise ConfigurationError(
-                    f"layout: {label}{field.label}: expected {_expected(field)}, "
-                    f"got {_shown(value)}"
+                    f"layout: {label}{field.label}: expected {_describe_values(field)}, "
+                    f"got {_short_repr(value)}"
                 ) from exc
         return self._struct.pack(*wire)
 
-    def take(self, value: object, label: str, forced: Mapping[str, Any]) -> list[Any]:
-        """Return the values of one record in the order of the fields.
+    def values_in_order(self, value: object, label: str, forced: Mapping[str, Any]) -> list[Any]:
+        """Return the values of one record, in the order of the fields.
 
         ``value``: mapping, record, or sequence of the values in order. ``label`` names a record in
         errors. ``forced``: values of some fields that override values of ``value``. Raises
@@ -236,7 +238,7 @@ class RecordCodec:
         values.
         """
         names = [field.name for field in self.fields]
-        given = named(value, names, label)
+        given = values_by_name(value, names, label)
         given.update({name: forced[name] for name in names if name in forced})
         check_names(given, names, label)
         return [given[name] for name in names]
@@ -246,7 +248,7 @@ class RecordCodec:
         index = bisect.bisect_right(self.offsets, position) - 1
         return self.fields[index], self.offsets[index]
 
-    def locate(self, payload: Payload, offset: int, label: str) -> InterpretationError:
+    def conversion_error(self, payload: Payload, offset: int, label: str) -> InterpretationError:
         """Return the error for the first value that cannot be converted; there must be one."""
         for number, start in enumerate(range(offset, len(payload), self.size)):
             for index, convert, _ in self._converters:
@@ -254,48 +256,52 @@ class RecordCodec:
                 try:
                     convert(value)
                 except (KeyError, UnicodeDecodeError) as exc:
-                    at = start + self.offsets[index]
-                    where = f"{label} {number}: " if label else ""
+                    value_offset = start + self.offsets[index]
+                    prefix = f"{label} {number}: " if label else ""
                     if isinstance(exc, UnicodeDecodeError):
                         excerpt = f"{hex_excerpt(value)} ({exc.reason})"
-                        return misfit(
-                            self.fields[index], at + exc.start, "UTF-8 text", excerpt, where
+                        return misfit_error(
+                            self.fields[index],
+                            value_offset + exc.start,
+                            "UTF-8 text",
+                            excerpt,
+                            prefix,
                         )
                     expected, excerpt = "0x00 or 0xFF for a bool", f"0x{value:02X}"
-                    return misfit(self.fields[index], at, expected, excerpt, where)
+                    return misfit_error(self.fields[index], value_offset, expected, excerpt, prefix)
         raise AssertionError("the fast way failed and the slow way did not")
 
 
 def split_rows(items: list[T], counts: list[int]) -> list[list[T]]:
-    """Return items of several payloads as a list for each, by the number of items of each."""
+    """Split the items of several payloads into one list for each payload, by its item count."""
     if counts.count(1) == len(counts):
         return [[item] for item in items]
-    left = iter(items)
-    return [list(itertools.islice(left, count)) for count in counts]
+    remaining = iter(items)
+    return [list(itertools.islice(remaining, count)) for count in counts]
 
 
-def named(value: object, names: Sequence[str], label: str) -> dict[str, Any]:
+def values_by_name(value: object, names: Sequence[str], label: str) -> dict[str, Any]:
     """Return a mapping's, a record's or a sequence's values by name.
 
     Raises ConfigurationError if it is none of these, or a sequence of another length.
     """
-    given: Any = value
+    values: Any = value
     if isinstance(value, Mapping):
-        return dict(given)
+        return dict(values)
     if isinstance(value, Record):
-        return dict(given._asdict())
+        return dict(values._asdict())
     fields = values_of(value)
     if fields is not None:
         return fields
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
         raise ConfigurationError(
-            f"layout: {label}expected a mapping or a sequence of values, got {_shown(value)}"
+            f"layout: {label}expected a mapping or a sequence of values, got {_short_repr(value)}"
         )
-    if len(given) != len(names):
+    if len(values) != len(names):
         raise ConfigurationError(
-            f"layout: {label}expected {len(names)} values ({', '.join(names)}), got {len(given)}"
+            f"layout: {label}expected {len(names)} values ({', '.join(names)}), got {len(values)}"
         )
-    return dict(zip(names, given, strict=True))
+    return dict(zip(names, values, strict=True))
 
 
 def check_names(given: Mapping[str, Any], names: Sequence[str], label: str) -> None:
@@ -327,33 +333,33 @@ def _converters(field: Field, *, lenient: bool) -> tuple[Convert, ConvertAll] | 
     the time of a function call per value.
     """
     if field.type == "string":
-        return _text, _texts
+        return _decode_text, _decode_texts
     if field.type == "bool":
-        return _both(bool if lenient else _BOOLS.__getitem__)
+        return _with_column(bool if lenient else _BOOLS.__getitem__)
     if field.unit is None:
         return None
     _, _, multiply, divide = UNITS[field.unit]
     if multiply == divide == 1.0:
-        return _both(float) if field.wire.is_integer else None
+        return _with_column(float) if field.wire.is_integer else None
     if multiply == 1.0:
         return lambda v: v / divide, lambda column: [v / divide for v in column]
     return lambda v: v * multiply / divide, lambda column: [v * multiply / divide for v in column]
 
 
-def _both(convert: Convert) -> tuple[Convert, ConvertAll]:
+def _with_column(convert: Convert) -> tuple[Convert, ConvertAll]:
     return convert, lambda column: list(map(convert, column))
 
 
-def _text(raw: bytes) -> str:
+def _decode_text(raw: bytes) -> str:
     return raw.partition(b"\0")[0].decode()
 
 
-def _texts(column: Sequence[bytes]) -> list[str]:
-    """Return the texts of a column; of many equal ones, each only once."""
+def _decode_texts(column: Sequence[bytes]) -> list[str]:
+    """Return the texts of a column; decode each text only once if many are equal."""
     if len(column) >= MIN_SHARED_TEXTS:
-        different = set(column)
-        if 2 * len(different) <= len(column):
-            known = {raw: _text(raw) for raw in different}
+        distinct = set(column)
+        if 2 * len(distinct) <= len(column):
+            known = {raw: _decode_text(raw) for raw in distinct}
             return list(map(known.__getitem__, column))
     return [raw.partition(b"\0")[0].decode() for raw in column]
 
@@ -381,7 +387,7 @@ def _to_wire(field: Field, value: Any) -> Any:
 
 
 def _from_si(unit: Unit, si: float) -> float:
-    """Return the number whose SI value is ``si``, or the nearest if there is none."""
+    """Return the number whose SI value is ``si``, or nearest to ``si``."""
     value = si * unit.divide / unit.multiply
     if math.isinf(value) and math.isfinite(si):
         raise OverflowError("out of range")
@@ -408,7 +414,7 @@ def _text_to_wire(field: Field, value: Any) -> bytes:
     return raw
 
 
-def _expected(field: Field) -> str:
+def _describe_values(field: Field) -> str:
     wire = field.wire
     if field.type == "bool":
         return "True or False"
@@ -418,6 +424,6 @@ def _expected(field: Field) -> str:
     return text if field.unit is None else f"{text} on the wire ({UNITS[field.unit].si} here)"
 
 
-def _shown(value: object) -> str:
+def _short_repr(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 64 else f"{text[:64]} ..."

@@ -25,16 +25,16 @@ class CompiledLayout:
         spec: parsed form of the text.
         text: the canonical text.
         codecs: codecs of the head and of a record, by byte order.
-        fixed: number of records; None if it depends on the container.
-        to_end: whether the layout has only records up to the end.
+        fixed_count: number of records; None if it depends on the container.
+        fills_payload: whether the layout has nothing but records up to the end.
         is_list: whether the value is a plain list of records.
         record_word: word for a record in errors; "" if there is only one.
         sequence_index: index of the field with the sequence number; None without one.
     """
 
     __slots__ = (
-        *("__weakref__", "codecs", "fixed", "is_list", "record_word", "sequence_index"),
-        *("spec", "text", "to_end"),
+        *("__weakref__", "codecs", "fixed_count", "is_list", "record_word", "sequence_index"),
+        *("fills_payload", "spec", "text"),
     )
 
     def __init__(self, spec: LayoutSpec, text: str, *, lenient: bool) -> None:
@@ -49,8 +49,8 @@ class CompiledLayout:
             for order in orders
         }
         repeat = 1 if spec.repeat is None else spec.repeat
-        self.fixed: int | None = repeat if isinstance(repeat, int) else None
-        self.to_end: bool = repeat == "*" and not spec.head
+        self.fixed_count: int | None = repeat if isinstance(repeat, int) else None
+        self.fills_payload: bool = repeat == "*" and not spec.head
         self.is_list: bool = spec.is_list
         self.record_word: str = "" if spec.repeat is None else "record"
         fields = (*spec.head, *spec.fields)
@@ -63,16 +63,16 @@ _in_use: weakref.WeakValueDictionary[tuple[str, bool], CompiledLayout] = (
     weakref.WeakValueDictionary()
 )
 """Compiled layouts by text and ``lenient``, while a layout uses them. Each has at most two entries:
-its canonical text, and the text that it was first made from."""
+one for its canonical text, and one for the text from which it was first made."""
 
 
 def compile_text(text: str, start: int, *, lenient: bool) -> CompiledLayout:
-    """Return the compiled form of a layout text, from a cache or put into it.
+    """Return the compiled form of a layout text, which is cached.
 
     Args:
         text: the layout text.
         start: index of the character at which the layout begins.
-        lenient: True if any byte but zero is a true bool.
+        lenient: whether any byte except zero is a true bool.
 
     Raises:
         LayoutError: the text has a mistake; the error gives its position.

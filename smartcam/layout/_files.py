@@ -78,15 +78,15 @@ def from_data(data: Mapping[str, Any]) -> tuple[str, bool]:
     if checked.repeat is None and (checked.head or checked.group is not None):
         raise ConfigurationError("layout: head and group are for layouts with repeat")
     spec = LayoutSpec(
-        tuple(_checked_field(field) for field in checked.head),
-        tuple(_checked_field(field) for field in checked.fields_),
+        tuple(_parse_field(field) for field in checked.head),
+        tuple(_parse_field(field) for field in checked.fields_),
         checked.repeat,
         checked.group,
     )
     return to_text(spec), checked.lenient
 
 
-def _checked_field(data: _FieldData) -> LayoutField:
+def _parse_field(data: _FieldData) -> LayoutField:
     type_, _, length = data.type.partition("[")
     digits = length.removesuffix("]")
     if type_ not in TYPES or (length and not (length.endswith("]") and digits.isdecimal())):
@@ -98,7 +98,7 @@ def _checked_field(data: _FieldData) -> LayoutField:
         raise ConfigurationError(
             f"layout: field {data.name!r}: expected a unit ({', '.join(UNITS)}), got {data.unit!r}"
         )
-    # the length is part of the type's text: the parser of layout texts checks its range
+    # the type's text includes the length, whose range the parser of layout texts checks
     return LayoutField(data.name, data.type, None, data.unit, data.sequence)
 
 
@@ -125,17 +125,17 @@ def load_yaml(text: str) -> dict[str, Any] | str:
                 f"{error}\nnor is it YAML: {place}{exc}", text=error.text, position=error.position
             ) from exc
         return text
-    given: Any = loaded
+    values: Any = loaded
     if isinstance(loaded, str):
         return loaded
-    # "x: int32" is also a YAML mapping; a layout file has other values than texts
-    is_data = isinstance(loaded, dict) and not all(isinstance(v, str) for v in given.values())
-    return given if is_data else text
+    # "x: int32" is also a YAML mapping, but a layout file has values that are no texts
+    is_data = isinstance(loaded, dict) and not all(isinstance(v, str) for v in values.values())
+    return values if is_data else text
 
 
 def make_model(spec: LayoutSpec) -> type[BaseModel]:
     """Return the pydantic model of the values from a layout's ``parse``."""
-    record = _object_model("Record", [_member(field) for field in spec.fields])
+    record = _make_object_model("Record", [_member_data(field) for field in spec.fields])
     if spec.repeat is None:
         return record
     bounds = {"min_length": spec.repeat, "max_length": spec.repeat}
@@ -143,11 +143,13 @@ def make_model(spec: LayoutSpec) -> type[BaseModel]:
     records: Any = Annotated[list[record], ModelField(**limits)]  # type: ignore[valid-type]
     if spec.is_list:
         return type("Records", (RootModel[records],), {"__module__": __name__})
-    members = [_member(field) for field in spec.head]
-    return _object_model("Container", [*members, (spec.group_field, records, "the records", {})])
+    members = [_member_data(field) for field in spec.head]
+    return _make_object_model(
+        "Container", [*members, (spec.group_field, records, "the records", {})]
+    )
 
 
-def _member(field: LayoutField) -> tuple[str, Any, str, dict[str, Any]]:
+def _member_data(field: LayoutField) -> tuple[str, Any, str, dict[str, Any]]:
     """Return name, type, description and limits of a field's value."""
     wire, text = field.wire, field.type_text
     if field.sequence:
@@ -163,7 +165,7 @@ def _member(field: LayoutField) -> tuple[str, Any, str, dict[str, Any]]:
     return field.name, float, text, {}
 
 
-def _object_model(
+def _make_object_model(
     name: str, members: list[tuple[str, Any, str, dict[str, Any]]]
 ) -> type[BaseModel]:
     taken = {member[0] for member in members}

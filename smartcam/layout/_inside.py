@@ -9,7 +9,7 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.layout._classes import describes_layout, read_class
     from smartcam.layout._codec import split_rows
-    from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, Field, misfit
+    from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, Field, misfit_error
     from smartcam.layout._texts import pack_texts
     from smartcam.layout._units import ShownUnits, units_of
     from smartcam.layout._yaml_files import file_schema, read_model
@@ -26,7 +26,7 @@ __all__ = [
     "describes_layout",
     "file_schema",
     "load",
-    "misfit",
+    "misfit_error",
     "pack_texts",
     "read_class",
     "read_model",
@@ -40,7 +40,7 @@ if not TYPE_CHECKING:
         {
             "_classes": "describes_layout read_class",
             "_codec": "split_rows",
-            "_text": "Field SI_SYMBOLS TYPES UNITS misfit",
+            "_text": "Field SI_SYMBOLS TYPES UNITS misfit_error",
             "_texts": "pack_texts",
             "_units": "ShownUnits units_of",
             "_yaml_files": "file_schema read_model",

@@ -39,11 +39,15 @@ class TableCodec:
         fields = codec.fields
         self._codec = codec
         self.dtype: np.dtype[np.void] = _dtype(fields, byte_order)
-        self._native = _dtype(fields, sys.byteorder, converted=True)
+        self._table_dtype = _dtype(fields, sys.byteorder, converted=True)
         self._columns = [(field.name, _converter(field)) for field in fields]
-        self._bools = [field.name for field in fields if field.type == "bool" and not codec.lenient]
-        self._converts = any(field.type == "bool" or field.unit is not None for field in fields)
-        self.is_view: bool = self._native == self.dtype and not self._converts
+        self._strict_bools = [
+            field.name for field in fields if field.type == "bool" and not codec.lenient
+        ]
+        self._has_conversions = any(
+            field.type == "bool" or field.unit is not None for field in fields
+        )
+        self.is_view: bool = self._table_dtype == self.dtype and not self._has_conversions
 
     def read(self, payload: Payload, offset: int, count: int, *, label: str) -> Rows:
         """Return ``count`` records, beginning at ``offset``, read-only and if possible as a view.
@@ -54,18 +58,18 @@ class TableCodec:
         dtype = self.dtype
         # numpy refuses an empty buffer
         rows: Rows = np.frombuffer(payload, dtype, count, offset) if count else np.empty(0, dtype)
-        for name in self._bools:
-            if not _all_bools(rows[name]):
-                raise self._codec.locate(payload, offset, label)
-        if self._converts:
-            rows = self._converted(rows)
+        for name in self._strict_bools:
+            if not _has_only_bools(rows[name]):
+                raise self._codec.conversion_error(payload, offset, label)
+        if self._has_conversions:
+            rows = self._convert_rows(rows)
         elif not self.is_view:
-            rows = rows.astype(self._native)
+            rows = rows.astype(self._table_dtype)
         rows.flags.writeable = False
         return rows
 
-    def _converted(self, wire: Rows) -> Rows:
-        rows = np.empty(len(wire), self._native)
+    def _convert_rows(self, wire: Rows) -> Rows:
+        rows = np.empty(len(wire), self._table_dtype)
         with np.errstate(all="ignore"):  # NaN and infinity are accepted, as for single values
             for name, convert in self._columns:
                 column = wire[name]
@@ -89,7 +93,7 @@ def _dtype(
     return np.dtype(columns, align=False)
 
 
-def _all_bools(column: np.ndarray[Any, Any]) -> bool:
+def _has_only_bools(column: np.ndarray[Any, Any]) -> bool:
     return not column.tobytes().translate(None, b"\x00\xff")
 
 

@@ -86,8 +86,8 @@ TYPES: dict[str, WireType] = {
 class Unit(NamedTuple):
     """A unit on the wire: ``value * multiply / divide`` is the value in SI.
 
-    One of the two is 1 (or, for ``inch``, the product is exact), so a value is rounded once, and
-    scalars and numpy columns come out the same to the last bit.
+    One of the factors is 1, or the product is exact as for ``inch``. So a value is rounded only
+    once, and scalars and numpy columns are equal to the last bit.
     """
 
     quantity: str
@@ -113,8 +113,8 @@ UNITS: dict[str, Unit] = {
 SI_SYMBOLS: dict[str, str] = {"length": "m", "angle": "rad", "time": "s", "pixels": "px"}
 """The symbols of the SI units that values have, by their quantity; a ratio has none."""
 
-# words that people write for a type, if the spelling alone does not lead to it
-_MEANT = {
+# words that people write for a type, and that are not spelled like it
+_OTHER_NAMES = {
     "float": "real32",
     "float32": "real32",
     "float64": "real64",
@@ -193,8 +193,8 @@ class LayoutSpec(NamedTuple):
     @property
     def is_list(self) -> bool:
         """True if the value is a plain list: an unnamed group, without other values."""
-        special = (field.sequence or field.name == self.repeat for field in self.head)
-        return self.repeat is not None and self.group is None and all(special)
+        is_no_value = (field.sequence or field.name == self.repeat for field in self.head)
+        return self.repeat is not None and self.group is None and all(is_no_value)
 
     @property
     def group_field(self) -> str:
@@ -216,10 +216,10 @@ def parse_text(text: str, start: int = 0) -> LayoutSpec:
     """Parse the fields and groups of a layout text from ``start`` on.
 
     Raises LayoutError with the position of the mistake in ``text``. A text is also too long if its
-    canonical form is, since copies and files use that form.
+    canonical form is too long, since copies and files use that form.
     """
     _check_length(text, len(text) - start, start)
-    spec = _Parser(text, start).layout()
+    spec = _Parser(text, start).parse()
     _check_length(text, len(to_text(spec)), start, "in its canonical form, ")
     return spec
 
@@ -233,7 +233,7 @@ def _check_length(text: str, length: int, start: int, form: str = "") -> None:
         )
 
 
-def misfit(
+def misfit_error(
     field: Field, offset: int, expected: str, actual: object, where: str = "", more: str = ""
 ) -> InterpretationError:
     """Return the error for a value that does not match its field.
@@ -250,7 +250,7 @@ def misfit(
     )
 
 
-class _Lexeme(NamedTuple):
+class _Token(NamedTuple):
     kind: str
     text: str
     position: int
@@ -268,11 +268,11 @@ class _Parser:
     def __init__(self, text: str, start: int) -> None:
         self._text = text
         self._tokens = self._tokenize(start)
-        self._next = 0
+        self._index = 0
         self._names: set[str] = set()
         self._has_sequence = False
 
-    def layout(self) -> LayoutSpec:
+    def parse(self) -> LayoutSpec:
         """Parse the whole text."""
         fields: list[Field] = []
         group: LayoutSpec | None = None
@@ -281,88 +281,90 @@ class _Parser:
             if token.kind == "end" and (fields or group):
                 break
             if group is not None:
-                self._unexpected("the end, a group comes last")
-            if self._at_group():
-                group = self._group(tuple(fields))
+                self._fail_unexpected("the end, a group comes last")
+            if self._is_group_next():
+                group = self._parse_group(tuple(fields))
             else:
-                fields.append(self._field("a field or a group"))
-            if not self._take_mark(","):
+                fields.append(self._parse_field("a field or a group"))
+            if not self._accept_mark(","):
                 self._expect_end(None if group else fields[-1])
                 break
         return group or LayoutSpec((), tuple(fields), None, None)
 
     # -- rules -------------------------------------------------------------------------------
 
-    def _at_group(self) -> bool:
+    def _is_group_next(self) -> bool:
         """Return True if the next tokens are ``(`` or ``name : (``."""
-        ahead = [token.text for token in self._tokens[self._next : self._next + 3]]
-        return ahead[:1] == ["("] or ahead[1:] == [":", "("]
+        next_texts = [token.text for token in self._tokens[self._index : self._index + 3]]
+        return next_texts[:1] == ["("] or next_texts[1:] == [":", "("]
 
-    def _group(self, head: tuple[Field, ...]) -> LayoutSpec:
-        at = self._peek()
+    def _parse_group(self, head: tuple[Field, ...]) -> LayoutSpec:
+        first_token = self._peek()
         name: str | None = None
-        if at.text != "(":
-            name = self._name("a field or a group")
-            self._take()
-        self._take()
+        if first_token.text != "(":
+            name = self._parse_name("a field or a group")
+            self._next_token()
+        self._next_token()
         fields: list[Field] = []
         while not (fields and self._peek().text == ")"):
-            if self._at_group():
+            if self._is_group_next():
                 self._fail("expected a field, groups do not nest", self._peek())
-            fields.append(self._field("a field"))
-            if not self._take_mark(","):
+            fields.append(self._parse_field("a field"))
+            if not self._accept_mark(","):
                 break
-        if not self._take_mark(")"):
+        if not self._accept_mark(")"):
             self._fail_after(fields[-1], "',' or ')'")
-        spec = LayoutSpec(head, tuple(fields), self._repeat(head), name)
+        spec = LayoutSpec(head, tuple(fields), self._parse_repeat(head), name)
         if not spec.is_list and any(field.name == spec.group_field for field in head):
-            self._fail("expected a name before the group, 'records' is a field already", at)
+            self._fail(
+                "expected a name before the group, 'records' is a field already", first_token
+            )
         return spec
 
-    def _repeat(self, head: tuple[Field, ...]) -> str | int:
-        if self._take_mark("*"):
+    def _parse_repeat(self, head: tuple[Field, ...]) -> str | int:
+        if self._accept_mark("*"):
             return "*"
-        self._expect("[", "'*', '[number]' or '[name]' after the group")
-        token = self._take()
+        self._expect_mark("[", "'*', '[number]' or '[name]' after the group")
+        token = self._next_token()
         repeat: str | int
         if token.kind == "number":
-            repeat = self._number(token, "records")
+            repeat = self._parse_number(token, "records")
         elif token.kind == "name":
-            repeat = self._count_name(token, head)
+            repeat = self._parse_count_name(token, head)
         else:
-            self._unexpected("a number or the name of a count field", token)
-        self._expect("]", "']'")
+            self._fail_unexpected("a number or the name of a count field", token)
+        self._expect_mark("]", "']'")
         return repeat
 
-    def _count_name(self, token: _Lexeme, head: tuple[Field, ...]) -> str:
+    def _parse_count_name(self, token: _Token, head: tuple[Field, ...]) -> str:
         name = unicodedata.normalize("NFKC", token.text)
         for field in head:
             if field.name == name:
                 break
         else:
             known = ", ".join(field.name for field in head) or "none"
-            self._unexpected(f"the name of a field before the group (there: {known})", token)
+            self._fail_unexpected(f"the name of a field before the group (there: {known})", token)
         if not field.wire.is_integer or field.unit is not None or field.sequence:
             self._fail(
                 f"expected an integer field without a unit as the count, got {field.label}", token
             )
         return name
 
-    def _field(self, expected: str) -> Field:
-        name = self._name(expected)
-        self._expect(":", f"':' and a type after {name!r}")
-        type_, length = self._type()
-        unit = self._unit(type_)
-        return Field(name, type_, length, unit, self._sequence(type_, unit))
+    def _parse_field(self, expected: str) -> Field:
+        name = self._parse_name(expected)
+        self._expect_mark(":", f"':' and a type after {name!r}")
+        type_, length = self._parse_type()
+        unit = self._parse_unit(type_)
+        return Field(name, type_, length, unit, self._parse_sequence(type_, unit))
 
-    def _name(self, expected: str) -> str:
-        token = self._take()
+    def _parse_name(self, expected: str) -> str:
+        token = self._next_token()
         if token.kind != "name":
-            self._unexpected(expected, token)
+            self._fail_unexpected(expected, token)
         # normalized, as Python does with the names of attributes
         name = unicodedata.normalize("NFKC", token.text)
         if not token.text.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
-            self._unexpected(
+            self._fail_unexpected(
                 "a name that can be an attribute (letters, digits, '_'; no leading '_', no Python "
                 "keyword)",
                 token,
@@ -372,131 +374,133 @@ class _Parser:
         self._names.add(name)
         return name
 
-    def _type(self) -> tuple[str, int | None]:
-        token = self._take()
+    def _parse_type(self) -> tuple[str, int | None]:
+        token = self._next_token()
         if token.text not in TYPES:
             self._fail(
                 f"expected a type ({', '.join(TYPES)}), got {token}"
-                f"{did_you_mean(token.text, TYPES, _MEANT)}",
+                f"{did_you_mean(token.text, TYPES, _OTHER_NAMES)}",
                 token,
             )
         if token.text != "string":
             return token.text, None
-        self._expect("[", "'[' and the string's length in bytes")
-        length = self._number(self._take(), "bytes")
-        self._expect("]", "']'")
+        self._expect_mark("[", "'[' and the string's length in bytes")
+        length = self._parse_number(self._next_token(), "bytes")
+        self._expect_mark("]", "']'")
         return token.text, length
 
-    def _unit(self, type_: str) -> str | None:
+    def _parse_unit(self, type_: str) -> str | None:
         token = self._peek()
-        if token.kind != "name" or self._after().text == ":":
+        if token.kind != "name" or self._peek_second().text == ":":
             return None
         if not TYPES[type_].is_number:
-            self._unexpected(f"no unit, a {type_} has none")
+            self._fail_unexpected(f"no unit, a {type_} has none")
         if token.text not in UNITS:
-            self._unexpected(f"a unit ({', '.join(UNITS)})")
-        return self._take().text
+            self._fail_unexpected(f"a unit ({', '.join(UNITS)})")
+        return self._next_token().text
 
-    def _sequence(self, type_: str, unit: str | None) -> bool:
-        at = self._peek()
-        if not self._take_mark("@"):
+    def _parse_sequence(self, type_: str, unit: str | None) -> bool:
+        mark = self._peek()
+        if not self._accept_mark("@"):
             return False
         if self._peek().text != SEQUENCE:
-            self._fail(f"expected '@{SEQUENCE}', got '@' and {self._peek()}", at)
-        self._take()
+            self._fail(f"expected '@{SEQUENCE}', got '@' and {self._peek()}", mark)
+        self._next_token()
         if not TYPES[type_].is_integer or unit is not None:
-            self._fail(f"expected '@{SEQUENCE}' only after an integer without a unit", at)
+            self._fail(f"expected '@{SEQUENCE}' only after an integer without a unit", mark)
         if self._has_sequence:
-            self._fail(f"expected one '@{SEQUENCE}', got a second", at)
+            self._fail(f"expected one '@{SEQUENCE}', got a second", mark)
         self._has_sequence = True
         return True
 
-    def _number(self, token: _Lexeme, counted: str) -> int:
+    def _parse_number(self, token: _Token, counted: str) -> int:
         digits = token.text.lstrip("0")
         # check the length first: int() refuses some thousand digits with an error of its own
         if token.kind != "number" or not 1 <= len(digits) <= 5 or int(digits) > MAX_COUNT:
-            self._unexpected(f"a number of {counted} from 1 to {MAX_COUNT}", token)
+            self._fail_unexpected(f"a number of {counted} from 1 to {MAX_COUNT}", token)
         return int(digits)
 
     def _expect_end(self, last: Field | None) -> None:
         if self._peek().kind == "end":
             return
         if last is None:
-            self._unexpected("the end, a group comes last")
+            self._fail_unexpected("the end, a group comes last")
         self._fail_after(last, "',' or the end")
 
     # -- tokens ------------------------------------------------------------------------------
 
-    def _tokenize(self, start: int) -> list[_Lexeme]:
-        tokens: list[_Lexeme] = []
+    def _tokenize(self, start: int) -> list[_Token]:
+        tokens: list[_Token] = []
         position = start
         while position < len(self._text):
             match = _TOKEN.match(self._text, position)
             if match is None:
-                bad = self._text[position]
+                character = self._text[position]
                 self._fail(
-                    f"expected a name, a number or one of : , ( ) [ ] * @ #, got {bad!r}",
-                    _Lexeme("mark", bad, position),
+                    f"expected a name, a number or one of : , ( ) [ ] * @ #, got {character!r}",
+                    _Token("mark", character, position),
                 )
             if match.lastgroup != "space":
-                tokens.append(_Lexeme(match.lastgroup or "", match.group(), position))
+                tokens.append(_Token(match.lastgroup or "", match.group(), position))
             position = match.end()
-        tokens.append(_Lexeme("end", "", max(start, len(self._text))))
+        tokens.append(_Token("end", "", max(start, len(self._text))))
         return tokens
 
-    def _peek(self) -> _Lexeme:
-        return self._tokens[self._next]
+    def _peek(self) -> _Token:
+        return self._tokens[self._index]
 
-    def _after(self) -> _Lexeme:
-        return self._tokens[min(self._next + 1, len(self._tokens) - 1)]
+    def _peek_second(self) -> _Token:
+        return self._tokens[min(self._index + 1, len(self._tokens) - 1)]
 
-    def _take(self) -> _Lexeme:
-        token = self._tokens[self._next]
+    def _next_token(self) -> _Token:
+        token = self._tokens[self._index]
         if token.kind != "end":
-            self._next += 1
+            self._index += 1
         return token
 
-    def _take_mark(self, mark: str) -> bool:
+    def _accept_mark(self, mark: str) -> bool:
         if self._peek().kind == "mark" and self._peek().text == mark:
-            self._next += 1
+            self._index += 1
             return True
         return False
 
-    def _expect(self, mark: str, expected: str) -> None:
-        if not self._take_mark(mark):
-            self._unexpected(expected)
+    def _expect_mark(self, mark: str, expected: str) -> None:
+        if not self._accept_mark(mark):
+            self._fail_unexpected(expected)
 
-    def _unexpected(self, expected: str, token: _Lexeme | None = None) -> NoReturn:
+    def _fail_unexpected(self, expected: str, token: _Token | None = None) -> NoReturn:
         """Raise the error for a token, by default the next one."""
         token = token or self._peek()
         self._fail(f"expected {expected}, got {token}", token)
 
     def _fail_after(self, field: Field, expected: str) -> NoReturn:
-        """Raise the error after a whole field, naming the parts that could have followed."""
+        """Raise the error for a token after a complete field; name the parts that may follow."""
         token = self._peek()
         if token.kind == "name":
             self._fail(f"expected {expected}, got {token}: a comma is missing before it", token)
         extras = "" if field.unit or not field.wire.is_number else "a unit, "
-        self._unexpected(f"{extras}{expected}")
+        self._fail_unexpected(f"{extras}{expected}")
 
-    def _fail(self, message: str, token: _Lexeme) -> NoReturn:
+    def _fail(self, message: str, token: _Token) -> NoReturn:
         at = token.position
         raise LayoutError(
-            f"layout: {message} {_show(self._text, at)}", text=self._text, position=at
+            f"layout: {message} {_show_position(self._text, at)}", text=self._text, position=at
         )
 
 
-def _show(text: str, position: int) -> str:
+def _show_position(text: str, position: int) -> str:
     """Return the line of ``position`` with a caret below it."""
     before = text[:position]
     line = before.count("\n") + 1
-    begin = before.rfind("\n") + 1
+    line_start = before.rfind("\n") + 1
     end = text.find("\n", position)
-    column = position - begin
-    where = (
+    column = position - line_start
+    place = (
         f"at character {position}" if "\n" not in text else f"at line {line}, column {column + 1}"
     )
-    content = text[begin : end if end >= 0 else len(text)]
-    first = max(0, column - 50)  # only a part of the line if it is long
-    shown = "".join(char if char.isprintable() else " " for char in content[first : column + 30])
-    return f"{where}\n  {shown}\n  {' ' * (column - first)}^"
+    content = text[line_start : end if end >= 0 else len(text)]
+    excerpt_start = max(0, column - 50)  # only a part of the line if it is long
+    excerpt = "".join(
+        char if char.isprintable() else " " for char in content[excerpt_start : column + 30]
+    )
+    return f"{place}\n  {excerpt}\n  {' ' * (column - excerpt_start)}^"

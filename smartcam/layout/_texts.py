@@ -1,6 +1,6 @@
-"""Put values that are texts, such as a spreadsheet's cells, into the bytes of a layout.
+"""Pack values that are texts, such as a spreadsheet's cells, into the bytes of a layout.
 
-Then every interpreter reads them like a container, in the layout's units.
+Every interpreter then reads these bytes like a container, in the layout's units.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ _NUMBER = re.compile(
 def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes:
     """Return the little-endian bytes of a layout whose fields have these texts, in order.
 
-    Numbers are in the field's own unit, as on the wire, not in SI. In a group that is counted by a
-    field, texts after the counted records may be anything, or missing.
+    Numbers are in the field's own unit, as on the wire, not in SI. If a field counts the
+    records of a group, texts after the counted records are ignored, and may be missing.
 
     Args:
-        layout: the fields; ``( ... )*`` and a counted group take as many records as there are
-            cells for.
+        layout: the fields; ``( ... )*`` and a counted group take as many records as the cells
+            fill.
         cells: the name of each cell and its text; None for a cell without one.
 
     Raises:
         InterpretationError: a text is no value of its field, or there are too few or too many
             cells.
     """
-    fields = _fields(layout, len(cells))
-    used = len(fields)
+    fields = _cell_fields(layout, len(cells))
+    used_count = len(fields)
     parts: list[bytes] = []
     offset = 0
     for index, (field, (cell, text)) in enumerate(zip(fields, cells, strict=True)):
         try:
-            part = _pack(field, text) if index < used else bytes(field.size)
+            part = _pack_field(field, text) if index < used_count else bytes(field.size)
         except (ValueError, OverflowError) as exc:
             raise InterpretationError(
                 f"{field.label}: cell {cell} holds {text!r:.64}: {exc}"
@@ -58,16 +58,16 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
         parts.append(part)
         offset += len(part)
         if index < len(layout.head) and field.name == layout.repeat and text is not None:
-            used = len(layout.head) + _integer(text) * len(layout.fields)
+            used_count = len(layout.head) + _parse_integer(text) * len(layout.fields)
     return b"".join(parts)
 
 
-def _fields(layout: Layout, count: int) -> Sequence[Field]:
+def _cell_fields(layout: Layout, count: int) -> Sequence[Field]:
     """Return the field of each of ``count`` cells; raise InterpretationError if they do not fit."""
     records = layout.repeat
     if not isinstance(records, int):
-        left = max(0, count - len(layout.head))
-        records = 1 if records is None else -(-left // len(layout.fields))
+        cells_of_records = max(0, count - len(layout.head))
+        records = 1 if records is None else -(-cells_of_records // len(layout.fields))
     expected = len(layout.head) + records * len(layout.fields)
     if expected != count:
         cause = "" if count else "; ?cells=B2,C2 in the URL names those that are read"
@@ -79,7 +79,7 @@ def _fields(layout: Layout, count: int) -> Sequence[Field]:
     return (*layout.head, *layout.fields * records)
 
 
-def _pack(field: Field, text: str | None) -> bytes:
+def _pack_field(field: Field, text: str | None) -> bytes:
     """Return the bytes of one field; raise ValueError or OverflowError for a wrong value."""
     if text is None:
         raise ValueError("it has no value")
@@ -89,20 +89,20 @@ def _pack(field: Field, text: str | None) -> bytes:
             raise ValueError(f"at most {field.size} bytes of UTF-8 were expected")
         return raw.ljust(field.size, b"\0")
     if field.type == "bool":
-        number = _integer(text)
+        number = _parse_integer(text)
         if number not in {0, 1}:
             raise ValueError("neither 0 nor 1")
         return b"\xff" if number else b"\0"
     low, high = field.wire.low, field.wire.high
     if low is not None and high is not None:
-        number = _integer(text)
+        number = _parse_integer(text)
         if not low <= number <= high:
             raise ValueError(f"{low} to {high} was expected")
         return struct.pack("<" + field.wire.code, number)
-    return struct.pack("<" + field.wire.code, _real(text))
+    return struct.pack("<" + field.wire.code, _parse_real(text))
 
 
-def _real(text: str) -> float:
+def _parse_real(text: str) -> float:
     """Parse a number; raise ValueError if it is no number, or too large."""
     if not _NUMBER.fullmatch(text.strip()):
         raise ValueError("no number")
@@ -112,7 +112,7 @@ def _real(text: str) -> float:
     return number
 
 
-def _integer(text: str) -> int:
+def _parse_integer(text: str) -> int:
     """Parse an integer, perhaps with decimals that are zeros; raise ValueError for others."""
     match = _NUMBER.fullmatch(text.strip())
     if match is None or match["whole"] is None:

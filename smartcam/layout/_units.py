@@ -59,7 +59,7 @@ class ShownUnits:
             self._by_symbol[symbol] = ShownUnit(name, unit.divide / unit.multiply)
 
     def of(self, symbol: str) -> ShownUnit:
-        """Return the unit in which people see values with an SI unit; "" means no unit."""
+        """Return the unit in which people see values in the SI unit ``symbol``; "": no unit."""
         return self._by_symbol.get(symbol) or ShownUnit(symbol, 1.0)
 
     def shown(self, value: object, symbol: str) -> object:

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=BaseModel)
 
-_MAX_MISTAKES = 20  # number of mistakes that are reported at once
+_MAX_MISTAKES = 20  # mistakes that are reported at once
 
-MAX_FILES_BESIDE = 1000
+MAX_NEIGHBOUR_FILES = 1000
 """Largest number of files of a folder that are compared with a wrong file name."""
 
 
@@ -49,7 +49,7 @@ def read_model(
     Args:
         path: path of the file.
         label: kind of the file for errors, such as ``scenario``.
-        kind: model of the file's fields.
+        kind: pydantic model of the file's fields.
         such_as: name of a field, as an example for errors.
         mistake: function that returns the place of a value that cannot work and the reason, or
             None.
@@ -60,53 +60,59 @@ def read_model(
         MissingExtraError: PyYAML is not installed.
     """
     path = check_path(path, "path", label)
-    named = f"{label} {path}"
+    file_label = f"{label} {path}"
     try:
         with path.open(encoding="utf-8") as stream:
             text = stream.read(MAX_YAML_TEXT_CHARACTERS + 1)
     except UnicodeDecodeError as exc:
-        raise ConfigurationError(f"{named}: {exc}") from exc
+        raise ConfigurationError(f"{file_label}: {exc}") from exc
     except OSError as exc:
-        meant = did_you_mean(path.name, _beside(path)) if isinstance(exc, FileNotFoundError) else ""
-        raise ConfigurationError(f"{named}: {exc.strerror or exc}{meant}") from exc
+        suggestion = (
+            did_you_mean(path.name, _neighbour_names(path))
+            if isinstance(exc, FileNotFoundError)
+            else ""
+        )
+        raise ConfigurationError(f"{file_label}: {exc.strerror or exc}{suggestion}") from exc
     try:
         root = compose(text, label=f"a {label} file")
         if root is not None:
-            _refuse_twice(root, named)
+            _refuse_repeated_keys(root, file_label)
         data = None if root is None else construct(root)
     except BadYamlError as exc:
         line = "" if exc.line is None else f", line {exc.line}"
-        raise ConfigurationError(f"{named}{line}: {exc}") from exc
+        raise ConfigurationError(f"{file_label}{line}: {exc}") from exc
     if not isinstance(data, dict):
-        raise ConfigurationError(f"{named}: expected fields such as '{such_as}:'")
+        raise ConfigurationError(f"{file_label}: expected fields such as '{such_as}:'")
     try:
         model = kind.model_validate(data)
     except ValidationError as exc:
         findings = (
             (
                 item["loc"],
-                item["msg"].removeprefix("Value error, ") + _actual_text(item) + _meant(kind, item),
+                item["msg"].removeprefix("Value error, ")
+                + _actual_text(item)
+                + _field_hint(kind, item),
             )
             for item in exc.errors(include_url=False)
         )
-        raise ConfigurationError(_texts(named, root, findings)) from exc
-    problem = mistake(model)
-    if problem is not None:
-        raise ConfigurationError(_texts(named, root, [problem]))
+        raise ConfigurationError(_mistakes_text(file_label, root, findings)) from exc
+    found_mistake = mistake(model)
+    if found_mistake is not None:
+        raise ConfigurationError(_mistakes_text(file_label, root, [found_mistake]))
     return model
 
 
-def _beside(path: Path) -> list[str]:
-    """Return the names of some files in the folder of a missing file."""
+def _neighbour_names(path: Path) -> list[str]:
+    """Return the names of files in the folder of a missing file."""
     try:
         with os.scandir(path.parent) as entries:
-            return [entry.name for entry in itertools.islice(entries, MAX_FILES_BESIDE)]
+            return [entry.name for entry in itertools.islice(entries, MAX_NEIGHBOUR_FILES)]
     except OSError:
         return []
 
 
 def _actual_text(item: ErrorDetails) -> str:
-    """Return an addition to pydantic's error with the given value, if its text lacks it."""
+    """Return the given value as an addition to pydantic's error; "" if the error names it."""
     if item["type"] in {"missing", "extra_forbidden", "value_error", "union_tag_invalid"}:
         return ""
     given: object = item["input"]
@@ -115,16 +121,16 @@ def _actual_text(item: ErrorDetails) -> str:
     return " (got a list)" if isinstance(given, list) else f" (got {shown(given)})"
 
 
-def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
-    """Return a hint which field or word was probably meant."""
+def _field_hint(kind: type[BaseModel], item: ErrorDetails) -> str:
+    """Return a hint with the field or word that was probably meant."""
     if item["type"] != "extra_forbidden":
         return hint(item, ())
     *place, _ = item["loc"]
     schema = _schema(kind)
     branches = [*_branches(schema, schema)]
     for part in place:
-        children = [child for branch in branches for child in _children(schema, branch, part)]
-        branches = children or branches  # pydantic's path also has the types of a union in it
+        children = [child for branch in branches for child in _child_schemas(schema, branch, part)]
+        branches = children or branches  # pydantic's path also contains the types of a union
     return hint(
         item, dict.fromkeys(name for branch in branches for name in branch.get("properties", {}))
     )
@@ -135,48 +141,50 @@ def _schema(kind: type[BaseModel]) -> dict[str, Any]:
     return kind.model_json_schema()
 
 
-def _children(schema: Any, branch: Any, part: int | str) -> list[Any]:
-    kinds = [branch["items"]] if isinstance(part, int) and "items" in branch else []
+def _child_schemas(schema: Any, branch: Any, part: int | str) -> list[Any]:
+    subschemas = [branch["items"]] if isinstance(part, int) and "items" in branch else []
     if part in branch.get("properties", {}):
-        kinds = [branch["properties"][part]]
+        subschemas = [branch["properties"][part]]
     elif isinstance(branch.get("additionalProperties"), dict):
-        kinds = [branch["additionalProperties"]]
-    return [below for kind in kinds for below in _branches(schema, kind)]
+        subschemas = [branch["additionalProperties"]]
+    return [below for kind in subschemas for below in _branches(schema, kind)]
 
 
 def _branches(schema: Any, node: Any) -> Iterator[Any]:
     """Yield the schemas that a part of a schema refers to: a reference, each type of a union."""
     if "$ref" in node:
         yield from _branches(schema, schema["$defs"][node["$ref"].rpartition("/")[2]])
-    kinds = [*node.get("anyOf", ()), *node.get("oneOf", ()), *node.get("allOf", ())]
-    for kind in kinds:
+    subschemas = [*node.get("anyOf", ()), *node.get("oneOf", ()), *node.get("allOf", ())]
+    for kind in subschemas:
         yield from _branches(schema, kind)
     if "properties" in node or "items" in node or "additionalProperties" in node:
         yield node
 
 
-def _texts(named: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]) -> str:
+def _mistakes_text(
+    file_label: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]
+) -> str:
     texts = [
         # the text of a layout has a marker below it; its first line gives the position
-        ": ".join([f"line {_line(root, place)}", *_field(place), text.partition("\n")[0]])
+        ": ".join([f"line {_find_line(root, place)}", *_place_text(place), text.partition("\n")[0]])
         for place, text in itertools.islice(findings, _MAX_MISTAKES)
     ]
-    return f"{named}, {'; '.join(texts)}"
+    return f"{file_label}, {'; '.join(texts)}"
 
 
-def _field(place: Sequence[int | str]) -> list[str]:
+def _place_text(place: Sequence[int | str]) -> list[str]:
     return [".".join(str(part) for part in place)] if place else []
 
 
-def _line(node: Any, loc: Sequence[int | str]) -> int:
+def _find_line(node: Any, loc: Sequence[int | str]) -> int:
     """Return the line of the deepest node on the path to ``loc`` that is in the file."""
     for part in loc:
-        child = _child(node, part)  # pydantic's path also has the kinds of faults in it
+        child = _child_node(node, part)  # pydantic's path also contains the types of a union
         node = node if child is None else child
     return int(node.start_mark.line) + 1
 
 
-def _child(node: Any, part: int | str) -> Any:
+def _child_node(node: Any, part: int | str) -> Any:
     if node.id == "mapping":
         return next((value for key, value in node.value if key.value == str(part)), None)
     if node.id == "sequence" and isinstance(part, int) and part < len(node.value):
@@ -184,29 +192,29 @@ def _child(node: Any, part: int | str) -> Any:
     return None
 
 
-def _refuse_twice(root: Any, named: str) -> None:
-    """Refuse a repeated key in a mapping, of which YAML would silently take the last."""
+def _refuse_repeated_keys(root: Any, label: str) -> None:
+    """Refuse a repeated key in a mapping; YAML would silently use its last value."""
     seen: set[int] = set()  # aliases may form a circle
-    waiting = [root]
-    while waiting:
-        node = waiting.pop()
+    pending = [root]
+    while pending:
+        node = pending.pop()
         if id(node) in seen or node.id == "scalar":
             continue
         seen.add(id(node))
         if node.id == "sequence":
-            waiting.extend(node.value)
+            pending.extend(node.value)
             continue
         keys: set[str] = set()
         for key, value in cast("list[tuple[Any, Any]]", node.value):
-            # its text would be as long as everything that its aliases stand for
+            # the text of another key would be as long as all values that its aliases stand for
             if key.id != "scalar":
                 raise ConfigurationError(
-                    f"{named}, line {key.start_mark.line + 1}: expected a text as a key, got a "
+                    f"{label}, line {key.start_mark.line + 1}: expected a text as a key, got a "
                     f"{key.id}"
                 )
             if str(key.value) in keys:
                 raise ConfigurationError(
-                    f"{named}, line {key.start_mark.line + 1}: {key.value!r} stands there twice"
+                    f"{label}, line {key.start_mark.line + 1}: {key.value!r} stands there twice"
                 )
             keys.add(str(key.value))
-            waiting.append(value)
+            pending.append(value)

@@ -77,7 +77,7 @@ def construct(root: Any) -> Any:
     yaml = yaml_module("YAML")
     loader = _loader(yaml)("")
     try:
-        _count(root, {})
+        _count_values(root, {})
         return loader.construct_document(root)
     except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
         raise _as_bad_yaml(exc) from exc
@@ -100,31 +100,33 @@ def _as_bad_yaml(exc: Exception) -> BadYamlError:
     return BadYamlError(text, line=None if mark is None else mark.line + 1)
 
 
-def _count(node: Any, known: dict[int, int]) -> int:
+def _count_values(node: Any, counts: dict[int, int]) -> int:
     """Return the number of values that a node stands for, with its aliases expanded.
 
     Raises BadYamlError if they are too many, or if the node contains itself.
     """
     if node.id == "scalar":
         return 1
-    count = known.get(id(node))
+    count = counts.get(id(node))
     if count == 0:
-        raise BadYamlError("an alias of what it stands in", line=node.start_mark.line + 1)
+        raise BadYamlError(
+            "an alias of a value that contains this alias", line=node.start_mark.line + 1
+        )
     if count is None:
-        known[id(node)] = 0  # nodes that are being counted
+        counts[id(node)] = 0  # nodes that are being counted
         children = (
             node.value if node.id == "sequence" else [child for row in node.value for child in row]
         )
         count = 1
         for child in children:
-            count += _count(child, known)
+            count += _count_values(child, counts)
             if count > MAX_NODES:
                 raise BadYamlError(
                     f"expected {MAX_NODES} values at most, aliases counted with all that they "
                     "stand for",
                     line=child.start_mark.line + 1,
                 )
-        known[id(node)] = count
+        counts[id(node)] = count
     return count
 
 
@@ -142,23 +144,23 @@ def _loader(yaml: Any) -> Any:
                 raise BadYamlError(f"expected {MAX_NODES} values at most", line=mark.line + 1)
             self.depth += 1
             if self.depth > MAX_DEPTH:
-                raise self.too_deep()
+                raise self.depth_error()
             node = super().compose_node(parent, index)
             self.depth -= 1
             return node
 
         def fetch_flow_collection_start(self, token_class: Any) -> None:
             if self.flow_level >= MAX_DEPTH:
-                raise self.too_deep()
+                raise self.depth_error()
             super().fetch_flow_collection_start(token_class)
 
         def add_indent(self, column: int) -> bool:
             if len(self.indents) > MAX_DEPTH:
-                raise self.too_deep()
+                raise self.depth_error()
             added: bool = super().add_indent(column)
             return added
 
-        def too_deep(self) -> BadYamlError:
+        def depth_error(self) -> BadYamlError:
             text = f"nested too deep: expected {MAX_DEPTH} values in each other at most"
             return BadYamlError(text, line=self.get_mark().line + 1)
 

@@ -150,7 +150,7 @@ PARSERS: tuple[Parser, ...] = (
             f"transforms: {name}",
             from_file(functools.partial(_read_between, form, "robot", "camera"), "a"),
             _POSES,
-            form.most,
+            form.max_bytes,
             "calibration.formats._file_format.MAX_TEXT_BYTES",
             size=2500,
             short=PAST_LOOKAHEAD,
@@ -163,7 +163,7 @@ PARSERS: tuple[Parser, ...] = (
             f"samples: {name}",
             from_file(form.read, "a"),
             _SAMPLES,
-            form.most,
+            form.max_bytes,
             "calibration.formats._file_format."
             + ("MAX_YAML_BYTES" if "yaml" in name else "MAX_FILE_BYTES"),
             size=2500,
@@ -177,7 +177,7 @@ PARSERS: tuple[Parser, ...] = (
             f"trajectories: {name}",
             from_file(functools.partial(_read_between, form, "a", "b"), "a"),
             _TRAJECTORIES,
-            form.most,
+            form.max_bytes,
             "calibration.formats._file_format.MAX_FILE_BYTES",
             size=2500,
             short=PAST_LOOKAHEAD,
@@ -189,9 +189,9 @@ PARSERS: tuple[Parser, ...] = (
             f"cameras: {name}",
             from_file(form.read, "a"),
             _CAMERAS,
-            SAMPLES["moveit_yaml"].most
+            SAMPLES["moveit_yaml"].max_bytes
             if name == "mrcal"
-            else form.most,  # mrcal: beside the solver's inputs
+            else form.max_bytes,  # mrcal: beside the solver's inputs
             "calibration.formats."
             + ("_file_format.MAX_YAML_BYTES" if name == "mrcal" else "_cameras.MAX_FILE_BYTES"),
             size=2500,

@@ -104,7 +104,7 @@ from smartcam.calibration.formats._cameras import (
     parse_opencv,
 )
 from smartcam.calibration.formats._file_format import MAX_TEXT_BYTES, Format
-from smartcam.calibration.formats._plain import load_json, load_yaml, real
+from smartcam.calibration.formats._plain import format_real, load_json, load_yaml
 from smartcam.calibration.simulation import _scenes
 from smartcam.calibration.wizards import _journal
 from smartcam.calibration.wizards._journal import MAX_LINE_BYTES, Journal

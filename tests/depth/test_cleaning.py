@@ -10,9 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from smartcam.depth import SpatialFilter, TemporalFilter, fill_holes
-from smartcam.depth._cleaning import _widened, as_metres
+from smartcam.depth._cleaning import _join_neighbours, as_metres
 from smartcam.depth._inside import FOCAL, TowerTable, WoodenBlock
-from smartcam.depth._simulation import BASELINE, DISPARITY_SIGMA, RAYS_PER_SIDE, _jumps, _TableRays
+from smartcam.depth._simulation import (
+    BASELINE,
+    DISPARITY_SIGMA,
+    RAYS_PER_SIDE,
+    _find_jumps,
+    _TableRays,
+)
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 NEAR, FAR, SIGMA = 0.45, 0.50, 0.002
@@ -200,7 +206,7 @@ def crossings(depth: Map, level: float) -> Map:
 
 def test_rendered_scene_gets_nearer_to_its_truth_and_keeps_its_edges() -> None:
     table = TowerTable(1)
-    table._beside[:] = 0  # the camera is where it is said to be
+    table._camera_error[:] = 0  # the camera is where it is said to be
     table.blocks.append(WoodenBlock(0.4, 0.0, 0.5, size=(0.12, 0.06, 0.04)))
     camera = (0.4, 0.0, 0.5)
     rays = _TableRays(camera)
@@ -213,7 +219,7 @@ def test_rendered_scene_gets_nearer_to_its_truth_and_keeps_its_edges() -> None:
     clean = smooth(steady)
     raw = as_metres(maps[-1])
     errors = [rms(one[there], truth[there]) for one in (raw, steady, clean) for there in [one > 0]]
-    flat = ~_widened(_widened(_jumps(truth), np.logical_or), np.logical_or)
+    flat = ~_join_neighbours(_join_neighbours(_find_jumps(truth), np.logical_or), np.logical_or)
     inner = [rms(np.where(flat, one, 0), truth) for one in (raw, steady, clean)]
     assert errors[0] > errors[1] > errors[2]
     assert inner[1] < 0.7 * inner[0]

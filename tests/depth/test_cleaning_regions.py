@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from smartcam.depth import SpatialFilter, equalize_depth, region_depth
-from smartcam.depth._regions import _polygon
+from smartcam.depth._regions import _polygon_mask
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 Map = NDArray[Any]
@@ -50,7 +50,7 @@ def test_polygon_has_the_pixels_with_centres_inside() -> None:
     random = np.random.default_rng(1)
     for _ in range(6):
         corners = random.uniform(-3, 23, (int(random.integers(3, 8)), 2))
-        found = _polygon(corners, (20, 18))
+        found = _polygon_mask(corners, (20, 18))
         for (y, x), inside in np.ndenumerate(found):
             # by the angle under which the corners are seen: a turn for each time around
             rays = corners - (x, y)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from smartcam.depth import Cloud, load_cloud, save_cloud
 from smartcam.depth import _cloud_files as files_module
-from smartcam.depth._pcd import unpacked
+from smartcam.depth._pcd import unpack_lzf
 from smartcam.depth._tables import BadTableError
 from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
 
@@ -216,7 +216,7 @@ def test_compressed_pcd(tmp_path: Path) -> None:
     # then a zero, then 15 bytes from 1 back
     packed = bytes.fromhex("03 0000803f 40 03 00 00 e0 06 00")
     body = bytes.fromhex("0000803f" * 2) + bytes(16)
-    assert unpacked(packed, 24) == body
+    assert unpack_lzf(packed, 24) == body
     head = PCD_HEAD.format("F", "binary_compressed").replace(" rgb sigma", "")
     for line in ("SIZE", "TYPE", "COUNT"):
         start = head.index(line)
@@ -228,7 +228,7 @@ def test_compressed_pcd(tmp_path: Path) -> None:
         with pytest.raises(FrameFormatError):
             loaded(tmp_path, "a.pcd", wrong)
     with pytest.raises(BadTableError, match="4 bytes before it"):
-        unpacked(bytes.fromhex("20 03"), 3)
+        unpack_lzf(bytes.fromhex("20 03"), 3)
 
 
 @pytest.mark.parametrize(
@@ -340,7 +340,7 @@ def test_torn_and_mixed_files_are_clouds_or_typed_errors(
 @given(st.binary(max_size=64), st.integers(0, 4096))
 def test_any_bytes_unpack_or_are_refused(data: bytes, size: int) -> None:
     with contextlib.suppress(BadTableError):
-        assert len(unpacked(data, size)) == size
+        assert len(unpack_lzf(data, size)) == size
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,8 @@ from smartcam.calibration import CameraModel, StereoCalibration, Transform, cali
 from smartcam.calibration._inside import rectify
 from smartcam.calibration.formats import CameraChain, write_camera_info
 from smartcam.depth import StereoDepth, StereoMatcher, read_camera_infos
-from smartcam.depth._pair import CalibratedPair, _covariance_root, scaled
-from smartcam.depth._stereo import _bytes
+from smartcam.depth._pair import CalibratedPair, _covariance_root, scale_camera
+from smartcam.depth._stereo import _upper_bits
 from smartcam.depth._subpixel import MIN_COARSE_SIGMA_PX
 from smartcam.exceptions import (
     CalibrationError,
@@ -94,7 +94,7 @@ def drawn(right_size: tuple[int, int] = SIZE) -> tuple[NDArray[np.uint8], NDArra
     left, right = CHAIN.cameras
     return (
         ROOM.picture(left, noise=2, seed=1),
-        ROOM.picture(scaled(right, right_size), RIGHT_LEFT, noise=2, seed=2),
+        ROOM.picture(scale_camera(right, right_size), RIGHT_LEFT, noise=2, seed=2),
     )
 
 
@@ -164,7 +164,7 @@ async def test_cancelling_during_matching_leaves_the_pair_working() -> None:
         waiting = await streaming(cameras, left, right)
         give(pictures, 1, left, right)
         await until(lambda: cameras.statistics().group.delivered == 1)
-        worker = cameras._opened()[0]
+        worker = cameras._require_open()[0]
         assert worker._running is not None
         assert not worker._running.done()
         waiting.cancel()
@@ -265,7 +265,7 @@ async def test_the_drift_of_the_clocks_is_found() -> None:
         start = 1000.0
         for number in range(400):
             # the right one's clock is 200 parts in a million faster
-            cameras._clock.saw(
+            cameras._clock.add_pair(
                 frame(number, captured=start + number / 30),
                 frame(number, captured=start + 0.002 + number / 30 / (1 + 200e-6)),
             )
@@ -275,7 +275,7 @@ async def test_the_drift_of_the_clocks_is_found() -> None:
         assert account.skew == pytest.approx(0.002 - 385 / 30 * 200e-6, abs=2e-5)
         # other rates are no drift
         for number in range(400):
-            cameras._clock.saw(
+            cameras._clock.add_pair(
                 frame(number, captured=2000 + number / 30),
                 frame(number, captured=2000 + number / 25),
             )
@@ -329,7 +329,7 @@ def test_the_sigma_of_the_calibration_is_in_that_of_the_depth() -> None:
         found.append(z - (points @ turns[0].T)[:, 2])
     whole = np.zeros((SIZE[1], SIZE[0]), np.float32)
     whole[spots[:, 1], spots[:, 0]] = depth
-    told = made(CHAIN, covariance).sigma(whole, np.zeros_like(whole))
+    told = made(CHAIN, covariance).depth_sigma(whole, np.zeros_like(whole))
     np.testing.assert_allclose(told[spots[:, 1], spots[:, 0]], np.std(found, axis=0), rtol=0.02)
 
 
@@ -353,13 +353,13 @@ def test_a_calibration_of_ours_brings_its_covariance() -> None:
     pair = made(calibration)
     exact = made(CameraChain.of(calibration))
     flat = np.full((pair.size[1], pair.size[0]), 1.0, np.float32)
-    sure, told = exact.sigma(flat, flat * 0.1), pair.sigma(flat, flat * 0.1)
+    sure, told = exact.depth_sigma(flat, flat * 0.1), pair.depth_sigma(flat, flat * 0.1)
     np.testing.assert_allclose(sure, 0.1 / (pair.focal * pair.baseline), rtol=0.02)
     assert (told > sure).all()
     focal = made(CameraChain.of(calibration), focal_sigma=3.0)
     np.testing.assert_allclose(
-        focal.sigma(flat, flat * 0),
-        np.hypot(exact.sigma(flat, flat * 0), 3 / pair.focal),
+        focal.depth_sigma(flat, flat * 0),
+        np.hypot(exact.depth_sigma(flat, flat * 0), 3 / pair.focal),
         rtol=0.01,
     )
 
@@ -370,15 +370,15 @@ def test_sizes_lenses_and_maps_go_together() -> None:
     assert small.camera_info.size == small.size == (120, 80)
     assert small.focal == pytest.approx(large.focal / 2, rel=0.01)
     assert small.baseline == pytest.approx(large.baseline)
-    lens_small = scaled(CHAIN.cameras[0], (120, 80))
+    lens_small = scale_camera(CHAIN.cameras[0], (120, 80))
     points = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.2]])
     np.testing.assert_allclose(
         lens_small.project(points) * 2 + 0.5, CHAIN.cameras[0].project(points), atol=1e-9
     )
     soft = ROOM._replace(detail=0.1)
-    expected = large.rectified(soft.picture(CHAIN.cameras[0]), 0, "left")
+    expected = large.rectify(soft.picture(CHAIN.cameras[0]), 0, "left")
     for size in ((120, 80), (360, 240)):
-        found = large.rectified(soft.picture(scaled(CHAIN.cameras[0], size)), 0, "left")
+        found = large.rectify(soft.picture(scale_camera(CHAIN.cameras[0], size)), 0, "left")
         assert np.median(np.abs(found.astype(float) - expected)) <= 1, size
         moved = np.roll(found, 1, axis=1).astype(float)
         assert np.median(np.abs(moved - expected)) >= 3, size  # of which a pixel would be seen
@@ -452,4 +452,4 @@ def test_pixels_without_source_have_no_disparity() -> None:
 def test_frames_of_more_bits_are_seen_by_their_highest() -> None:
     pixels = np.array([[0, 512, 1023]], np.uint16)
     one = shown(np.zeros((1, 3), np.uint8), format=find_format("Mono10"))
-    assert _bytes(one, pixels).tolist() == [[0, 128, 255]]
+    assert _upper_bits(one, pixels).tolist() == [[0, 128, 255]]

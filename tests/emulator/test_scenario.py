@@ -87,7 +87,7 @@ def test_scenario_without_builtins(tmp_path: Path) -> None:
             "line.yaml, line 2: applications.0: layout: .*got 300",
         ),
         ("applications: 5\n", "line.yaml, line 1: applications: Input should be a valid tuple"),
-        ("a: &x [*x]\n", "line.yaml, line 1: an alias of what it stands in"),
+        ("a: &x [*x]\n", "line.yaml, line 1: an alias of a value that contains this alias"),
         (
             "quirks:\n  bad_frame: open\n",
             "line.yaml, line 2: quirks.bad_frame: Input should be 'skip' or 'close'",

@@ -227,7 +227,7 @@ URL = "url: bvs://192.168.0.10\n    "
         (f"{CAMERAS}connect: tls/h:7447\n", ", line 2: connect: tls/h:7447 wants certificates"),
         (f"certificates: none\n{CAMERAS}", ", line 1: certificates: .*none has no ca.pem, no cert"),
         ("cameras: [\n", ", line "),
-        ("cameras: &a {x: *a}\n", ", line 1: an alias of what it stands in"),
+        ("cameras: &a {x: *a}\n", ", line 1: an alias of a value that contains this alias"),
         ("cameras: !!python/object:os.system x\n", ", line 1: could not determine"),
     ],
 )

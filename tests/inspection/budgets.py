@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.budgets.parser import Make, Parser, fill_text
-from tests.inspection.inside import elements
+from tests.inspection.inside import split_elements
 
 _ELEMENTS: dict[str, Make] = {
     "elements of a length": fill_text("11250101"),
@@ -16,7 +16,7 @@ _ELEMENTS: dict[str, Make] = {
 PARSERS: tuple[Parser, ...] = (
     Parser(
         "GS1 elements",
-        elements,
+        split_elements,
         _ELEMENTS,
         4_000,
         "inspection._read.tool.MAX_TEXT_BYTES",

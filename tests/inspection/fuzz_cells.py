@@ -25,10 +25,10 @@ from tests.fuzz.fuzz_scenario import measured, scratch
 from tests.inspection.inside import (
     GS,
     MAX_REASON_BYTES,
-    elements,
     failed_values,
     frame_inspector,
     gs1,
+    split_elements,
 )
 
 if TYPE_CHECKING:
@@ -92,13 +92,13 @@ def check_teaching(name: str, number: int, program: Program) -> None:
 
 def first_element(text: str) -> tuple[tuple[str, str], ...]:
     """Return only the first element, as a planted mistake."""
-    return gs1.elements(text)[:1]
+    return gs1.split_elements(text)[:1]
 
 
 def check_gs1(data: bytes) -> None:
     """Check that a text's elements are whole, and that joined they are the text."""
     text = text_of(data)
-    found = elements(text)
+    found = split_elements(text)
     assert "".join(one + other for one, other in found).replace(GS, "") == text.replace(GS, "")
     for place, (identifier, value) in enumerate(found):
         if not identifier:

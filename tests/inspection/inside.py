@@ -15,8 +15,8 @@ from smartcam.inspection._measure.edges import (
     noise_of,
 )
 from smartcam.inspection._measure.features import (
+    CurveEdges,
     FoundPoint,
-    FoundShape,
     find_circle,
     find_line,
     find_pair,
@@ -24,20 +24,20 @@ from smartcam.inspection._measure.features import (
     strip_between,
 )
 from smartcam.inspection._measure.fits import Edges, fit_circle, fit_line
-from smartcam.inspection._measure.planes import PIXELS, Plane, plane_of
+from smartcam.inspection._measure.planes import PIXELS, Plane, measuring_plane
 from smartcam.inspection._measure.strips import Sectors, Strips
 from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
 from smartcam.inspection._measure.values import (
     Value,
-    circle_of,
     distance,
-    line_of,
-    point_of,
+    fit_circle_in_plane,
+    fit_line_in_plane,
+    measure_with_calibration,
+    point_in_plane,
     width,
-    with_calibration,
 )
 from smartcam.inspection._program import MAX_REASON_BYTES
 from smartcam.inspection._read import gs1
 from smartcam.inspection._read.codes import ReadCode, formats_of, read_codes
-from smartcam.inspection._read.gs1 import GS, elements
+from smartcam.inspection._read.gs1 import GS, split_elements
 from smartcam.inspection._read.tool import ReadSettings, ReadTool

@@ -582,7 +582,7 @@ async def test_a_damaged_picture_is_lost_and_any_other_fault_ends_the_pictures(
         monkeypatch.undo()
         raise left.pop()
 
-    monkeypatch.setattr("smartcam.inspection._camera.judged_frames._drawn", drawn)
+    monkeypatch.setattr("smartcam.inspection._camera.judged_frames._draw_marks", drawn)
     async with (
         device,
         smartcam.connect(device.url, application=7, **LIMITS) as camera,

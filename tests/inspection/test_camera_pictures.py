@@ -120,7 +120,7 @@ async def test_results_of_a_free_run_keep_their_pictures_after_earlier_sessions(
         await until(lambda: len(seen.results) >= done + 3)
         results.close()
         for result in seen.results[-3:]:
-            judged = camera._pairs.judged_of(result)
+            judged = camera._pairs.find_judged(result)
             assert judged is not None
             assert judged.number == result.sequence
 

@@ -231,8 +231,8 @@ def test_part_of_a_size_that_was_not_asked_for_is_told() -> None:
     part = PlacedPart(PARTS["bolt"], 100.0, 104.4, -0.7, 1.045)
     found = locate(Picture(drawn(part)), [model_of("bolt")], PartSearch())
     assert not found.parts
-    assert found.nearest is not None
-    assert found.nearest.refusal == "its size is 1.045 of the taught one, expected 1"
+    assert found.best_refused is not None
+    assert found.best_refused.refusal == "its size is 1.045 of the taught one, expected 1"
 
 
 @pytest.mark.long
@@ -357,11 +357,11 @@ def test_what_was_nearest_is_told_with_the_reason() -> None:
     picture[100:, :] = 60
     found = locate(Picture(picture), [model_of("bolt")], PartSearch(seconds=30.0))
     assert not found.parts
-    assert found.nearest is not None
-    assert "% of its edges" in found.nearest.refusal
-    assert found.nearest.score < 0.7
+    assert found.best_refused is not None
+    assert "% of its edges" in found.best_refused.refusal
+    assert found.best_refused.score < 0.7
     nothing = locate(Picture(drawn()), [model_of("bolt")], PartSearch())
-    assert (nothing.parts, nothing.nearest) == ((), None)
+    assert (nothing.parts, nothing.best_refused) == ((), None)
 
 
 @pytest.mark.long

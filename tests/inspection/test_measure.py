@@ -19,21 +19,21 @@ from tests.calibration.sheetkit import CAMERA, SEEN, SIGMA, TARGET, truth
 from tests.calibration.test_sheet import seen, touched
 from tests.inspection.inside import (
     PIXELS,
+    CurveEdges,
     Edge,
     Edges,
     FoundPoint,
-    FoundShape,
     NotMeasuredError,
     NoValueReason,
     Plane,
     Value,
     distance,
-    line_of,
-    plane_of,
-    point_of,
+    fit_line_in_plane,
+    measure_with_calibration,
+    measuring_plane,
+    point_in_plane,
     strip_between,
     width,
-    with_calibration,
 )
 from tests.inspection.measurekit import HOLE, RADIUS, WIDE, plate, program
 
@@ -354,10 +354,12 @@ def exact_pair() -> tuple[FoundPoint, FoundPoint]:
 
 @pytest.mark.long
 def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> None:
-    true = width(*exact_pair(), plane_of(plane(0, 1e-9)))
+    true = width(*exact_pair(), measuring_plane(plane(0, 1e-9)))
     errors, sigmas = [], []
     for seed in range(40):
-        found = with_calibration(lambda one: width(*exact_pair(), one), plane_of(plane(seed)))
+        found = measure_with_calibration(
+            lambda one: width(*exact_pair(), one), measuring_plane(plane(seed))
+        )
         errors.append(found.value - true.value)
         sigmas.append(found.sigma)
     predicted = float(np.sqrt(np.mean(np.square(sigmas)) / np.mean(np.square(errors))))
@@ -369,7 +371,7 @@ def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> Non
 def test_calibration_without_a_known_error_is_remarked() -> None:
     found = fit_plane(GRID[[0, 2, 6]], tilted(GRID)[[0, 2, 6]], model="affine")
     assert found.touch_sigma is None
-    assert plane_of(found).remark == "sigma does not include the touches' error: unknown"
+    assert measuring_plane(found).remark == "sigma does not include the touches' error: unknown"
 
 
 def test_line_that_a_lens_bends_is_straight_in_the_calibrated_plane() -> None:
@@ -379,17 +381,17 @@ def test_line_that_a_lens_bends_is_straight_in_the_calibrated_plane() -> None:
     pixels = CAMERA.project(points @ SEEN.rotation.T + SEEN.translation)
     way = np.gradient(pixels, axis=0)
     normals = way[:, ::-1] * [-1.0, 1.0] / np.linalg.norm(way, axis=1)[:, None]
-    found = FoundShape(Edges(pixels, normals, np.full(25, 0.01)), (), 0.8, 0.0)
-    in_plane = line_of(found, pixels[[0, -1]], plane_of(calibration))
-    in_picture = line_of(found, pixels[[0, -1]], PIXELS)
-    assert in_plane.kept.all()
+    found = CurveEdges(Edges(pixels, normals, np.full(25, 0.01)), (), 0.8, 0.0)
+    in_plane = fit_line_in_plane(found, pixels[[0, -1]], measuring_plane(calibration))
+    in_picture = fit_line_in_plane(found, pixels[[0, -1]], PIXELS)
+    assert in_plane.inliers.all()
     assert np.abs(in_plane.residuals).max() < 1e-6  # millimetres
-    assert in_picture.excess > 3.0 or not in_picture.kept.all()
+    assert in_picture.excess > 3.0 or not in_picture.inliers.all()
 
 
 def test_lengths_on_a_sheet_match_the_paper() -> None:
     calibration = calibrate_sheet(seen(sigma=0.05), touched(SIGMA), camera=CAMERA)
-    flat = plane_of(calibration)
+    flat = measuring_plane(calibration)
     pixels = CAMERA.project(TARGET.points[[0, 8]] @ SEEN.rotation.T + SEEN.translation)
     found = ends_on_sheet(pixels, flat)
     assert abs(found.value - 200.0) < 4 * found.sigma < 2.0
@@ -403,7 +405,9 @@ def ends_on_sheet(pixels: Any, plane: Plane) -> Value:
         FoundPoint(strip, Edge(s * strip.length / 2, nothing, 0, 1e-6, 99.0, 0.8, 0.0, 0.0))
         for s in (-1, 1)
     ]
-    return with_calibration(lambda one: distance(*(point_of(end, one) for end in ends)), plane)
+    return measure_with_calibration(
+        lambda one: distance(*(point_in_plane(end, one) for end in ends)), plane
+    )
 
 
 def wrong_lens(off: Any) -> CameraModel:
@@ -446,13 +450,13 @@ def test_sigma_on_a_sheet_has_the_lens_error_in_it(
             camera=wrong_lens(off),
             lens_covariance=covariance,
         )
-        found = ends_on_sheet(at, plane_of(calibration))
+        found = ends_on_sheet(at, measuring_plane(calibration))
         errors.append(found.value - true)
         sigmas.append(found.sigma)
         unknown = replace(calibration, lens_covariance=None)
         if not seed:
-            without.append(ends_on_sheet(at, plane_of(unknown)).sigma)
-            assert "the lens' error" in plane_of(unknown).remark
+            without.append(ends_on_sheet(at, measuring_plane(unknown)).sigma)
+            assert "the lens' error" in measuring_plane(unknown).remark
     observed = float(np.sqrt(np.mean(np.square(errors))))
     assert least < float(np.sqrt(np.mean(np.square(sigmas)))) / observed < most
     assert without[0] < 0.5 * observed
@@ -461,7 +465,7 @@ def test_sigma_on_a_sheet_has_the_lens_error_in_it(
 def test_place_beyond_the_calibrated_plane_has_a_reason() -> None:
     calibration = calibrate_sheet(seen(), touched(), camera=CAMERA)
     with pytest.raises(NotMeasuredError) as caught:
-        plane_of(calibration).points(np.array([[-50.0, 10.0]]))
+        measuring_plane(calibration).map_points(np.array([[-50.0, 10.0]]))
     assert caught.value.why is NoValueReason.OFF_CALIBRATION
 
 

@@ -254,8 +254,8 @@ def test_noise_of_a_large_picture_is_estimated_from_a_part() -> None:
 def test_misfit_of_an_edge_bounds_its_error() -> None:
     plain = measured(50 + 150 * edge_at(-1))
     odd = measured(50 + 150 * edge_at(-1) - 40 * edge_at(1))  # an edge and, hidden in it, another
-    assert plain.misfit == 0.0
-    assert odd.misfit > 2 * odd.sigma
+    assert plain.model_error == 0.0
+    assert odd.model_error > 2 * odd.sigma
 
 
 def test_brightness_that_falls_off_hardly_moves_an_edge() -> None:
@@ -281,10 +281,10 @@ def test_strips_turn_with_their_direction() -> None:
 
 def test_places_in_a_strip_match_its_points() -> None:
     strips = Strips(MIDDLE[None], AHEAD[None], 20.0, 6.0)
-    along, beside = np.array([[3.0, -4.0]]), np.array([[1.0, 2.5]])
-    back = strips.places(strips.points(along, beside))
+    along, across = np.array([[3.0, -4.0]]), np.array([[1.0, 2.5]])
+    back = strips.coordinates_of(strips.points(along, across))
     assert np.allclose(back[0], along)
-    assert np.allclose(back[1], beside)
+    assert np.allclose(back[1], across)
 
 
 def test_strips_with_too_many_pixels_are_refused_at_once() -> None:

@@ -9,14 +9,14 @@ import pytest
 
 from tests.inspection.inside import (
     PIXELS,
+    CurveEdges,
     Edges,
-    FoundShape,
     NotMeasuredError,
     NoValueReason,
-    circle_of,
     fit_circle,
+    fit_circle_in_plane,
     fit_line,
-    line_of,
+    fit_line_in_plane,
 )
 from tests.inspection.rendering import Array
 
@@ -45,9 +45,9 @@ def test_outliers_of_a_line_are_reported_and_do_not_move_it(wrong: int) -> None:
         out = random.choice(20, wrong, replace=False)
         offsets[out] += random.choice([-1.0, 1.0], wrong) * random.uniform(0.2, 6.0, wrong)
         fit = fit_line(on_line(offsets), AHEAD)
-        assert not fit.kept[out].any()
-        assert fit.kept.sum() >= 20 - wrong - 2
-        assert abs(fit.shape.at[1] - 50) < 0.03
+        assert not fit.inliers[out].any()
+        assert fit.inliers.sum() >= 20 - wrong - 2
+        assert abs(fit.curve.middle[1] - 50) < 0.03
 
 
 @pytest.mark.parametrize("wrong", [1, 4, 10])
@@ -58,24 +58,26 @@ def test_outliers_of_a_circle_are_reported_and_do_not_move_it(wrong: int) -> Non
         out = random.choice(24, wrong, replace=False)
         offsets[out] += random.choice([-1.0, 1.0], wrong) * random.uniform(0.2, 6.0, wrong)
         fit = fit_circle(on_circle(offsets))
-        assert not fit.kept[out].any()
-        assert abs(fit.shape.radius - 40) < 0.03
+        assert not fit.inliers[out].any()
+        assert abs(fit.curve.radius - 40) < 0.03
 
 
 def test_edges_on_two_lines_agree_on_none() -> None:
     offsets = np.where(np.arange(24) % 3 == 0, 0.0, np.where(np.arange(24) % 3 == 1, 4.0, 8.0))
     offsets = offsets + np.random.default_rng(1).normal(0, 0.01, 24)
     with pytest.raises(NotMeasuredError) as caught:
-        line_of(FoundShape(on_line(offsets), (), 0.8, 0.0), np.array([[0, 50], [9, 50]]), PIXELS)
+        fit_line_in_plane(
+            CurveEdges(on_line(offsets), (), 0.8, 0.0), np.array([[0, 50], [9, 50]]), PIXELS
+        )
     assert caught.value.why is NoValueReason.NO_AGREEMENT
 
 
 def test_part_that_is_rougher_than_the_noise_keeps_its_edges_and_has_a_larger_sigma() -> None:
     offsets = np.random.default_rng(1).normal(0, 0.1, 40)
     fit = fit_line(on_line(offsets, sigma=0.01), AHEAD)
-    assert fit.kept.sum() >= 36
+    assert fit.inliers.sum() >= 36
     assert fit.excess == pytest.approx(10, rel=0.3)
-    assert math.sqrt(fit.shape.covariance[0, 0]) == pytest.approx(0.1 / math.sqrt(40), rel=0.3)
+    assert math.sqrt(fit.curve.covariance[0, 0]) == pytest.approx(0.1 / math.sqrt(40), rel=0.3)
 
 
 @pytest.mark.parametrize(
@@ -88,9 +90,9 @@ def test_sigmas_of_a_line_and_a_circle_are_true(count: int, within: float) -> No
         random = np.random.default_rng(seed)
         fit = fit_line(on_line(random.normal(0, 0.01, 12)), AHEAD)
         line.append(
-            (fit.shape.at[1] - 50) / math.sqrt(fit.shape.offset_variance(np.array([50.0, 50])))
+            (fit.curve.middle[1] - 50) / math.sqrt(fit.curve.offset_variance(np.array([50.0, 50])))
         )
-        round_ = fit_circle(on_circle(random.normal(0, 0.01, 16), arc=100.0)).shape
+        round_ = fit_circle(on_circle(random.normal(0, 0.01, 16), arc=100.0)).curve
         circle.append((round_.radius - 40) / math.sqrt(round_.covariance[2, 2]))
     assert np.std(line) == pytest.approx(1.0, abs=within)
     assert np.std(circle) == pytest.approx(1.0, abs=within)
@@ -98,16 +100,16 @@ def test_sigmas_of_a_line_and_a_circle_are_true(count: int, within: float) -> No
 
 def test_line_runs_the_way_that_was_asked_for() -> None:
     edges = on_line(np.zeros(8))
-    assert fit_line(edges, AHEAD).shape.direction @ AHEAD > 0.99
-    assert fit_line(edges, -AHEAD).shape.direction @ AHEAD < -0.99
+    assert fit_line(edges, AHEAD).curve.direction @ AHEAD > 0.99
+    assert fit_line(edges, -AHEAD).curve.direction @ AHEAD < -0.99
 
 
 def test_rotated_line_has_the_same_offset_variance() -> None:
     edges = on_line(np.random.default_rng(1).normal(0, 0.01, 12))
-    one, other = fit_line(edges, AHEAD).shape, fit_line(edges, -AHEAD).shape
+    one, other = fit_line(edges, AHEAD).curve, fit_line(edges, -AHEAD).curve
     for place in (np.array([-50.0, 40.0]), np.array([180.0, 60.0])):
         assert one.offset_variance(place) == pytest.approx(other.offset_variance(place))
-    assert one.offset_variance(np.array([180.0, 50.0])) > 4 * one.offset_variance(one.at)
+    assert one.offset_variance(np.array([180.0, 50.0])) > 4 * one.offset_variance(one.middle)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
@@ -127,18 +129,18 @@ def test_edges_at_one_place_are_refused() -> None:
 def test_straight_edges_are_no_circle() -> None:
     edges = on_line(np.random.default_rng(1).normal(0, 0.01, 12))
     with pytest.raises(NotMeasuredError) as caught:
-        circle_of(FoundShape(edges, (), 0.8, 0.0), PIXELS)
+        fit_circle_in_plane(CurveEdges(edges, (), 0.8, 0.0), PIXELS)
     assert caught.value.why is NoValueReason.UNCERTAIN
 
 
 def test_arc_that_is_too_short_for_its_radius_is_refused() -> None:
     edges = on_circle(np.random.default_rng(1).normal(0, 0.05, 12), arc=12.0, sigma=0.05)
     with pytest.raises(NotMeasuredError) as caught:
-        circle_of(FoundShape(edges, (), 0.8, 0.0), PIXELS)
+        fit_circle_in_plane(CurveEdges(edges, (), 0.8, 0.0), PIXELS)
     assert caught.value.why is NoValueReason.UNCERTAIN
 
 
 def test_common_error_of_all_edges_is_not_averaged() -> None:
     edges = on_circle(np.random.default_rng(1).normal(0, 0.01, 24))
-    found = circle_of(FoundShape(edges, (), 0.8, 0.2), PIXELS).shape
+    found = fit_circle_in_plane(CurveEdges(edges, (), 0.8, 0.2), PIXELS).curve
     assert math.sqrt(found.covariance[2, 2]) == pytest.approx(0.2, rel=0.01)

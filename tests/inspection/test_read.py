@@ -20,7 +20,7 @@ from smartcam.inspection._read.ladder import CONFIRMED_KINDS, RUNGS
 from smartcam.inspection._read.patterns import TextPattern, TooLongError
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
-from tests.inspection.inside import ReadSettings, ReadTool, elements, formats_of, read_codes
+from tests.inspection.inside import ReadSettings, ReadTool, formats_of, read_codes, split_elements
 from tests.inspection.proofs import codes
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def test_elements_of_gs1_come_apart(tmp_path: Path) -> None:
 def test_element_strings_are_cut_by_their_lengths(
     text: str, expected: list[tuple[str, str]]
 ) -> None:
-    assert list(elements(text)) == expected
+    assert list(split_elements(text)) == expected
 
 
 @pytest.mark.parametrize("degrees", [0, 20, 90, 200])

@@ -37,7 +37,7 @@ def test_load_of_too_long_a_text_is_refused() -> None:
     "text", ["a: &a [*a]", "a: &a {b: *a}", "a: &a\n  <<: *a", "&a [*a, [*a]]"]
 )
 def test_load_of_what_contains_itself_is_refused(text: str) -> None:
-    with pytest.raises(BadYamlError, match="an alias of what it stands in"):
+    with pytest.raises(BadYamlError, match="an alias of a value that contains this alias"):
         load(text)
 
 
@@ -114,13 +114,13 @@ def test_scenario_with_many_mistakes_tells_some(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[object] = []
-    meant = yaml_files._meant
+    meant = yaml_files._field_hint
 
     def counted(*given: Any) -> str:
         asked.append(given)
         return meant(*given)
 
-    monkeypatch.setattr(yaml_files, "_meant", counted)
+    monkeypatch.setattr(yaml_files, "_field_hint", counted)
     path = tmp_path / "a.yaml"
     path.write_text("".join(f"no{n}: 1\n" for n in range(500)))
     with pytest.raises(ConfigurationError, match="no0"):

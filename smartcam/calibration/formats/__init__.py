@@ -1,6 +1,6 @@
 """Read and write other programs' transforms, samples of hand-eye calibrations, and poses over time.
 
-Our own files are in ``calibration/_files``.
+``calibration/_files`` reads and writes smartcam's own files.
 
 ::
 
@@ -8,8 +8,8 @@ Our own files are in ``calibration/_files``.
     camera = read_transform("handeye.calib", "easy_handeye2")
     pose = pose_from("kuka", [400, 120, 35.5, 90, 0, 180])
 
-``TRANSFORMS``, ``SAMPLES`` and ``TRAJECTORIES`` are the tables of formats; those of
-cameras are in ``_cameras.py`` (:func:`read_cameras`). To add a format, add a row with a function
+``TRANSFORMS``, ``SAMPLES`` and ``TRAJECTORIES`` are the tables of formats; ``_cameras.py`` has the
+table of cameras' formats, for :func:`read_cameras`. To add a format, add a row with a function
 that parses and one that composes. Nothing that is read is trusted until it has been checked: size,
 depth, every number and every rotation.
 """
@@ -31,8 +31,13 @@ from smartcam.calibration.formats._cameras import (
     write_camera_info,
     write_cameras,
 )
-from smartcam.calibration.formats._file_format import MAX_FILE_BYTES, MAX_YAML_BYTES, Format, named
-from smartcam.calibration.formats._plain import frame_name, known
+from smartcam.calibration.formats._file_format import (
+    MAX_FILE_BYTES,
+    MAX_YAML_BYTES,
+    Format,
+    ignore_names,
+)
+from smartcam.calibration.formats._plain import frame_name, look_up
 from smartcam.calibration.formats._planes import plane_frame
 from smartcam.calibration.formats._robots import pose_from, pose_to
 from smartcam.calibration.formats._samples import HandEyeSample
@@ -66,45 +71,60 @@ __all__ = [
 ]
 
 
-def _arguments(title: str, compose: Callable[..., str], **options: bool) -> Format[Transform]:
-    """Return a format of command-line arguments; all of them are read in the same way."""
-    return Format(title, ".txt", named(ros.parse_arguments), partial(compose, **options))
+def _arguments_format(
+    title: str, compose: Callable[..., str], **options: bool
+) -> Format[Transform]:
+    """Return a format of command-line arguments; all these formats are read in the same way."""
+    return Format(title, ".txt", ignore_names(ros.parse_arguments), partial(compose, **options))
 
 
-def _easy(
-    name: str, of: str, suffix: str, parse: Callable[[str], Transform], compose: Callable[..., str]
+def _handeye_formats(
+    name: str,
+    program: str,
+    suffix: str,
+    parse: Callable[[str], Transform],
+    compose: Callable[..., str],
 ) -> dict[str, Format[Transform]]:
     """Return a program's two formats: one for a fixed camera, one for a camera on the robot."""
-    carried = partial(compose, in_hand=True)
+    compose_in_hand = partial(compose, in_hand=True)
     return {
-        name: Format(f"{name}, {of}: a camera that stands", suffix, named(parse), compose),
+        name: Format(
+            f"{name}, {program}: a camera that stands", suffix, ignore_names(parse), compose
+        ),
         f"{name}_in_hand": Format(
-            f"{name}, {of}: a camera that the robot carries", suffix, named(parse), carried
+            f"{name}, {program}: a camera that the robot carries",
+            suffix,
+            ignore_names(parse),
+            compose_in_hand,
         ),
     }
 
 
 TRANSFORMS: Mapping[str, Format[Transform]] = {
-    "tf": _arguments(
+    "tf": _arguments_format(
         "arguments of ROS 1, tf: quaternion, period", ros.compose_positions, period=True
     ),
-    "tf_ypr": _arguments(
+    "tf_ypr": _arguments_format(
         "the same with yaw, pitch and roll", ros.compose_positions, angles=True, period=True
     ),
-    "tf2": _arguments("arguments of ROS 1, tf2_ros: quaternion", ros.compose_positions),
-    "tf2_ypr": _arguments("the same with yaw, pitch and roll", ros.compose_positions, angles=True),
-    "ros2": _arguments("arguments of ROS 2, tf2_ros: quaternion", ros.compose_options),
-    "ros2_ypr": _arguments("the same with yaw, pitch and roll", ros.compose_options, angles=True),
+    "tf2": _arguments_format("arguments of ROS 1, tf2_ros: quaternion", ros.compose_positions),
+    "tf2_ypr": _arguments_format(
+        "the same with yaw, pitch and roll", ros.compose_positions, angles=True
+    ),
+    "ros2": _arguments_format("arguments of ROS 2, tf2_ros: quaternion", ros.compose_options),
+    "ros2_ypr": _arguments_format(
+        "the same with yaw, pitch and roll", ros.compose_options, angles=True
+    ),
     "ros_industrial": Format(
         "pose of ROS-Industrial's calibration, without names of frames",
         ".yaml",
         ros.parse_pose,
         ros.compose_pose,
     ),
-    **_easy(
+    **_handeye_formats(
         "easy_handeye", "ROS 1", ".yaml", handeye.parse_easy_handeye, handeye.compose_easy_handeye
     ),
-    **_easy(
+    **_handeye_formats(
         "easy_handeye2",
         "ROS 2",
         ".calib",
@@ -131,19 +151,19 @@ SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
     "moveit": Format(
         "samples of MoveIt's hand-eye solver, JSON",
         ".json",
-        named(samples.parse_json),
+        ignore_names(samples.parse_json),
         samples.compose_json,
-        most=MAX_FILE_BYTES,
+        max_bytes=MAX_FILE_BYTES,
     ),
     "moveit_yaml": Format(
         "samples of MoveIt's hand-eye panel, YAML",
         ".yaml",
-        named(samples.parse_yaml),
+        ignore_names(samples.parse_yaml),
         samples.compose_yaml,
-        most=MAX_YAML_BYTES,
+        max_bytes=MAX_YAML_BYTES,
     ),
 }
-"""Formats of samples of a hand-eye calibration; they have no names of frames."""
+"""Formats of samples of a hand-eye calibration; these formats have no names of frames."""
 
 TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
     "asl": Format(
@@ -151,28 +171,27 @@ TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_asl,
-        most=MAX_FILE_BYTES,
+        max_bytes=MAX_FILE_BYTES,
     ),
     "euroc": Format(
         "EuRoC: nanoseconds, the quaternion's real part first",
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_euroc,
-        most=MAX_FILE_BYTES,
+        max_bytes=MAX_FILE_BYTES,
     ),
 }
-"""Formats of poses over time; both are read in the same way, since the file's header decides."""
+"""Formats of poses over time; both are read in the same way: the file's header tells them apart."""
 
 _MATRIX: Format[PlaneMatrix] = Format(
     "matrix of a plane calibration",
     ".yaml",
-    named(opencv.parse_matrix),
+    ignore_names(opencv.parse_matrix),
     opencv.compose_matrix,
 )
 
 
-# ---------------------------------------------------------------------- a reader and a writer for
-# each kind of value
+# ---------------------------------------------------------------------- readers and writers
 
 
 def read_transform(
@@ -190,8 +209,8 @@ def read_transform(
         form: name of the format, such as ``tf2``.
         target: the frame that the transform leads to, for a format that does not name it.
         source: the frame that the transform comes from, for a format that does not name it.
-        unit: unit of the file's lengths; None for the unit that the file or its format says. A bare
-            matrix and OpenCV's files say none.
+        unit: unit of the file's lengths; None for the unit that the file or its format names. A
+            bare matrix and OpenCV's files name none.
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``; ``MALFORMED``: the file does not have the format, or
@@ -201,11 +220,11 @@ def read_transform(
         MissingExtraError: PyYAML is not installed.
         OSError: the file cannot be read.
     """
-    return known(TRANSFORMS, form).read(path, target, source, unit=unit)
+    return look_up(TRANSFORMS, form).read(path, target, source, unit=unit)
 
 
 def write_transform(path: str | os.PathLike[str], form: str, transform: Transform) -> None:
-    """Write a transform; the file is written whole, or left as it was.
+    """Write a transform; if this fails, the file stays as it was.
 
     Args:
         path: the file.
@@ -216,7 +235,7 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
         CalibrationError: ``UNKNOWN_FORMAT``; ``BAD_NAME``: a frame's name that the format cannot
             hold; ``NOT_WRITTEN``: the file cannot be written.
     """
-    known(TRANSFORMS, form).write(path, transform)
+    look_up(TRANSFORMS, form).write(path, transform)
 
 
 def read_samples(
@@ -227,17 +246,17 @@ def read_samples(
     Their frames are called base, effector, camera and object. Errors are those of
     :func:`read_transform`.
     """
-    return known(SAMPLES, form).read(path, unit=unit)
+    return look_up(SAMPLES, form).read(path, unit=unit)
 
 
 def write_samples(path: str | os.PathLike[str], form: str, values: Sequence[HandEyeSample]) -> None:
-    """Write samples; the file is written whole, or left as it was.
+    """Write samples; if this fails, the file stays as it was.
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``; ``WRONG_FRAME``: samples are between different frames,
             whose names the file cannot hold; ``NOT_WRITTEN``: the file cannot be written.
     """
-    known(SAMPLES, form).write(path, values)
+    look_up(SAMPLES, form).write(path, values)
 
 
 def read_trajectory(
@@ -253,17 +272,17 @@ def read_trajectory(
     Times are rounded to the nearest microsecond. Arguments and errors are those of
     :func:`read_transform`, and ``BAD_TIME``.
     """
-    return known(TRAJECTORIES, form).read(path, target, source, unit=unit)
+    return look_up(TRAJECTORIES, form).read(path, target, source, unit=unit)
 
 
 def write_trajectory(path: str | os.PathLike[str], form: str, values: Sequence[Transform]) -> None:
-    """Write poses over time; the file is written whole, or left as it was.
+    """Write poses over time; if this fails, the file stays as it was.
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``, ``WRONG_FRAME``; ``BAD_TIME``: a pose has no time;
             ``NOT_WRITTEN``: the file cannot be written.
     """
-    known(TRAJECTORIES, form).write(path, values)
+    look_up(TRAJECTORIES, form).write(path, values)
 
 
 def read_matrix(path: str | os.PathLike[str]) -> PlaneMatrix:
@@ -279,7 +298,7 @@ def read_matrix(path: str | os.PathLike[str]) -> PlaneMatrix:
 
 
 def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = None) -> str:
-    """Return the text of a file with a plane calibration's frame, its scale in a comment.
+    """Return the text of a file with a plane calibration's frame; a comment has the scale.
 
     Args:
         form: name of the format, such as ``tf2``.
@@ -290,16 +309,18 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
         CalibrationError: ``UNKNOWN_FORMAT``, ``NOT_SIMILAR``; ``BAD_NAME``: a frame's name that the
             format cannot hold, or ``suffix`` is not the format's.
     """
-    wanted = known(TRANSFORMS, form)
-    if suffix not in {None, wanted.suffix}:
+    file_format = look_up(TRANSFORMS, form)
+    if suffix not in {None, file_format.suffix}:
         raise Code.BAD_NAME.unexpected(
-            f"format {form}: expected a name that ends in {wanted.suffix}", wanted.suffix, suffix
+            f"format {form}: expected a name that ends in {file_format.suffix}",
+            file_format.suffix,
+            suffix,
         )
     transform, scale = plane_frame(calibration)
     for name in (transform.target, transform.source):
-        frame_name(name, "frame")  # the comment must be able to hold it
+        frame_name(name, "frame")  # the comment must be able to hold this name
     comment = (
         f"# multiply coordinates of {transform.source} by {scale!r} to have metres, then apply "
         f"{transform.label}\n"
     )
-    return wanted.head + comment + wanted.text(transform)
+    return file_format.head + comment + file_format.to_text(transform)

@@ -24,22 +24,22 @@ from smartcam.calibration._files.store import replace_file
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration.formats import _foreign as foreign
 from smartcam.calibration.formats._file_format import MAX_FILE_BYTES as MAX_MRCAL_BYTES
-from smartcam.calibration.formats._file_format import Format, Measured
+from smartcam.calibration.formats._file_format import Format, UnscaledValue
 from smartcam.calibration.formats._opencv import HEAD, load_storage, storage_matrix
 from smartcam.calibration.formats._plain import (
     Plain,
-    flow,
-    known,
+    as_list,
+    as_mapping,
+    as_whole_number,
+    flow_list,
     lens_matrix,
     load_yaml,
+    look_up,
     malformed_error,
-    mapping,
     matrix_rows,
-    quoted,
-    rigid,
-    sequence,
+    quote,
+    rigid_transform,
     stored_matrix,
-    whole,
 )
 from smartcam.geometry import CameraModel
 from smartcam.geometry._inside import COEFFICIENTS, Code, check_size
@@ -60,7 +60,7 @@ CameraForm: TypeAlias = Literal[
 """Names of the formats."""
 
 MAX_FILE_BYTES: Final = 1 << 20
-"""A file has at most this many bytes; a chain of eight cameras has four thousand."""
+"""Largest number of bytes of a file; a chain of eight cameras has four thousand."""
 
 _KALIBR: Final[dict[DistortionModel, str]] = {"plumb_bob": "radtan", "equidistant": "equidistant"}
 _RADTAN: Final = 4
@@ -72,7 +72,7 @@ _MATRICES: Final = (("M1", "D1"), ("M2", "D2"))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraChain:
-    """Cameras, each with its pose relative to the one before.
+    """Cameras, each with its pose relative to the camera before.
 
     Attributes:
         cameras: the lenses, one or more.
@@ -135,10 +135,10 @@ def read_cameras(
         form: ``camera_info`` and ``ros_ini`` (ROS), ``kalibr``, ``opencv`` (YAML or XML),
             ``euroc`` (``sensor.yaml``), ``mrcal`` (``.cameramodel``), ``colmap``
             (``cameras.txt``), ``basalt`` or ``multical`` (``calibration.json``).
-        size: width and height of the cameras' images, pixels, for a file that does not say it, such
-            as OpenCV's ``intrinsics.yml``; if a file says it, it must be the same.
+        size: width and height of the cameras' images, pixels, for a file without the size, such as
+            OpenCV's ``intrinsics.yml``; if a file has the size, it must be the same.
         unit: unit of the lengths between cameras; None for the unit that the file or its format
-            says. Those of OpenCV and multical say none.
+            names. Files of OpenCV and multical name none.
         extrinsics: the second file of OpenCV's sample ``stereo_calib``, with R and T.
 
     Raises:
@@ -148,16 +148,16 @@ def read_cameras(
         MissingExtraError: PyYAML is not installed.
         OSError: the file cannot be read.
     """
-    wanted = known(FORMS, form, "format of cameras")
+    file_format = look_up(FORMS, form, "format of cameras")
     if size is not None:
         check_size(size, "read_cameras")
     if extrinsics is None:
-        return wanted.read(path, size, unit=unit)
+        return file_format.read(path, size, unit=unit)
     if form != "opencv":
         raise _unsupported_error(form, "one file", "extrinsics as well")
     with Path(extrinsics).open("rb") as stream:
-        more = stream.read(MAX_FILE_BYTES + 1).decode("utf-8", "replace")
-    return wanted.read(path, size, more, unit=unit)
+        extrinsics_text = stream.read(MAX_FILE_BYTES + 1).decode("utf-8", "replace")
+    return file_format.read(path, size, extrinsics_text, unit=unit)
 
 
 def write_cameras(path: str | os.PathLike[str], form: CameraForm, chain: CameraChain) -> None:
@@ -172,7 +172,7 @@ def write_cameras(path: str | os.PathLike[str], form: CameraForm, chain: CameraC
         CalibrationError: ``SHAPE``: the format cannot hold this number of cameras, or such a lens;
             ``UNKNOWN_FORMAT``; ``NOT_WRITTEN``: the file cannot be written.
     """
-    known(FORMS, form, "format of cameras").write(path, chain)
+    look_up(FORMS, form, "format of cameras").write(path, chain)
 
 
 def write_camera_info(
@@ -190,8 +190,8 @@ def write_camera_info(
         camera: the lens.
         name: name of the camera.
         rectification: (3, 3), as from :meth:`StereoCalibration.rectify`; None for no rectification.
-        projection: (3, 4), pixels and, for the right camera, pixels times metres; None for that of
-            the lens without its distortion.
+        projection: (3, 4), pixels and, for the right camera, pixels times metres; None for the
+            projection of the lens without its distortion.
 
     Raises:
         CalibrationError: ``NOT_WRITTEN``: the file cannot be written.
@@ -214,23 +214,23 @@ def compose_camera_info(
     Source: ROS, ``camera_calibration_parsers`` (published). ``cols`` of the coefficients is their
     number; readers that expect five misread files of eight (image_pipeline #278).
     """
-    straight = np.column_stack([camera.matrix, np.zeros(3)])
+    undistorted = np.column_stack([camera.matrix, np.zeros(3)])
     return (
         f"image_width: {camera.size[0]}\n"
         f"image_height: {camera.size[1]}\n"
-        f"camera_name: {quoted(name)}\n"
+        f"camera_name: {quote(name)}\n"
         + _ros_matrix("camera_matrix", camera.matrix)
         + f"distortion_model: {camera.distortion_model}\n"
         + _ros_matrix("distortion_coefficients", camera.distortion[None])
         + _ros_matrix("rectification_matrix", np.eye(3) if rectification is None else rectification)
-        + _ros_matrix("projection_matrix", straight if projection is None else projection)
+        + _ros_matrix("projection_matrix", undistorted if projection is None else projection)
     )
 
 
 def _ros_matrix(name: str, matrix: Array) -> str:
     return (
         f"{name}:\n  rows: {matrix.shape[0]}\n  cols: {matrix.shape[1]}\n"
-        f"  data: {flow(matrix.ravel())}\n"
+        f"  data: {flow_list(matrix.ravel())}\n"
     )
 
 
@@ -240,7 +240,7 @@ def parse_camera_info(text: str, size: tuple[int, int] | None = None) -> CameraI
     Raises ``MALFORMED``, ``NOT_FINITE``, ``SHAPE``; MissingExtraError: PyYAML is not installed.
     """
     needed = ["camera_matrix", "distortion_model", "distortion_coefficients"]
-    data = mapping(load_yaml(text), "file", needed)
+    data = as_mapping(load_yaml(text), "file", needed)
     matrix = stored_matrix(data["camera_matrix"], "camera_matrix", (3, 3))
     rectification, projection = np.eye(3), np.column_stack([matrix, np.zeros(3)])
     if "rectification_matrix" in data:
@@ -248,22 +248,22 @@ def parse_camera_info(text: str, size: tuple[int, int] | None = None) -> CameraI
     if "projection_matrix" in data:
         projection = stored_matrix(data["projection_matrix"], "projection_matrix", (3, 4))
     coefficients = stored_matrix(data["distortion_coefficients"], "distortion_coefficients").ravel()
-    model = _model(data["distortion_model"], coefficients)
+    model = _parse_model(data["distortion_model"], coefficients)
     stated = [data[key] for key in ("image_width", "image_height") if key in data]
-    camera = _camera(_size(stated, size), matrix, coefficients, model)
+    camera = _make_camera(_choose_size(stated, size), matrix, coefficients, model)
     name = data.get("camera_name", "camera")
     if not isinstance(name, str):
         raise malformed_error("camera_name", "a text", name)
     return CameraInfo(camera, name, rectification, projection)
 
 
-def _compose_one(chain: CameraChain) -> str:
+def _compose_single(chain: CameraChain) -> str:
     if len(chain.cameras) != 1:
         raise _unsupported_error("camera_info", "one camera", f"{len(chain.cameras)}")
     return compose_camera_info(chain.cameras[0], chain.names[0])
 
 
-def _parse_one(text: str, size: tuple[int, int] | None = None) -> CameraChain:
+def _parse_single(text: str, size: tuple[int, int] | None = None) -> CameraChain:
     info = parse_camera_info(text, size)
     return CameraChain(cameras=(info.camera,), names=(info.name,))
 
@@ -281,25 +281,25 @@ def compose_camchain(chain: CameraChain) -> str:
         CalibrationError: ``SHAPE``: a lens has k3, or a model that Kalibr does not have.
     """
     text = ""
-    for number_, (camera, name) in enumerate(zip(chain.cameras, chain.names, strict=True)):
+    for index, (camera, name) in enumerate(zip(chain.cameras, chain.names, strict=True)):
         text += (
-            f"cam{number_}:\n"
+            f"cam{index}:\n"
             "  camera_model: pinhole\n"
-            f"  intrinsics: {flow(camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])}\n"
+            f"  intrinsics: {flow_list(camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])}\n"
             f"  distortion_model: {_KALIBR.get(camera.distortion_model, '')}\n"
-            f"  distortion_coeffs: {flow(_of_kalibr(camera))}\n"
+            f"  distortion_coeffs: {flow_list(_kalibr_coefficients(camera))}\n"
         )
-        if number_:
-            motion = chain.transforms[number_ - 1]
+        if index:
+            motion = chain.transforms[index - 1]
             text += "  T_cn_cnm1:\n"
-            text += "".join(f"  - {flow(row)}\n" for row in matrix_rows(motion))
+            text += "".join(f"  - {flow_list(row)}\n" for row in matrix_rows(motion))
         text += f"  resolution: [{camera.size[0]}, {camera.size[1]}]\n"
-        text += f"  rostopic: {quoted(f'/{name}/image_raw')}\n"
+        text += f"  rostopic: {quote(f'/{name}/image_raw')}\n"
     return text
 
 
-def _of_kalibr(camera: CameraModel) -> Array:
-    """Return the coefficients that Kalibr has."""
+def _kalibr_coefficients(camera: CameraModel) -> Array:
+    """Return the coefficients of a lens in Kalibr's model."""
     if camera.distortion_model not in _KALIBR:
         raise _unsupported_error("kalibr", " or ".join(_KALIBR), camera.distortion_model)
     if camera.distortion[_RADTAN:].any():
@@ -325,7 +325,7 @@ def compose_opencv(chain: CameraChain) -> str:
     first = chain.cameras[0]
     head = (
         f"{HEAD}image_width: {first.size[0]}\nimage_height: {first.size[1]}\n"
-        f"distortion_model: {quoted(first.distortion_model)}\n"
+        f"distortion_model: {quote(first.distortion_model)}\n"
         f"fisheye_model: {int(first.distortion_model == 'equidistant')}\n"
         'unit: "m"\n'
     )
@@ -337,11 +337,11 @@ def compose_opencv(chain: CameraChain) -> str:
         )
     if len(chain.cameras) > len(_MATRICES):
         raise _unsupported_error("opencv", "one camera or two", f"{len(chain.cameras)}")
-    alike, *others = (
+    first_kind, *others = (
         f"{camera.size} pixels and {camera.distortion_model}" for camera in chain.cameras
     )
-    if any(other != alike for other in others):
-        raise _unsupported_error("opencv", f"cameras of {alike}", others[0])
+    if any(other != first_kind for other in others):
+        raise _unsupported_error("opencv", f"cameras of {first_kind}", others[0])
     motion = chain.transforms[0]
     return (
         head
@@ -357,29 +357,36 @@ def compose_opencv(chain: CameraChain) -> str:
 
 def parse_opencv(
     text: str, size: tuple[int, int] | None = None, extrinsics: str = ""
-) -> Measured[CameraChain]:
+) -> UnscaledValue[CameraChain]:
     """Return the cameras of a file of OpenCV's calibration samples and tutorials, YAML or XML.
 
-    Names are read in any case, with or without ``_``. If the file does not name the model, it is
-    ``equidistant`` with ``fisheye_model: 1``, ``rational_polynomial`` of eight coefficients if one
-    beyond the fifth is not 0, and else ``plumb_bob``. ``extrinsics``: the text of the file with R
-    and T.
+    Names are read in any case, with or without ``_``. If the file does not name the model, the
+    model is ``equidistant`` if the file has ``fisheye_model: 1``, ``rational_polynomial`` if there
+    are eight coefficients or one beyond the fifth is not 0, and else ``plumb_bob``. ``extrinsics``:
+    the text of the file with R and T.
 
     Raises:
         CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID``, ``SHAPE``, ``WRONG_SIZE``.
         MissingExtraError: PyYAML is not installed.
     """
-    data = _normal(load_storage(text))
+    data = _normalize_names(load_storage(text))
     if extrinsics:
-        data = {**_normal(load_storage(extrinsics)), **data}
-    sides = next((ends for ends in _ENDS if _first(data, _MATRIX, ends[0])), None)
+        data = {**_normalize_names(load_storage(extrinsics)), **data}
+    endings = next(
+        (
+            endings_of_pair
+            for endings_of_pair in _NAME_ENDINGS
+            if _first_value(data, _MATRIX_NAMES, endings_of_pair[0])
+        ),
+        None,
+    )
     stated = [data[key] for key in ("imagewidth", "imageheight") if key in data]
-    both = _first(data, ("imagesize", "size"), "", [])
-    size = _size(stated or sequence(both, "image_size"), size)
-    if sides is None:
+    image_size = _first_value(data, ("imagesize", "size"), "", [])
+    size = _choose_size(stated or as_list(image_size, "image_size"), size)
+    if endings is None:
         camera = _opencv_camera(data, size, "")
-        return Measured(CameraChain(cameras=(camera,), names=("camera",)), "m")
-    cameras = tuple(_opencv_camera(data, size, end) for end in sides)
+        return UnscaledValue(CameraChain(cameras=(camera,), names=("camera",)), "m")
+    cameras = tuple(_opencv_camera(data, size, ending) for ending in endings)
     if not {"r", "t"} <= data.keys():
         raise malformed_error(
             "file",
@@ -391,21 +398,28 @@ def parse_opencv(
     if len(shift) != 3:
         raise malformed_error("T", "3 numbers", str(len(shift)))
     rows = [*np.column_stack([rotation, shift]), [0.0, 0.0, 0.0, 1.0]]
-    motion = rigid("right", "left", rows, "R")
+    motion = rigid_transform("right", "left", rows, "R")
     chain = CameraChain(cameras=cameras, transforms=(motion,), names=("left", "right"))
-    return Measured(chain, data.get("unit"))
+    return UnscaledValue(chain, data.get("unit"))
 
 
-_MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "k", "m")
-_BENT: Final = ("distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distortion", "d")
-_ENDS: Final = (("1", "2"), ("left", "right"), ("l", "r"))
+_MATRIX_NAMES: Final = ("cameramatrix", "intrinsicmatrix", "k", "m")
+_DISTORTION_NAMES: Final = (
+    "distortioncoefficients",
+    "distcoeffs",
+    "distcoeff",
+    "distcoefs",
+    "distortion",
+    "d",
+)
+_NAME_ENDINGS: Final = (("1", "2"), ("left", "right"), ("l", "r"))
 """Endings of the names of matrices and coefficients that distinguish two cameras."""
 
 
-def _normal(data: Plain) -> dict[str, Plain]:
-    """Return a mapping with its names in lower case and without ``_``."""
+def _normalize_names(data: Plain) -> dict[str, Plain]:
+    """Return a mapping whose names are changed to lower case, without ``_``."""
     normal: dict[str, Plain] = {}
-    for name, value in mapping(data, "file").items():
+    for name, value in as_mapping(data, "file").items():
         key = name.lower().replace("_", "")
         if key in normal:
             raise malformed_error("file", "each name once", name)
@@ -413,48 +427,58 @@ def _normal(data: Plain) -> dict[str, Plain]:
     return normal
 
 
-def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain = None) -> Plain:
-    """Return the value of the first name that is there."""
-    return next((data[f"{name}{end}"] for name in names if f"{name}{end}" in data), other)
+def _first_value(
+    data: dict[str, Plain], names: Sequence[str], ending: str, other: Plain = None
+) -> Plain:
+    """Return the value of the first name that the mapping has, or ``other``."""
+    return next((data[f"{name}{ending}"] for name in names if f"{name}{ending}" in data), other)
 
 
-def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> CameraModel:
-    for names in (_MATRIX, _BENT):
-        if _first(data, names, end) is None:
-            expected = f"{names[0]}{end} (or {', '.join(f'{name}{end}' for name in names[1:])})"
+def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], ending: str) -> CameraModel:
+    for names in (_MATRIX_NAMES, _DISTORTION_NAMES):
+        if _first_value(data, names, ending) is None:
+            expected = (
+                f"{names[0]}{ending} (or {', '.join(f'{name}{ending}' for name in names[1:])})"
+            )
             raise malformed_error("file", expected, ", ".join(data))
-    matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
-    coefficients = stored_matrix(_first(data, _BENT, end), f"coefficients {end}".rstrip()).ravel()
+    matrix = stored_matrix(
+        _first_value(data, _MATRIX_NAMES, ending), f"camera matrix {ending}".rstrip(), (3, 3)
+    )
+    coefficients = stored_matrix(
+        _first_value(data, _DISTORTION_NAMES, ending), f"coefficients {ending}".rstrip()
+    ).ravel()
     name = data.get("distortionmodel")
     if name is None:
-        many = len(coefficients) == 8 or coefficients[5:].any()
-        name = "rational_polynomial" if many else "plumb_bob"
+        is_rational = len(coefficients) == 8 or coefficients[5:].any()
+        name = "rational_polynomial" if is_rational else "plumb_bob"
         if data.get("fisheyemodel") == "1":
             name = "equidistant"
-    return _camera(size, matrix, coefficients, _model(name, coefficients))
+    return _make_camera(size, matrix, coefficients, _parse_model(name, coefficients))
 
 
-# ---------------------------------------------------------------------- all
+# ---------------------------------------------------------------------- table of formats
 
 
-def _form(
+def _camera_format(
     name: CameraForm,
-    parse: Callable[..., CameraChain | Measured[CameraChain]],
+    parse: Callable[..., CameraChain | UnscaledValue[CameraChain]],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    return Format(title=name, suffix=".yaml", parse=parse, compose=compose, most=MAX_FILE_BYTES)
+    return Format(
+        title=name, suffix=".yaml", parse=parse, compose=compose, max_bytes=MAX_FILE_BYTES
+    )
 
 
-def _foreign(
+def _foreign_format(
     name: CameraForm,
-    parse: Callable[[str], foreign.Found],
+    parse: Callable[[str], foreign.FoundLenses],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
     """Return a format for a parser that returns lenses in the units of the file."""
 
-    def read(
-        text: str, given: tuple[int, int] | None = None
-    ) -> CameraChain | Measured[CameraChain]:
+    def parse_chain(
+        text: str, given_size: tuple[int, int] | None = None
+    ) -> CameraChain | UnscaledValue[CameraChain]:
         lenses, transforms, unit = parse(text)
         if not 1 <= len(lenses) <= foreign.MAX_CAMERAS:
             raise malformed_error("file", f"1 to {foreign.MAX_CAMERAS} cameras", str(len(lenses)))
@@ -462,25 +486,27 @@ def _foreign(
             raise malformed_error("file", "one camera, since it has no poses", str(len(lenses)))
         cameras = []
         for lens in lenses:
-            matrix, size = lens_matrix(*lens.focal), _size(lens.size or [], given)
-            cameras.append(_camera(size, matrix, np.array(lens.coefficients), lens.model))
+            matrix, size = lens_matrix(*lens.focal), _choose_size(lens.size or [], given_size)
+            cameras.append(_make_camera(size, matrix, np.array(lens.coefficients), lens.model))
         names = tuple(lens.name for lens in lenses)
         chain = CameraChain(cameras=tuple(cameras), transforms=tuple(transforms), names=names)
-        return chain if unit == foreign.BY_FORMAT else Measured(chain, unit)
+        return chain if unit == foreign.METRES_BY_FORMAT else UnscaledValue(chain, unit)
 
-    return _form(name, read, compose)
+    return _camera_format(name, parse_chain, compose)
 
 
 FORMS: Final[Mapping[str, Format[CameraChain]]] = {
-    "camera_info": _form("camera_info", _parse_one, _compose_one),
-    "kalibr": _foreign("kalibr", foreign.parse_camchain, compose_camchain),
-    "opencv": _form("opencv", parse_opencv, compose_opencv),
-    "ros_ini": _foreign("ros_ini", foreign.parse_ros_ini),
-    "euroc": _foreign("euroc", foreign.parse_euroc),
-    "mrcal": dataclasses.replace(_foreign("mrcal", foreign.parse_mrcal), most=MAX_MRCAL_BYTES),
-    "colmap": _foreign("colmap", foreign.parse_colmap),
-    "basalt": _foreign("basalt", foreign.parse_basalt),
-    "multical": _foreign("multical", foreign.parse_multical),
+    "camera_info": _camera_format("camera_info", _parse_single, _compose_single),
+    "kalibr": _foreign_format("kalibr", foreign.parse_camchain, compose_camchain),
+    "opencv": _camera_format("opencv", parse_opencv, compose_opencv),
+    "ros_ini": _foreign_format("ros_ini", foreign.parse_ros_ini),
+    "euroc": _foreign_format("euroc", foreign.parse_euroc),
+    "mrcal": dataclasses.replace(
+        _foreign_format("mrcal", foreign.parse_mrcal), max_bytes=MAX_MRCAL_BYTES
+    ),
+    "colmap": _foreign_format("colmap", foreign.parse_colmap),
+    "basalt": _foreign_format("basalt", foreign.parse_basalt),
+    "multical": _foreign_format("multical", foreign.parse_multical),
 }
 """Formats of cameras by their names."""
 
@@ -491,29 +517,29 @@ def _unsupported_error(form: str, expected: str, actual: str) -> CalibrationErro
     )
 
 
-def _size(stated: Sequence[Plain], given: tuple[int, int] | None) -> tuple[int, int]:
-    """Return width and height, pixels, from those in the file and those that the user gives."""
+def _choose_size(stated: Sequence[Plain], given_size: tuple[int, int] | None) -> tuple[int, int]:
+    """Return width and height, pixels: the file's, or those that the user gives."""
     if not stated:
-        if given is None:
+        if given_size is None:
             raise Code.WRONG_SIZE.refusal(
                 "file: expected width and height of the images, which it lacks; give them "
                 "as size=(width, height), pixels",
                 "size=(width, height)",
             )
-        return int(given[0]), int(given[1])
+        return int(given_size[0]), int(given_size[1])
     width, height = (
-        whole(length, "size of the images") for length in sequence([*stated], "size", 2)
+        as_whole_number(length, "size of the images") for length in as_list([*stated], "size", 2)
     )
-    if given is not None and (width, height) != tuple(given):
+    if given_size is not None and (width, height) != tuple(given_size):
         raise Code.WRONG_SIZE.refusal(
-            f"size: the file says {width} x {height}, got {given[0]} x {given[1]}",
+            f"size: the file says {width} x {height}, got {given_size[0]} x {given_size[1]}",
             (width, height),
-            tuple(given),
+            tuple(given_size),
         )
     return width, height
 
 
-def _model(name: Plain, coefficients: Array) -> DistortionModel:
+def _parse_model(name: Plain, coefficients: Array) -> DistortionModel:
     for model in COEFFICIENTS:
         if model == name:
             return model
@@ -522,13 +548,13 @@ def _model(name: Plain, coefficients: Array) -> DistortionModel:
     raise malformed_error("distortion_model", ", ".join(COEFFICIENTS), name)
 
 
-def _camera(
+def _make_camera(
     size: tuple[int, int], matrix: Array, coefficients: Array, model: DistortionModel
 ) -> CameraModel:
-    """Return a lens; missing coefficients at the end are taken as 0, surplus ones must be 0."""
+    """Return a lens; missing coefficients at the end are 0, and surplus coefficients must be 0."""
     count = COEFFICIENTS[model]
-    short = {"plumb_bob": {0, 4}}.get(model, {0})
-    if len(coefficients) in short:
+    short_counts = {"plumb_bob": {0, 4}}.get(model, {0})
+    if len(coefficients) in short_counts:
         coefficients = np.concatenate([coefficients, np.zeros(count - len(coefficients))])
     if len(coefficients) > count and not coefficients[count:].any():
         coefficients = coefficients[:count]

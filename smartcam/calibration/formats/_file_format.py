@@ -1,4 +1,4 @@
-"""Read files of other programs within a bound, and write them whole or not at all."""
+"""Read files of other programs up to a size, and write files whole or not at all."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_TEXT_BYTES = 1 << 16
-"""A file with one pose has at most this many bytes; usual ones have some hundred."""
+"""Largest number of bytes of a file with one pose; usual files have some hundred bytes."""
 
 MAX_YAML_BYTES = 1 << 18
-"""A YAML file with samples has at most this many bytes, which hold some 400 samples. PyYAML may
-take seconds for it."""
+"""Largest number of bytes of a YAML file with samples: some 400 samples. PyYAML may take seconds
+for such a file."""
 
 MAX_FILE_BYTES = 1 << 24
-"""A JSON or CSV file has at most this many bytes: a ground truth of EuRoC has 6 MB."""
+"""Largest number of bytes of a JSON or CSV file; a ground truth of EuRoC has 6 MB."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Measured(Generic[T]):
-    """A value read from a file whose format does not fix the unit of lengths."""
+class UnscaledValue(Generic[T]):
+    """A value whose lengths are in the file's unit, since its format does not fix a unit."""
 
     value: T
     unit: str | None = None  # unit that the file names, or None
@@ -48,62 +48,62 @@ class Format(Generic[T]):
     title: str  # description for people
     suffix: str  # suffix of the files' names
     # function that parses a text to a value; further arguments: the size for cameras, else the
-    # names of target and source if the format has none. It returns Measured if lengths may be in
-    # any unit, else metres; errors are those of
+    # names of target and source if the format has none. It returns an UnscaledValue if
+    # lengths may be in any unit, else metres; errors are those of
     # :func:`~smartcam.calibration.formats.read_transform`
-    parse: Callable[..., T | Measured[T]]
-    # function that returns a value as text without ``head``; None for a format that is only read.
+    parse: Callable[..., T | UnscaledValue[T]]
+    # function that returns a value as text without ``head``; None: the format is only read.
     # Errors are those of :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
-    compose: Callable[[T], str] | None = None  # None: it is only read
+    compose: Callable[[T], str] | None = None
     head: str = ""  # text at the beginning of each file
-    most: int = MAX_TEXT_BYTES  # largest number of bytes of a file
+    max_bytes: int = MAX_TEXT_BYTES  # largest size of a file
 
     def read(
         self,
         path: str | os.PathLike[str],
-        *given: Any,
+        *parse_arguments: Any,
         unit: str | None = None,
     ) -> T:
         """Read a file; errors are those of ``parse``, and UNIT_UNKNOWN.
 
-        ``unit``: unit of its lengths; None for the unit that the file or its format names.
+        ``unit``: unit of the file's lengths; None for the unit that the file or its format names.
         """
         with Path(path).open("rb") as stream:
-            body = stream.read(self.most + 1)
+            body = stream.read(self.max_bytes + 1)
         try:
-            if len(body) > self.most:
-                raise malformed_error("file", f"{self.most} bytes at most")
+            if len(body) > self.max_bytes:
+                raise malformed_error("file", f"{self.max_bytes} bytes at most")
             try:
                 text = body.decode("utf-8-sig")
             except UnicodeDecodeError as exc:
                 raise malformed_error("file", f"UTF-8 ({exc.reason} at byte {exc.start})") from exc
-            return self._in_metres(self.parse(text, *given), unit)
+            return self._to_metres(self.parse(text, *parse_arguments), unit)
         except CalibrationError as exc:
             raise CalibrationError(
                 f"{path}: {self.title}: {exc}", code=exc.code, expected=exc.expected, got=exc.got
             ) from exc
 
-    def _in_metres(self, parsed: T | Measured[T], unit: str | None) -> T:
-        by_file = isinstance(parsed, Measured)
-        stated = cast("Measured[T]", parsed).unit if by_file else "m"
-        value = cast("Measured[T]", parsed).value if by_file else cast("T", parsed)
-        motions = _motions(value)
+    def _to_metres(self, parsed: T | UnscaledValue[T], unit: str | None) -> T:
+        has_any_unit = isinstance(parsed, UnscaledValue)
+        stated_unit = cast("UnscaledValue[T]", parsed).unit if has_any_unit else "m"
+        value = cast("UnscaledValue[T]", parsed).value if has_any_unit else cast("T", parsed)
+        motions = _find_motions(value)
         if not motions:
             return value
-        if unit is None and stated is None:
+        if unit is None and stated_unit is None:
             raise no_unit_error("lengths")
-        factor = metres_of(unit or stated or "m", "lengths")
-        if unit is None and not by_file:
+        factor = metres_of(unit or stated_unit or "m", "lengths")
+        if unit is None and not has_any_unit:
             for motion in motions:
                 distance = factor * float(np.linalg.norm(motion.translation))
                 check_length(distance, f"distance of {motion.source} from {motion.target}")
-        return value if factor == 1.0 else cast("T", _scaled(value, factor))
+        return value if factor == 1.0 else cast("T", _scale_translations(value, factor))
 
     def write(self, path: str | os.PathLike[str], value: T) -> None:
         """Write a file, whole or not at all; errors are those of ``compose``, and NOT_WRITTEN."""
-        replace_file(Path(path), (self.head + self.text(value)).encode())
+        replace_file(Path(path), (self.head + self.to_text(value)).encode())
 
-    def text(self, value: T) -> str:
+    def to_text(self, value: T) -> str:
         """Return a value as text, without ``head``; raise UNKNOWN_FORMAT if it can only be read."""
         if self.compose is None:
             raise Code.UNKNOWN_FORMAT.refusal(
@@ -113,26 +113,28 @@ class Format(Generic[T]):
         return self.compose(value)
 
 
-def _motions(value: Any) -> list[Transform]:
+def _find_motions(value: Any) -> list[Transform]:
     """Return all motions in a file's value: a motion, nested lists of motions, or a chain."""
     if isinstance(value, Transform):
         return [value]
     if isinstance(value, (list, tuple)):
-        return [motion for item in value for motion in _motions(item)]
-    return _motions(getattr(value, "transforms", ()))
+        return [motion for item in value for motion in _find_motions(item)]
+    return _find_motions(getattr(value, "transforms", ()))
 
 
-def _scaled(value: Any, factor: float) -> Any:
+def _scale_translations(value: Any, factor: float) -> Any:
     """Return a file's value with all translations multiplied by a factor."""
     if isinstance(value, Transform):
         return dataclasses.replace(value, translation=factor * value.translation)
     if isinstance(value, tuple) and hasattr(value, "_replace"):
-        return type(value)(*(_scaled(item, factor) for item in value))
+        return type(value)(*(_scale_translations(item, factor) for item in value))
     if isinstance(value, (list, tuple)):
-        return type(value)(_scaled(item, factor) for item in value)
-    return dataclasses.replace(value, transforms=_scaled(value.transforms, factor))
+        return type(value)(_scale_translations(item, factor) for item in value)
+    return dataclasses.replace(value, transforms=_scale_translations(value.transforms, factor))
 
 
-def named(parse: Callable[[str], T | Measured[T]]) -> Callable[..., T | Measured[T]]:
-    """Return a parser for a format that names its frames itself, or has none."""
+def ignore_names(
+    parse: Callable[[str], T | UnscaledValue[T]],
+) -> Callable[..., T | UnscaledValue[T]]:
+    """Return a parser that ignores given names of frames: the format names them, or has none."""
     return lambda text, *_names: parse(text)

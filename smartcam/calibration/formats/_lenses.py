@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats._cameras import CameraForm
     from smartcam.geometry import Transform
 
-HEAD_BYTES: Final = 1 << 16
-"""The beginning of a file, this many bytes, decides which format it has."""
+BEGINNING_BYTES: Final = 1 << 16
+"""Number of bytes at a file's beginning in which the format is recognized."""
 
 FORMAT_PATTERNS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
     "euroc": re.compile(rb"^sensor_type\s*:\s*camera", re.MULTILINE),
@@ -46,7 +46,7 @@ class StoredLenses(NamedTuple):
 
     Attributes:
         names: names of the cameras.
-        lenses: lens of each camera, with everything that the file has about it.
+        lenses: lens of each camera, with all that the file has about this lens.
         transforms: ``T_1_0``, ... between neighbours; empty for a single camera.
     """
 
@@ -63,7 +63,7 @@ def read_lenses(
 ) -> StoredLenses:
     """Return the lenses of a file; its contents show the format.
 
-    It may be a calibration of a lens, of a pair or of a camera on a robot, or have a format of
+    The file is a calibration of a lens, of a pair or of a camera on a robot, or has a format of
     :func:`read_cameras`, which explains ``size`` and ``unit``.
 
     Raises:
@@ -74,14 +74,14 @@ def read_lenses(
         OSError: the file cannot be read.
     """
     with Path(path).open("rb") as stream:
-        head = stream.read(HEAD_BYTES)
-    for form, mark in FORMAT_PATTERNS.items():
-        if mark.search(head):
+        beginning = stream.read(BEGINNING_BYTES)
+    for form, pattern in FORMAT_PATTERNS.items():
+        if pattern.search(beginning):
             cameras = read_cameras(path, form, size=size, unit=unit)
             lenses = tuple(Lens(camera) for camera in cameras.cameras)
             return StoredLenses(cameras.names, lenses, cameras.transforms)
-    if head.lstrip().startswith(b"{"):
-        return _ours(path)
+    if beginning.lstrip().startswith(b"{"):
+        return _read_own_file(path)
     raise Code.UNKNOWN_FORMAT.refusal(
         f"{path}: expected a calibration of smartcam, or one of {', '.join(FORMAT_PATTERNS)}; got "
         "none of them",
@@ -89,18 +89,18 @@ def read_lenses(
     )
 
 
-def _of_pair(pair: StereoCalibration) -> StoredLenses:
-    """Return a pair's lenses, each with the places at which it saw the target."""
+def _lenses_of_pair(pair: StereoCalibration) -> StoredLenses:
+    """Return a pair's lenses, each with the points of the targets that it saw."""
     sides = []
-    for number, camera in enumerate((pair.left, pair.right)):
-        seen = [
+    for side, camera in enumerate((pair.left, pair.right)):
+        target_points = [
             fit.transform.apply(view.object_points)
             for fit in pair.pairs
-            for view in ((fit.left, fit.right)[number],)
-            if fit.used[number] and fit.transform is not None and view is not None
+            for view in ((fit.left, fit.right)[side],)
+            if fit.used[side] and fit.transform is not None and view is not None
         ]
-        points = np.concatenate(seen) if seen else None
-        if points is not None and number:
+        points = np.concatenate(target_points) if target_points else None
+        if points is not None and side:
             points = pair.transform.apply(points)
         sides.append(Lens(camera, points=points))
     return StoredLenses(
@@ -108,27 +108,27 @@ def _of_pair(pair: StereoCalibration) -> StoredLenses:
     )
 
 
-def _of_robot(hand: HandEyeCalibration) -> StoredLenses | None:
-    """Return the lens of a camera on a robot; None if it has none."""
+def _lens_on_robot(hand: HandEyeCalibration) -> StoredLenses | None:
+    """Return the lens of a camera on a robot; None: the calibration has no lens."""
     if hand.camera is None:
         return None
-    seen = [
+    target_points = [
         pose.apply(view.object_points)
         for pose, view, used in zip(hand.target_poses, hand.views, hand.used, strict=False)
         if used
     ]
-    points = np.concatenate(seen) if seen else None
+    points = np.concatenate(target_points) if target_points else None
     return StoredLenses(("camera",), (Lens(hand.camera, points=points),))
 
 
-def _ours(path: str | os.PathLike[str]) -> StoredLenses:
+def _read_own_file(path: str | os.PathLike[str]) -> StoredLenses:
     document = read_document(path)
     if document.kind == IntrinsicCalibration.kind:
         return StoredLenses(("camera",), (Lens.of(IntrinsicCalibration.from_data(document.data)),))
     if document.kind == StereoCalibration.kind:
-        return _of_pair(StereoCalibration.from_data(document.data))
+        return _lenses_of_pair(StereoCalibration.from_data(document.data))
     if document.kind == HandEyeCalibration.kind:
-        lenses = _of_robot(HandEyeCalibration.from_data(document.data))
+        lenses = _lens_on_robot(HandEyeCalibration.from_data(document.data))
         if lenses is not None:
             return lenses
     raise Code.WRONG_KIND.refusal(

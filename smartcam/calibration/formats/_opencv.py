@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration.formats._file_format import Measured
+from smartcam.calibration.formats._file_format import UnscaledValue
 from smartcam.calibration.formats._plain import (
     Plain,
-    flow,
+    as_mapping,
+    flow_list,
+    format_real,
     frame_name,
     load_yaml,
     malformed_error,
-    mapping,
     matrix_rows,
-    quoted,
-    real,
-    rigid,
+    quote,
+    rigid_transform,
     stored_matrix,
 )
 from smartcam.calibration.formats._xml import load_xml, storage_data
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 HEAD = "%YAML:1.0\n---\n"
-"""Beginning of OpenCV's files; its readers need ``%YAML`` there."""
+"""Beginning of OpenCV's files; OpenCV's readers need ``%YAML`` there."""
 
 
 def load_storage(text: str) -> Plain:
@@ -74,19 +74,19 @@ class PlaneMatrix(NamedTuple):
 
 
 def compose_matrix(plane: PlaneMatrix, unit: str = "unit") -> str:
-    """Return the matrix of a plane calibration, in YAML that both readers understand.
+    """Return the matrix of a plane calibration, in YAML for OpenCV's and PyYAML's readers.
 
     ``unit``: unit of the camera's coordinates, in words.
     """
     rows = plane.matrix.tolist()
-    values = ",\n    ".join(", ".join(real(value) for value in row) for row in rows)
-    about = f"w (x, y, z, 1) = matrix (u, v, 1), metres; {unit} in"
+    values = ",\n    ".join(", ".join(format_real(value) for value in row) for row in rows)
+    formula = f"w (x, y, z, 1) = matrix (u, v, 1), metres; {unit} in"
     return (
         "%YAML 1.1\n---\n"
-        f"about: {quoted(about)}\n"
-        f"model: {quoted(plane.model)}\n"
-        f"robot_frame: {quoted(plane.robot_frame)}\n"
-        f"camera_frame: {quoted(plane.camera_frame)}\n"
+        f"about: {quote(formula)}\n"
+        f"model: {quote(plane.model)}\n"
+        f"robot_frame: {quote(plane.robot_frame)}\n"
+        f"camera_frame: {quote(plane.camera_frame)}\n"
         f"rows: {len(rows)}\ncols: {len(rows[0])}\n"
         f"data: [\n    {values} ]\n"
     )
@@ -95,7 +95,7 @@ def compose_matrix(plane: PlaneMatrix, unit: str = "unit") -> str:
 def parse_matrix(text: str) -> PlaneMatrix:
     """Return the matrix of a calibration that :func:`compose_matrix` wrote, bit for bit."""
     names = ["model", "robot_frame", "camera_frame"]
-    data = mapping(load_yaml(text), "file", [*names, "rows", "cols", "data"])
+    data = as_mapping(load_yaml(text), "file", [*names, "rows", "cols", "data"])
     for name in names:
         if not isinstance(data[name], str):
             raise malformed_error(name, "a text", data[name])
@@ -109,25 +109,25 @@ def storage_matrix(name: str, matrix: Array) -> str:
     """Return a matrix with its name, in the form of ``cv2.FileStorage``."""
     return (
         f"{name}: !!opencv-matrix\n   rows: {matrix.shape[0]}\n   cols: {matrix.shape[1]}\n"
-        f"   dt: d\n   data: {flow(matrix.ravel())}\n"
+        f"   dt: d\n   data: {flow_list(matrix.ravel())}\n"
     )
 
 
 def compose_transform(transform: Transform) -> str:
     """Return a transform as a (4, 4) ``!!opencv-matrix``, without :data:`HEAD`."""
     return (
-        f"target: {quoted(frame_name(transform.target, 'target'))}\n"
-        f"source: {quoted(frame_name(transform.source, 'source'))}\n"
+        f"target: {quote(frame_name(transform.target, 'target'))}\n"
+        f"source: {quote(frame_name(transform.source, 'source'))}\n"
         'unit: "m"\n' + storage_matrix("transform", np.array(matrix_rows(transform)))
     )
 
 
-def parse_transform(text: str, target: str, source: str) -> Measured[Transform]:
+def parse_transform(text: str, target: str, source: str) -> UnscaledValue[Transform]:
     """Return the only (4, 4) matrix of a file of OpenCV, whatever its name.
 
-    ``target`` and ``source`` are the frames, if the file does not name them.
+    ``target`` and ``source``: names of the frames if the file does not name them.
     """
-    data = mapping(load_storage(text), "file")
+    data = as_mapping(load_storage(text), "file")
     names = [
         name
         for name, entry in data.items()
@@ -136,8 +136,10 @@ def parse_transform(text: str, target: str, source: str) -> Measured[Transform]:
     if len(names) != 1:
         raise malformed_error("file", "one matrix of 4 rows and 4 cols", ", ".join(names) or "none")
     rows = stored_matrix(data[names[0]], names[0], (4, 4))
-    frames = [
+    frame_names = [
         frame_name(data.get(key, given), key)
         for key, given in (("target", target), ("source", source))
     ]
-    return Measured(rigid(frames[0], frames[1], rows, names[0]), data.get("unit"))
+    return UnscaledValue(
+        rigid_transform(frame_names[0], frame_names[1], rows, names[0]), data.get("unit")
+    )

@@ -1,9 +1,9 @@
 """Parse texts of other programs into plain data, within bounds and without guessing types.
 
 Scalars stay texts, as they are in the file. YAML gives texts many meanings (a time, a number to the
-base 60, ``1e-05`` as a string), and programs differ in which of them they support; :func:`number`
-and :func:`flag` read the forms that all of them share. Anything else raises a CalibrationError,
-``MALFORMED`` if no other code is named.
+base 60, ``1e-05`` as a string), and programs differ in the meanings that they support.
+:func:`as_number` and :func:`as_flag` read only the forms that all programs share. Anything else
+raises a CalibrationError, ``MALFORMED`` if no other code is named.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Plain: TypeAlias = Any
-"""A text, a list of them or a mapping to them, to any depth; checked where it is used."""
+"""A text, or nested lists and mappings of texts; each use checks the type."""
 
 POSE: tuple[str, ...] = ("x", "y", "z", "qx", "qy", "qz", "qw")
-"""Names of the numbers of :func:`row` in most formats."""
+"""Names of the numbers of :func:`pose_numbers` in most formats."""
 
 MAX_DEPTH = 16
-"""Lists in a file are nested at most this deep; those of poses five deep."""
+"""Largest depth of nested lists in a file; poses need a depth of five."""
 
 MAX_NUMBER = 1e9
-"""Largest number of a pose, in metres or any other unit: no robot is farther away, and its square
-is still finite."""
+"""Largest number of a pose, in metres or any other unit: no robot is farther away, and the square
+of this number is still finite."""
 
 MAX_SIDE = 1_000_000
 """Largest side of an image, pixels, and largest number of rows or columns of a matrix."""
@@ -58,19 +58,19 @@ same bound."""
 
 def malformed_error(label: str, expected: str, actual: object = None) -> CalibrationError:
     """Return the error for a text that does not have its format; ``actual`` is shortened."""
-    shown = None if actual is None else _cut(actual)
+    shown = None if actual is None else _shorten(actual)
     text = f"{label}: expected {expected}" + ("" if shown is None else f", got {shown}")
     return Code.MALFORMED.refusal(text, expected, shown)
 
 
-def within(where: str, error: CalibrationError) -> CalibrationError:
-    """Return the error with its place in the file added."""
+def add_place(where: str, error: CalibrationError) -> CalibrationError:
+    """Return the error with a place in the file added to its text."""
     return CalibrationError(
         f"{where}: {error}", code=error.code, expected=error.expected, got=error.got
     )
 
 
-def known(table: Mapping[str, T], name: str, label: str = "format") -> T:
+def look_up(table: Mapping[str, T], name: str, label: str = "format") -> T:
     """Return a table's value for a name; raise ``UNKNOWN_FORMAT`` if there is none."""
     if not isinstance(name, str) or name not in table:
         raise Code.UNKNOWN_FORMAT.refusal(
@@ -79,7 +79,7 @@ def known(table: Mapping[str, T], name: str, label: str = "format") -> T:
     return table[name]
 
 
-def _cut(value: object) -> str:
+def _shorten(value: object) -> str:
     """Return a short text for a value from a file, however large it is."""
     if isinstance(value, (dict, list)):
         kind = "mapping" if isinstance(value, dict) else "list"
@@ -109,12 +109,12 @@ def load_yaml(text: str) -> Plain:
         text = text.partition("\n")[2]
     try:
         root = compose(text, label="reading YAML")
-        return None if root is None else _plain(root, set(), 0)
+        return None if root is None else _as_plain(root, set(), 0)
     except BadYamlError as exc:
-        raise malformed_error("file", f"YAML ({_cut(str(exc))})") from exc
+        raise malformed_error("file", f"YAML ({_shorten(str(exc))})") from exc
 
 
-def _plain(node: Any, seen: set[int], depth: int) -> Plain:
+def _as_plain(node: Any, seen: set[int], depth: int) -> Plain:
     line = f"line {node.start_mark.line + 1}"
     if node.id == "scalar":
         return str(node.value)
@@ -122,18 +122,18 @@ def _plain(node: Any, seen: set[int], depth: int) -> Plain:
         raise malformed_error(line, f"no alias, and at most {MAX_DEPTH} lists in lists")
     seen.add(id(node))
     if node.id == "sequence":
-        return [_plain(item, seen, depth + 1) for item in node.value]
+        return [_as_plain(item, seen, depth + 1) for item in node.value]
     plain: dict[str, Plain] = {}
     for key, value in node.value:
         name = str(key.value) if key.id == "scalar" else ""
         if not name or name in plain:
             raise malformed_error(line, "keys that are texts, each once", name)
-        plain[name] = _plain(value, seen, depth + 1)
+        plain[name] = _as_plain(value, seen, depth + 1)
     return plain
 
 
-def mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Plain]:
-    """Return a value that must be a mapping with these keys; it may have others."""
+def as_mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Plain]:
+    """Return a value that must be a mapping with these keys; other keys are allowed."""
     if not isinstance(value, dict):
         raise malformed_error(where, "a mapping", value)
     fields = cast("dict[str, Plain]", value)
@@ -143,55 +143,55 @@ def mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Pla
     return fields
 
 
-def sequence(value: Plain, where: str, count: int | None = None) -> list[Plain]:
-    """Return a value that must be a list, of ``count`` items if that is given."""
+def as_list(value: Plain, where: str, count: int | None = None) -> list[Plain]:
+    """Return a value that must be a list, of ``count`` items unless None."""
     items: list[Plain] | None = value if isinstance(value, list) else None
     if items is None or count not in {None, len(items)}:
         raise malformed_error(where, "a list" if count is None else f"a list of {count}", value)
     return items
 
 
-def number(value: Plain, where: str) -> float:
+def as_number(value: Plain, where: str) -> float:
     """Return a number of at most :data:`MAX_NUMBER`.
 
     Raises ``MALFORMED``, or ``NOT_FINITE`` for NaN, infinity and larger numbers.
     """
     text = value if isinstance(value, str) else ""
-    read = math.nan if _NOT_FINITE.fullmatch(text) else None
+    parsed = math.nan if _NOT_FINITE.fullmatch(text) else None
     if len(text) <= _MAX_SHOWN and _NUMBER.fullmatch(text):
-        read = float(text)
-    if read is None:
+        parsed = float(text)
+    if parsed is None:
         raise malformed_error(where, "a number", value)
-    if not abs(read) <= MAX_NUMBER:
+    if not abs(parsed) <= MAX_NUMBER:
         raise Code.NOT_FINITE.refusal(
-            f"{where}: expected a number of at most {MAX_NUMBER:g}, got {_cut(text)}",
+            f"{where}: expected a number of at most {MAX_NUMBER:g}, got {_shorten(text)}",
             MAX_NUMBER,
             text,
         )
-    return read
+    return parsed
 
 
-def reals(value: Plain, where: str, count: int | None = None) -> list[float]:
-    """Return the numbers of a list, of ``count`` if that is given."""
-    return [number(item, where) for item in sequence(value, where, count)]
+def as_numbers(value: Plain, where: str, count: int | None = None) -> list[float]:
+    """Return the numbers of a value that must be a list, of ``count`` items unless None."""
+    return [as_number(item, where) for item in as_list(value, where, count)]
 
 
-def matrix_of(value: Plain, where: str, shape: tuple[int, int]) -> Array:
+def as_matrix(value: Plain, where: str, shape: tuple[int, int]) -> Array:
     """Return a matrix that is stored as a list of rows."""
-    rows = sequence(value, where, shape[0])
-    return np.array([reals(line, where, shape[1]) for line in rows]).reshape(shape)
+    rows = as_list(value, where, shape[0])
+    return np.array([as_numbers(line, where, shape[1]) for line in rows]).reshape(shape)
 
 
 def stored_matrix(value: Plain, where: str, shape: tuple[int, int] | None = None) -> Array:
-    """Return a matrix stored as ``rows``, ``cols`` and ``data``, of a given shape if any."""
-    data = mapping(value, where, ["rows", "cols", "data"])
-    rows, cols = (whole(data[key], f"{where}.{key}", 0) for key in ("rows", "cols"))
+    """Return a matrix stored as ``rows``, ``cols`` and ``data``; ``shape``: None for any shape."""
+    data = as_mapping(value, where, ["rows", "cols", "data"])
+    rows, cols = (as_whole_number(data[key], f"{where}.{key}", 0) for key in ("rows", "cols"))
     if shape is not None and shape != (rows, cols):
         raise malformed_error(where, f"{shape[0]} rows and {shape[1]} cols", f"{rows} {cols}")
-    return np.array(reals(data["data"], where, rows * cols)).reshape(rows, cols)
+    return np.array(as_numbers(data["data"], where, rows * cols)).reshape(rows, cols)
 
 
-def whole(value: Plain, where: str, least: int = 1) -> int:
+def as_whole_number(value: Plain, where: str, least: int = 1) -> int:
     """Return a whole number of pixels, rows or columns."""
     if not (isinstance(value, str) and value.isdecimal() and len(value) < 8):
         raise malformed_error(where, "a whole number", value)
@@ -205,18 +205,18 @@ def lens_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def numbers(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
-    """Return the numbers of a mapping in the order of ``keys``; it must have no other keys.
+def numbers_by_key(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
+    """Return the numbers of a mapping in the order of ``keys``; other keys are an error.
 
-    ``where``: name of the mapping, for the error.
+    ``where``: name of the mapping in the error.
     """
-    fields = mapping(value, where, keys)
+    fields = as_mapping(value, where, keys)
     if len(fields) != len(keys):
         raise malformed_error(where, f"the keys {', '.join(keys)} alone", ", ".join(fields))
-    return [number(fields[key], f"{where}.{key}") for key in keys]
+    return [as_number(fields[key], f"{where}.{key}") for key in keys]
 
 
-def flag(value: Plain, where: str) -> bool:
+def as_flag(value: Plain, where: str) -> bool:
     """Return a truth value."""
     truth = _FLAGS.get(value.lower()) if isinstance(value, str) else None
     if truth is None:
@@ -234,17 +234,17 @@ def frame_name(value: Plain, where: str) -> str:
         raise Code.BAD_NAME.unexpected(
             f"{where}: expected a frame's name of letters, digits and _ . / + -",
             _NAME.pattern,
-            _cut(value),
+            _shorten(value),
         )
     return value
 
 
-def rigid(
+def rigid_transform(
     target: str, source: str, rows: Sequence[Sequence[float]] | Array, where: str
 ) -> Transform:
-    """Return the transform of a (4, 4) matrix; its rotation may be printed with few decimals.
+    """Return the transform of a (4, 4) matrix, whose rotation may be printed with few decimals.
 
-    Raises ``MALFORMED`` for a wrong last row; ``NOT_RIGID`` if the rest is no rotation.
+    Raises ``MALFORMED`` for a wrong last row; ``NOT_RIGID`` if the matrix has no rotation.
     """
     matrix = np.array(rows, dtype=np.float64)
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_MAX_EXACT_DEVIATION):
@@ -264,12 +264,12 @@ def _nearest_rotation(matrix: Array) -> Array:
     return np.asarray(left @ right, dtype=np.float64)
 
 
-def placed(target: str, source: str, pose: Sequence[float]) -> Transform:
+def transform_of_pose(target: str, source: str, pose: Sequence[float]) -> Transform:
     """Return the transform from the numbers of :data:`POSE`."""
     return Transform.from_quaternion(target, source, pose[:3], pose[3:])
 
 
-def row(transform: Transform) -> list[float]:
+def pose_numbers(transform: Transform) -> list[float]:
     """Return a transform as the numbers of :data:`POSE`, metres."""
     return [*transform.translation.tolist(), *transform.quaternion.tolist()]
 
@@ -283,25 +283,25 @@ def matrix_rows(transform: Transform) -> list[list[float]]:
 # ---------------------------------------------------------------------- writing
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     """Return a text in the quotes of YAML and JSON."""
     return '"{}"'.format(text.replace("\\", "\\\\").replace('"', '\\"'))
 
 
-def real(value: float) -> str:
-    """Return a number in YAML 1.1's form of a real one: with a point, also before an exponent."""
-    mantissa, e, exponent = repr(float(value)).partition("e")
-    if not e:
+def format_real(value: float) -> str:
+    """Return a real number in the form of YAML 1.1: with a point, also before an exponent."""
+    mantissa, exponent_mark, exponent = repr(float(value)).partition("e")
+    if not exponent_mark:
         return mantissa
     sign = "" if exponent.startswith("-") else "+"
     return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}e{sign}{exponent.lstrip('+')}"
 
 
-def flow(values: Sequence[float] | Array) -> str:
+def flow_list(values: Sequence[float] | Array) -> str:
     """Return a YAML list of numbers in one line."""
-    return "[ {} ]".format(", ".join(real(float(value)) for value in values))
+    return "[ {} ]".format(", ".join(format_real(float(value)) for value in values))
 
 
-def block(values: Mapping[str, float], indent: str = "") -> str:
+def block_mapping(values: Mapping[str, float], indent: str = "") -> str:
     """Return a YAML mapping of numbers, one per line."""
-    return "".join(f"{indent}{name}: {real(value)}\n" for name, value in values.items())
+    return "".join(f"{indent}{name}: {format_real(value)}\n" for name, value in values.items())

@@ -22,8 +22,8 @@ class PlaneFrame(NamedTuple):
     Attributes:
         transform: ``T_robot_plane``: the plane's origin is the camera's (0, 0), its x and y are the
             camera's, its z is the plane's normal.
-        scale: metres per unit of the camera's coordinates, which are multiplied by it before the
-            transform is applied: ``transform.apply(scale * (u, v, 0))``.
+        scale: metres per unit of the camera's coordinates. Multiply coordinates by it, then apply
+            the transform: ``transform.apply(scale * (u, v, 0))``.
     """
 
     transform: Transform

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._units import check_angles, check_length, metres_of
-from smartcam.calibration.formats._plain import MAX_NUMBER, known
+from smartcam.calibration.formats._plain import MAX_NUMBER, look_up
 from smartcam.geometry import Transform
 from smartcam.geometry._inside import Code, as_vector, matrix_from_quaternion
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 _MAX_UNIT_DEVIATION: Final = 0.01
-"""A quaternion's length may deviate from 1 by this much, and is then corrected."""
+"""Largest deviation of a quaternion's length from 1; such a length is corrected."""
 
 
 def rotation_zyx(z: float, y: float, x: float) -> Array:
@@ -53,8 +53,8 @@ def rotation_zyx(z: float, y: float, x: float) -> Array:
 def angles_zyx(rotation: Array) -> tuple[float, float, float]:
     """Return z, y, x of :func:`rotation_zyx`, radians; y is within a quarter turn.
 
-    At a quarter turn about y only the sum or difference of the other two is determined; then z is
-    0. Close to it, z is affected by rounding, and x compensates it, so the three angles together
+    At a quarter turn about y, only the sum or difference of z and x is determined; then z is 0.
+    Near a quarter turn, rounding changes z, and x compensates this, so the three angles together
     still give the rotation.
     """
     r = rotation.tolist()
@@ -64,20 +64,20 @@ def angles_zyx(rotation: Array) -> tuple[float, float, float]:
     return z, math.atan2(-r[2][0], cz * r[0][0] + sz * r[1][0]), x
 
 
-def _from_vector(vector: Array) -> Array:
+def _matrix_from_vector(vector: Array) -> Array:
     angle = float(np.linalg.norm(vector))
     share = math.sin(0.5 * angle) / angle if angle > 0 else 0.5
     return matrix_from_quaternion([*(share * vector), math.cos(0.5 * angle)])
 
 
-def _to_vector(pose: Transform) -> list[float]:
+def _vector_from_pose(pose: Transform) -> list[float]:
     x, y, z, w = (pose.quaternion * math.copysign(1.0, pose.quaternion[3])).tolist()
     sine = math.hypot(x, y, z)
     factor = 2.0 * math.atan2(sine, w) / sine if sine > 0 else 2.0
     return [factor * x, factor * y, factor * z]
 
 
-def _from_xyzw(quaternion: Array) -> Array:
+def _matrix_from_xyzw(quaternion: Array) -> Array:
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) < _MAX_UNIT_DEVIATION:
         raise Code.NOT_RIGID.refusal(
@@ -88,35 +88,40 @@ def _from_xyzw(quaternion: Array) -> Array:
     return matrix_from_quaternion(quaternion / length)
 
 
-def _shifted(places: int) -> tuple[Callable[[Array], Array], Callable[[Transform], list[float]]]:
-    """Return the two functions for quaternions whose real part is moved to the front by a place."""
+def _quaternion_converters(
+    real_part_shift: int,
+) -> tuple[Callable[[Array], Array], Callable[[Transform], list[float]]]:
+    """Return two functions for quaternions: from numbers to a matrix, and from a pose to numbers.
+
+    ``real_part_shift``: 1 if the real part is the first number, 0 if it is the last.
+    """
     return (
-        lambda given: _from_xyzw(np.roll(given, -places)),
-        lambda pose: list(map(float, np.roll(pose.quaternion, places))),
+        lambda given: _matrix_from_xyzw(np.roll(given, -real_part_shift)),
+        lambda pose: list(map(float, np.roll(pose.quaternion, real_part_shift))),
     )
 
 
-def _angles(
-    signs: int, order: slice
+def _angle_converters(
+    sign: int, order: slice
 ) -> tuple[Callable[[Array], Array], Callable[[Transform], list[float]]]:
-    """Return the two functions for angles in degrees about z, y and x, in a given order.
+    """Return two functions for angles in degrees: from numbers to a matrix, and from a pose.
 
-    With ``signs`` of -1 the turns are about the moving axes, x first: Rx(a) Ry(b) Rz(c) is the
-    inverse of Rz(-c) Ry(-b) Rx(-a).
+    ``order``: slice that brings the numbers into the order z, y, x. With a ``sign`` of -1 the turns
+    are about the moving axes, x first: Rx(a) Ry(b) Rz(c) is the inverse of Rz(-c) Ry(-b) Rx(-a).
     """
     return (
-        lambda given: _turned(
-            rotation_zyx(*(math.radians(signs * angle) for angle in given.tolist()[order])), signs
+        lambda given: _inverse_if_negative(
+            rotation_zyx(*(math.radians(sign * angle) for angle in given.tolist()[order])), sign
         ),
         lambda pose: [
-            signs * math.degrees(angle)
-            for angle in list(angles_zyx(_turned(pose.rotation, signs)))[order]
+            sign * math.degrees(angle)
+            for angle in list(angles_zyx(_inverse_if_negative(pose.rotation, sign)))[order]
         ],
     )
 
 
-def _turned(rotation: Array, signs: int) -> Array:
-    return rotation if signs > 0 else rotation.T
+def _inverse_if_negative(rotation: Array, sign: int) -> Array:
+    return rotation if sign > 0 else rotation.T
 
 
 class PoseConvention(NamedTuple):
@@ -125,38 +130,39 @@ class PoseConvention(NamedTuple):
     numbers: tuple[str, ...]  # names of the numbers, in order
     metre: float  # number of length units in a metre
     # function that converts the numbers after the position to a rotation (3, 3)
-    rotation: Callable[[Array], Array]
-    orientation: Callable[[Transform], list[float]]  # inverse function, from a pose
+    to_matrix: Callable[[Array], Array]
+    # function that converts a pose to the numbers after the position
+    from_pose: Callable[[Transform], list[float]]
     title: str  # form of the orientation, in words
 
 
 ROBOTS: Mapping[str, PoseConvention] = {
     "ur": PoseConvention(
-        ("x", "y", "z", "rx", "ry", "rz"), 1.0, _from_vector, _to_vector,
+        ("x", "y", "z", "rx", "ry", "rz"), 1.0, _matrix_from_vector, _vector_from_pose,
         "rotation vector, rad: along the axis, as long as the angle",
     ),
     "abb": PoseConvention(
-        ("x", "y", "z", "q1", "q2", "q3", "q4"), 1000.0, *_shifted(1),
+        ("x", "y", "z", "q1", "q2", "q3", "q4"), 1000.0, *_quaternion_converters(1),
         "quaternion, its real part q1 first",
     ),
     "kuka": PoseConvention(
-        ("x", "y", "z", "a", "b", "c"), 1000.0, *_angles(1, slice(None)),
+        ("x", "y", "z", "a", "b", "c"), 1000.0, *_angle_converters(1, slice(None)),
         "degrees: Rz(a) Ry(b) Rx(c)",
     ),
     "fanuc": PoseConvention(
-        ("x", "y", "z", "w", "p", "r"), 1000.0, *_angles(1, slice(None, None, -1)),
+        ("x", "y", "z", "w", "p", "r"), 1000.0, *_angle_converters(1, slice(None, None, -1)),
         "degrees: Rz(r) Ry(p) Rx(w)",
     ),
     "meca500": PoseConvention(
-        ("x", "y", "z", "alpha", "beta", "gamma"), 1000.0, *_angles(-1, slice(None, None, -1)),
-        "degrees, mobile XYZ: Rx(alpha) Ry(beta) Rz(gamma)",
+        ("x", "y", "z", "alpha", "beta", "gamma"), 1000.0, *_angle_converters(-1, slice(None, None,
+        -1)), "degrees, mobile XYZ: Rx(alpha) Ry(beta) Rz(gamma)",
     ),
     "xyzw": PoseConvention(
-        ("x", "y", "z", "qx", "qy", "qz", "qw"), 1.0, *_shifted(0),
+        ("x", "y", "z", "qx", "qy", "qz", "qw"), 1.0, *_quaternion_converters(0),
         "quaternion, its real part last",
     ),
     "wxyz": PoseConvention(
-        ("x", "y", "z", "qw", "qx", "qy", "qz"), 1.0, *_shifted(1),
+        ("x", "y", "z", "qw", "qx", "qy", "qz"), 1.0, *_quaternion_converters(1),
         "quaternion, its real part first",
     ),
 }  # fmt: skip
@@ -179,7 +185,7 @@ def pose_from(
         values: numbers of the pose in the convention's order and units.
         target: name of the frame in which the pose is given.
         source: name of the frame whose pose is given.
-        unit: unit of the position; None for the controller's.
+        unit: unit of the position; None for the controller's unit.
 
     Returns:
         ``T_target_source``, metres.
@@ -190,7 +196,7 @@ def pose_from(
             the length of the quaternion is more than 1 % off; ``UNIT_UNKNOWN``: the position is
             farther than 20 m without a ``unit``, or a rotation vector has more than a turn.
     """
-    convention = known(ROBOTS, robot, "robot's convention")
+    convention = look_up(ROBOTS, robot, "robot's convention")
     label = f"pose of {robot} ({', '.join(convention.numbers)})"
     given = as_vector(values, len(convention.numbers), label)
     if not np.abs(given).max() <= MAX_NUMBER:
@@ -204,7 +210,7 @@ def pose_from(
         position = given[:3] * metres_of(unit, label)
     if robot == "ur":
         check_angles([float(np.linalg.norm(given[3:]))], label)
-    return Transform(target, source, convention.rotation(given[3:]), position)
+    return Transform(target, source, convention.to_matrix(given[3:]), position)
 
 
 def pose_to(robot: str, pose: Transform) -> list[float]:
@@ -215,13 +221,13 @@ def pose_to(robot: str, pose: Transform) -> list[float]:
         pose: ``T_base_tool``, metres.
 
     Returns:
-        The convention's numbers, in its units. Angles are within half a turn, those about y of
-        ``kuka``, ``fanuc`` and ``meca500`` within a quarter turn; a rotation vector is at most pi
-        long; a quaternion has the sign that makes its largest element positive.
+        The convention's numbers, in its units. Angles are within half a turn; the angles about y
+        of ``kuka``, ``fanuc`` and ``meca500`` are within a quarter turn. A rotation vector is at
+        most pi long. A quaternion has the sign that makes its largest element positive.
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``.
     """
-    convention = known(ROBOTS, robot, "robot's convention")
+    convention = look_up(ROBOTS, robot, "robot's convention")
     position: list[float] = (convention.metre * pose.translation).tolist()
-    return position + convention.orientation(pose)
+    return position + convention.from_pose(pose)

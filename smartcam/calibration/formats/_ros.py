@@ -1,8 +1,8 @@
 """Read and write arguments of ROS' ``static_transform_publisher`` and poses of ROS-Industrial.
 
-Three programs have that name. The arguments of the one in ROS 1's ``tf`` end with a period in
-milliseconds, those of ``tf2_ros`` do not, and ROS 2's takes options. Each knows quaternions, and
-yaw, pitch and roll: ``Rz(yaw) Ry(pitch) Rx(roll)``, radians.
+Three programs have that name. The arguments of ROS 1's ``tf`` end with a period in milliseconds,
+the arguments of ROS 1's ``tf2_ros`` do not, and ROS 2's program takes options. Each program accepts
+quaternions, and yaw, pitch and roll: ``Rz(yaw) Ry(pitch) Rx(roll)``, radians.
 
 Source: wiki.ros.org/tf, section 6.3; github.com/ros2/geometry2,
 ``static_transform_broadcaster_program.cpp``; github.com/moveit/moveit_calibration,
@@ -22,17 +22,17 @@ import numpy as np
 from smartcam.calibration._units import check_angles
 from smartcam.calibration.formats._plain import (
     POSE,
-    block,
+    as_list,
+    as_mapping,
+    as_number,
+    as_numbers,
+    block_mapping,
     frame_name,
     load_yaml,
     malformed_error,
-    mapping,
-    number,
-    numbers,
-    placed,
-    reals,
-    row,
-    sequence,
+    numbers_by_key,
+    pose_numbers,
+    transform_of_pose,
 )
 from smartcam.calibration.formats._robots import angles_zyx, rotation_zyx
 from smartcam.calibration.formats._xml import load_xml
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PERIOD_MS = 100
-"""Period of the messages of ``tf``, milliseconds; its documents call 100 a good value."""
+"""Period of the messages of ``tf``, milliseconds; the documents of ``tf`` call 100 a good value."""
 
 _COMMAND = "static_transform_publisher"
 _PYTHON = re.compile(r"^(?:from|import) [a-z]", re.MULTILINE)
@@ -55,31 +55,31 @@ _FRAMES = ("--frame-id", "--child-frame-id")
 def parse_arguments(text: str) -> Transform:
     """Return the transform that ``static_transform_publisher`` would send.
 
-    ``text``: its arguments, with the command in front of them or without; ``#`` begins a comment.
-    It may also be a launch file with one such node: XML of ROS 1 or 2, or ROS 2's Python, which is
-    read as text and not run. Raises ``MALFORMED`` if the number of arguments is wrong, an option is
-    unknown, or the arguments have two possible meanings.
+    ``text``: the program's arguments, with or without the command before them; ``#`` begins a
+    comment. The text may also be a launch file with one such node: XML of ROS 1 or 2, or ROS 2's
+    Python, which is read as text and not run. Raises ``MALFORMED`` if the number of arguments is
+    wrong, an option is unknown, or the arguments have two possible meanings.
     """
     if text.lstrip().startswith("<"):
-        text = _from_launch(text)
+        text = _launch_arguments(text)
     elif _PYTHON.search(text):
-        return _from_words(_from_python(text))
+        return _parse_words(_python_arguments(text))
     try:
         words = shlex.split(text, comments=True)
     except ValueError as exc:
         raise malformed_error("arguments", f"words as on a command line ({exc})") from exc
-    return _from_words(words)
+    return _parse_words(words)
 
 
-def _from_words(words: list[str]) -> Transform:
+def _parse_words(words: list[str]) -> Transform:
     if _COMMAND in words:
         words = words[words.index(_COMMAND) + 1 :]
     if any(word.startswith("--") for word in words):
-        return _from_options(words)
-    return _from_positions(words)
+        return _parse_options(words)
+    return _parse_positional(words)
 
 
-def _from_launch(text: str) -> str:
+def _launch_arguments(text: str) -> str:
     """Return the arguments of the one publisher in a launch file."""
     nodes = [node.attrib for node in load_xml(text.strip()).iter("node")]
     arguments = [
@@ -92,7 +92,7 @@ def _from_launch(text: str) -> str:
     return arguments[0]
 
 
-def _from_python(text: str) -> list[str]:
+def _python_arguments(text: str) -> list[str]:
     """Return the arguments of the one publisher in a launch file of Python, which is not run."""
     try:
         tree = ast.parse(text)
@@ -120,13 +120,13 @@ def _from_python(text: str) -> list[str]:
         raise malformed_error(
             "arguments", "texts and numbers, no variables or calls", "others"
         ) from exc
-    return [str(word) for word in sequence(words, "arguments")]
+    return [str(word) for word in as_list(words, "arguments")]
 
 
 def parse_urdf(text: str, target: str, source: str) -> Transform:
-    """Return the origin of a joint of a robot's description: its child's pose in its parent.
+    """Return the origin of a joint of a robot's description: the child's pose in the parent.
 
-    If there are several joints, the one from ``target`` to ``source`` is taken.
+    If there are several joints, the joint from ``target`` to ``source`` is used.
     """
     joints = {}
     for joint in load_xml(text.strip()).iter("joint"):
@@ -140,13 +140,13 @@ def parse_urdf(text: str, target: str, source: str) -> Transform:
         joints_text = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
         raise malformed_error("file", f"a joint of parent {target} and child {source}", joints_text)
     given = next((origin.attrib for origin in joints[names].iter("origin")), {})
-    place, turn = (
-        reals(given.get(name, "0 0 0").split(), f"origin {name}", 3) for name in ("xyz", "rpy")
+    position, rotation = (
+        as_numbers(given.get(name, "0 0 0").split(), f"origin {name}", 3) for name in ("xyz", "rpy")
     )
-    return _transform(place, turn[::-1], names)
+    return _make_transform(position, rotation[::-1], names)
 
 
-def _from_options(words: Sequence[str]) -> Transform:
+def _parse_options(words: Sequence[str]) -> Transform:
     options = [*_POSITION, *_QUATERNION, *_ANGLES, *_FRAMES]
     given: dict[str, str] = {}
     for option, value in zip(words[::2], [*words[1::2], None], strict=False):
@@ -160,21 +160,21 @@ def _from_options(words: Sequence[str]) -> Transform:
             f"{' and '.join(_FRAMES)}, and a quaternion or angles, not both",
             " ".join(given),
         )
-    return _transform(
-        _values(_POSITION, given),
-        _values(_ANGLES if given.keys() & _ANGLES else _QUATERNION, given),
+    return _make_transform(
+        _option_values(_POSITION, given),
+        _option_values(_ANGLES if given.keys() & _ANGLES else _QUATERNION, given),
         [given[frame] for frame in _FRAMES],
     )
 
 
-def _values(defaults: dict[str, float], given: dict[str, str]) -> list[float]:
+def _option_values(defaults: dict[str, float], given: dict[str, str]) -> list[float]:
     return [
-        number(given[field], field) if field in given else default
+        as_number(given[field], field) if field in given else default
         for field, default in defaults.items()
     ]
 
 
-def _from_positions(words: Sequence[str]) -> Transform:
+def _parse_positional(words: Sequence[str]) -> Transform:
     count = len(words)
     if count not in {8, 9, 10}:
         raise malformed_error(
@@ -182,21 +182,23 @@ def _from_positions(words: Sequence[str]) -> Transform:
             "x y z, qx qy qz qw or yaw pitch roll, frame, child, and perhaps a period",
             f"{count} words",
         )
-    angles = count == 8
-    # a quaternion, or angles with a period: the arguments that are numbers show which
+    has_angles = count == 8
+    # nine words have a quaternion, or angles and a period; the frames' names show which
     if count == 9:
-        angles = not _is_number(words[6])
-        if angles != _is_number(words[8]):
+        has_angles = not _is_number(words[6])
+        if has_angles != _is_number(words[8]):
             raise malformed_error(
                 "arguments",
                 "a quaternion and two frames, or three angles, two frames and a period",
                 " ".join(words[6:]),
             )
-    turn = 6 if angles else 7
-    for period in words[turn + 2 :]:
-        number(period, "period")
-    read = [number(word, f"argument {place + 1}") for place, word in enumerate(words[:turn])]
-    return _transform(read[:3], read[3:], words[turn : turn + 2])
+    pose_length = 6 if has_angles else 7
+    for period in words[pose_length + 2 :]:
+        as_number(period, "period")
+    values = [
+        as_number(word, f"argument {index + 1}") for index, word in enumerate(words[:pose_length])
+    ]
+    return _make_transform(values[:3], values[3:], words[pose_length : pose_length + 2])
 
 
 def _is_number(word: str) -> bool:
@@ -207,14 +209,14 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _transform(
-    position: Sequence[float], turn: Sequence[float], frames: Sequence[str]
+def _make_transform(
+    position: Sequence[float], rotation: Sequence[float], frames: Sequence[str]
 ) -> Transform:
     frame, child = (frame_name(frame, "frame") for frame in frames)
-    if len(turn) == 4:
-        return Transform.from_quaternion(frame, child, position, turn)
-    check_angles(turn, "yaw, pitch and roll")
-    return Transform(frame, child, rotation_zyx(*turn), np.array(position))
+    if len(rotation) == 4:
+        return Transform.from_quaternion(frame, child, position, rotation)
+    check_angles(rotation, "yaw, pitch and roll")
+    return Transform(frame, child, rotation_zyx(*rotation), np.array(position))
 
 
 def compose_positions(transform: Transform, *, angles: bool = False, period: bool = False) -> str:
@@ -224,7 +226,7 @@ def compose_positions(transform: Transform, *, angles: bool = False, period: boo
     follows at the end.
     """
     frames = frame_name(transform.target, "target"), frame_name(transform.source, "source")
-    values = row(transform)
+    values = pose_numbers(transform)
     if angles:
         values = [*values[:3], *angles_zyx(transform.rotation)]
     words = [*map(repr, values), *frames, *([str(PERIOD_MS)] if period else [])]
@@ -236,10 +238,10 @@ def compose_options(transform: Transform, *, angles: bool = False) -> str:
 
     ``angles``: as for :func:`compose_positions`.
     """
-    values = dict(zip([*_POSITION, *_QUATERNION], row(transform), strict=True))
+    values = dict(zip([*_POSITION, *_QUATERNION], pose_numbers(transform), strict=True))
     if angles:
-        turned = zip(_ANGLES, angles_zyx(transform.rotation), strict=True)
-        values = dict([*list(values.items())[:3], *turned])
+        angle_values = zip(_ANGLES, angles_zyx(transform.rotation), strict=True)
+        values = dict([*list(values.items())[:3], *angle_values])
     words = [f"{option} {value!r}" for option, value in values.items()]
     frames = frame_name(transform.target, "target"), frame_name(transform.source, "source")
     words += [f"{option} {name}" for option, name in zip(_FRAMES, frames, strict=True)]
@@ -247,20 +249,20 @@ def compose_options(transform: Transform, *, angles: bool = False) -> str:
 
 
 def parse_pose(text: str, target: str, source: str) -> Transform:
-    """Return the pose of a ROS-Industrial file: ``x y z qx qy qz qw``, perhaps under one name.
+    """Return the pose of a ROS-Industrial file: ``x y z qx qy qz qw``, perhaps under a name.
 
-    The file has no names of frames: it is ``source``'s pose in ``target``.
+    The file has no names of frames: the pose is ``source``'s pose in ``target``.
     """
-    data = mapping(load_yaml(text), "file")
+    data = as_mapping(load_yaml(text), "file")
     where = "pose"
     if not data.keys() & set(POSE):
         if len(data) != 1:
             raise malformed_error("file", "one pose", ", ".join(data) or "none")
         ((where, data),) = data.items()
-    pose = numbers(data, where, POSE)
-    return placed(target, source, pose)
+    pose = numbers_by_key(data, where, POSE)
+    return transform_of_pose(target, source, pose)
 
 
 def compose_pose(transform: Transform) -> str:
     """Return a pose in ROS-Industrial's form, which has no place for the frames' names."""
-    return block(dict(zip(POSE, row(transform), strict=True)))
+    return block_mapping(dict(zip(POSE, pose_numbers(transform), strict=True)))

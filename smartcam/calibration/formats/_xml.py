@@ -9,10 +9,10 @@ from smartcam.calibration.formats._plain import MAX_DEPTH, Plain, malformed_erro
 from smartcam.exceptions import CalibrationError
 
 MAX_XML_ELEMENTS: Final = 20_000
-"""A file has at most this many elements; a robot's description has some hundred."""
+"""Largest number of elements of a file; a robot's description has some hundred."""
 
 
-class _Bounded(ElementTree.TreeBuilder):
+class _BoundedBuilder(ElementTree.TreeBuilder):
     """A builder of elements, without their namespaces."""
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ def load_xml(text: str) -> ElementTree.Element:
 
     Raises ``MALFORMED`` if it is no XML, has a document type, or exceeds a bound.
     """
-    parser = ElementTree.XMLParser(target=_Bounded())  # noqa: S314 - no document types
+    parser = ElementTree.XMLParser(target=_BoundedBuilder())  # noqa: S314 - no document types
     try:
         parser.feed(text)
         return parser.close()
@@ -54,8 +54,8 @@ def storage_data(element: ElementTree.Element) -> Plain:
     """Convert an element of OpenCV's XML storage to the form of its YAML storage."""
     if not len(element):
         text = (element.text or "").strip()
-        listed = element.tag == "data" or " " in " ".join(text.split())
-        return text.split() if listed and '"' not in text else text.strip('"')
+        is_list = element.tag == "data" or " " in " ".join(text.split())
+        return text.split() if is_list and '"' not in text else text.strip('"')
     if all(child.tag == "_" for child in element):
         return [storage_data(child) for child in element]
     data: dict[str, Plain] = {}

@@ -1,7 +1,8 @@
-"""The wizard that calibrates the place of a camera on a robot, or beside it.
+"""The wizard that calibrates the place of a camera on a robot, or next to a robot.
 
-It suggests a view, takes a picture, finds the target in it and reads the robot, any number of
-times. It shows the error at poses that were left out, and names the worst pose.
+The wizard suggests a view, takes a picture, finds the target in it and reads the robot, any number
+of times. It shows the error at poses that were left out of the calibration, and names the worst
+pose.
 """
 
 from __future__ import annotations
@@ -27,14 +28,19 @@ from smartcam.calibration.formats._robots import ROBOTS, pose_from
 from smartcam.calibration.wizards._pictures import (
     MAX_PREVIEW_BYTES,
     PICTURE_TIMEOUT,
-    how_to_take,
-    taker,
+    picture_instruction,
+    picture_taker,
 )
-from smartcam.calibration.wizards._points import Calibrated, accepting, ask_to_save, review_step
+from smartcam.calibration.wizards._points import (
+    CalibrationOutcome,
+    accept_option_text,
+    ask_to_save,
+    review_step,
+)
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._sheet import DIAGONALS, shape_of
-from smartcam.calibration.wizards._steps import Number, Option, Step, pick
-from smartcam.calibration.wizards._target_drawing import draw
+from smartcam.calibration.wizards._sheet import DIAGONALS, grid_size
+from smartcam.calibration.wizards._steps import Number, Option, Step, number_input
+from smartcam.calibration.wizards._target_drawing import draw_preview
 from smartcam.calibration.wizards._target_steps import ask_target
 from smartcam.calibration.wizards._touches import ALLOWED
 from smartcam.calibration.wizards._usage import usage
@@ -56,13 +62,13 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
 
 ReadFlange = Callable[[], Awaitable[Transform | Pose]]
-"""Returns ``T_base_flange``, the flange's pose in the robot's base."""
+"""Function that returns ``T_base_flange``, the flange's pose in the robot's base."""
 
 MAX_VIEWS = 40
-"""Largest number of views of a run, far more than are needed."""
+"""Largest number of views of a run, far more than a calibration needs."""
 
 ADVISED_VIEWS = 10
-"""Number of views from which on the calculation is the wizard's first choice."""
+"""Number of views from which the wizard preselects the calculation."""
 
 CALCULATION_TIMEOUT = 120.0
 """Timeout of the calculation, seconds; with 15 views it takes a few seconds."""
@@ -73,10 +79,10 @@ _MOVES: Mapping[str, str] = {
 }
 
 TOUCHES = 3
-"""Number of touches that verify a calibration, at points of the sheet that are far apart."""
+"""Number of touches that verify a calibration; the touched points of the sheet are far apart."""
 
 SUGGESTIONS = tuple(look.text for look in LOOKS)
-"""Suggested views in order; after the last one they are suggested again, slightly changed."""
+"""Texts of the suggested views, in order; after the last one, the first one follows."""
 
 
 def hand_eye_wizard(
@@ -92,12 +98,13 @@ def hand_eye_wizard(
     """Return the wizard of a hand-eye calibration.
 
     Its parameters: ``name`` (of the calibration, passed to ``save_to``), and as defaults of the
-    first step ``setup`` and ``robot`` (the convention of typed poses, such as
-    ``kuka``); ``target``: a description of the target
-    on the sheet, which is then not asked for.
+    first step ``setup`` and ``robot`` (the convention of typed poses, such as ``kuka``);
+    ``target``: a description of the target on the sheet; the wizard then does not ask for the
+    target.
 
-    Its result: ``name, file, path, good_for_mm, method, views, held_out_mm, mean_mm,
-    translation_error_mm, rotation_error_deg, remarks``, and lines that ``use`` it.
+    Its result has the entries ``name``, ``file``, ``path``, ``good_for_mm``, ``method``, ``views``,
+    ``held_out_mm``, ``mean_mm``, ``translation_error_mm``, ``rotation_error_deg``, ``remarks``, and
+    ``use`` (lines that use the result).
 
     Args:
         take_picture: function that takes a picture while the robot stands still; or an open source
@@ -115,25 +122,27 @@ def hand_eye_wizard(
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
-        setup, robot, allowed = await _ask_setup(parameters, typed=read_robot is None)
-        shown = target
-        if shown is None:
-            shown = await ask_target(
+        setup, robot, allowed = await _ask_setup(parameters, pose_is_typed=read_robot is None)
+        sheet_target = target
+        if sheet_target is None:
+            sheet_target = await ask_target(
                 suggested, known=parameters.get("target"), square=parameters.get("square")
             )
-        views = _Views(shown, setup, taker(take_picture), read_robot or robot, camera, awaited)
+        views = _HandEyeRun(
+            sheet_target, setup, picture_taker(take_picture), read_robot or robot, camera, awaited
+        )
         views.allowed = allowed
         calibration = await views.run()
         name = str(parameters.get("name", KIND))
         preview = {"svg": draw_scene(calibration, title="Where camera and sheet were")}
-        result = await ask_to_save(name, save_to, KIND, _outcome(calibration), preview)
+        result = await ask_to_save(name, save_to, KIND, _calibration_outcome(calibration), preview)
         return {**result, "use": usage(KIND, save_to(name))}
 
     return Wizard(name=KIND, version=1, script=script, steps=14)
 
 
 async def _ask_setup(
-    parameters: Mapping[str, Any], *, typed: bool
+    parameters: Mapping[str, Any], *, pose_is_typed: bool
 ) -> tuple[Setup, str, float | None]:
     """Ask for the camera's place, the convention of typed poses, and the allowed error."""
     setup = Option(
@@ -151,7 +160,7 @@ async def _ask_setup(
     )
     label = "Largest error that is good enough; empty: a hundredth of the sheet's distance"
     allowed = replace(ALLOWED, label=label)
-    inputs = (setup, robot, allowed) if typed else (setup, allowed)
+    inputs = (setup, robot, allowed) if pose_is_typed else (setup, allowed)
     step = Step(
         id="about",
         title="Camera and robot",
@@ -159,14 +168,14 @@ async def _ask_setup(
         inputs=inputs,
     )
     answer = await ask(step.with_defaults(parameters))
-    where: Setup = "eye-to-hand" if answer["setup"] == "eye-to-hand" else "eye-in-hand"
+    camera_place: Setup = "eye-to-hand" if answer["setup"] == "eye-to-hand" else "eye-in-hand"
     error = answer["allowed"]
-    return where, str(answer.get("robot", "")), None if error is None else 1e-3 * error
+    return camera_place, str(answer.get("robot", "")), None if error is None else 1e-3 * error
 
 
 @dataclass(eq=False)
-class _Views:
-    """One run of the wizard; its state depends on the answers only."""
+class _HandEyeRun:
+    """One run of the wizard; its state depends only on the answers."""
 
     _target: Target
     _setup: Setup
@@ -179,42 +188,44 @@ class _Views:
 
     async def run(self) -> HandEyeCalibration:
         """Ask for views until a calibration is accepted; return it."""
-        more = True
+        take_more = True
         while True:
-            while more and await self._take_view():
+            while take_more and await self._take_view():
                 pass
             calibration, notes, judgement = await self._calculate()
             answers = await ask(self._review(calibration, notes, judgement))
             while answers["next"] == "verify" and calibration is not None:
-                calibration, touched = await self._verify(calibration)
-                notes = (*_outcome(calibration).notes, touched)
+                calibration, note = await self._verify(calibration)
+                notes = (*_calibration_outcome(calibration).notes, note)
                 answers = await ask(self._review(calibration, notes, calibration.judged()))
             if answers["next"] == "accept" and calibration is not None:
                 return calibration
-            more = answers["next"] == "more"
+            take_more = answers["next"] == "more"
             if answers["next"] == "remove":
                 del self._samples[answers["view"] - 1]
-                more = len(self._samples) < MIN_POSES
+                take_more = len(self._samples) < MIN_POSES
 
     async def _verify(self, calibration: HandEyeCalibration) -> tuple[HandEyeCalibration, str]:
         """Ask for touches of the sheet; return the calibration with their result, and a note."""
         points = (calibration.target or self._target).points
         if self._setup == "eye-in-hand":
-            places = calibration.target_pose.apply(points)
+            sheet_points = calibration.target_pose.apply(points)
         else:
             step = Step(
                 id="verify-picture",
                 title="A sheet that the robot can touch",
                 description="Lay a print of the same sheet into the camera's field where the robot "
-                f"can touch it, and fix it.{how_to_take(self._awaited)}",
+                f"can touch it, and fix it.{picture_instruction(self._awaited)}",
                 button="Take a picture",
                 waiting=f"Waiting: {self._awaited}" if self._awaited else "",
                 timeout=PICTURE_TIMEOUT,
             )
-            lying = (await ask(step, partial(self._lying, calibration.camera))).outcome
-            seen = motion_from_data(lying, CAMERA, TARGET)
-            places = (calibration.camera_pose @ seen).apply(points)
-        columns = shape_of(self._target)[0]
+            lying_sheet = (
+                await ask(step, partial(self._locate_lying_sheet, calibration.camera))
+            ).outcome
+            seen = motion_from_data(lying_sheet, CAMERA, TARGET)
+            sheet_points = (calibration.camera_pose @ seen).apply(points)
+        columns = grid_size(self._target)[0]
         errors: list[float] = []
         for direction in DIAGONALS[:TOUCHES]:
             number = int(np.argmax(points[:, :2] @ direction))
@@ -229,15 +240,19 @@ class _Views:
             )
             answer = await ask(step)
             touched = np.array([1e-3 * answer[axis] for axis in "xyz"])
-            errors.append(1e3 * float(np.linalg.norm(touched - places[number])))
+            errors.append(1e3 * float(np.linalg.norm(touched - sheet_points[number])))
         note = f"the tip touched the sheet {', '.join(f'{error:.2f}' for error in errors)} mm off"
-        others = tuple(warning for warning in calibration.warnings if warning.code != Code.REFUTED)
+        warnings = tuple(
+            warning for warning in calibration.warnings if warning.code != Code.REFUTED
+        )
         allowed = calibration.allowed
         if max(errors) > allowed.error:
-            others = (Code.REFUTED.remark(f"{note}, but {allowed.text}"), *others)
-        return replace(calibration, warnings=others), note
+            warnings = (Code.REFUTED.remark(f"{note}, but {allowed.text}"), *warnings)
+        return replace(calibration, warnings=warnings), note
 
-    async def _lying(self, lens: CameraModel | None, _answers: Answers) -> dict[str, Any]:
+    async def _locate_lying_sheet(
+        self, lens: CameraModel | None, _answers: Answers
+    ) -> dict[str, Any]:
         """Take a picture of a sheet that lies on the table, and return its pose."""
         image = await self._take_picture()
         view = await asyncio.to_thread(find_target, image, self._target)
@@ -246,7 +261,7 @@ class _Views:
         return motion_to_data(locate(view, lens).transform)
 
     async def _take_view(self) -> bool:
-        """Take one more view; return False if the user wants to calculate instead."""
+        """Take one more view; return False if there are enough, or the user wants to calculate."""
         count = len(self._samples)
         if count >= MAX_VIEWS:
             return False
@@ -258,81 +273,81 @@ class _Views:
             }
             default = "view" if count < ADVISED_VIEWS else "calculate"
             inputs = (Option(name="next", label="What next", options=options, default=default),)
-        following = self._samples[-1].get("next", {}) if self._samples else {}
-        look = following.get("text") or SUGGESTIONS[count % len(SUGGESTIONS)]
-        typed = ""
+        next_view = self._samples[-1].get("next", {}) if self._samples else {}
+        look = next_view.get("text") or SUGGESTIONS[count % len(SUGGESTIONS)]
+        instruction = ""
         if isinstance(self._robot, str):
-            typed = " Then take the pose of the flange from the robot, in its base."
+            instruction = " Then take the pose of the flange from the robot, in its base."
             inputs = (*inputs, *_pose_inputs(self._robot, optional=count >= MIN_POSES))
         step = Step(
             id=f"view-{count + 1}",
             title=f"View {count + 1}",
             description=f"{_MOVES[self._setup]}: {look}. The whole sheet must be in the image, and "
-            f"the robot must stand still.{typed}{how_to_take(self._awaited)}",
+            f"the robot must stand still.{instruction}{picture_instruction(self._awaited)}",
             button="Take a picture" if count < MIN_POSES else "Go on",
             inputs=inputs,
-            notes=tuple(filter(None, (self._progress(count), following.get("gain")))),
+            notes=tuple(filter(None, (self._progress(count), next_view.get("gain")))),
             preview=self.preview(),
             waiting=f"Waiting: {self._awaited}" if self._awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
-        sample = (await ask(step, self._sample)).outcome
+        sample = (await ask(step, self._take_sample)).outcome
         if sample:
             self._samples.append(sample)
         return bool(sample)
 
     def _progress(self, count: int) -> str:
-        """Return a text with the numbers of views so far, advised and allowed."""
-        end = (
+        """Return a text with the number of views so far, and the advised and the largest number."""
+        ending = (
             "to end, choose to calculate"
             if count >= MIN_POSES
             else f"with {MIN_POSES} it can be calculated; to end before, abort"
         )
-        return f"{count} of {ADVISED_VIEWS} views, {MAX_VIEWS} at most; {end}"
+        return f"{count} of {ADVISED_VIEWS} views, {MAX_VIEWS} at most; {ending}"
 
-    async def _sample(self, answers: Answers) -> dict[str, Any]:
+    async def _take_sample(self, answers: Answers) -> dict[str, Any]:
         """Take a picture and read the robot, unless the user wants to calculate."""
         if answers.get("next") == "calculate":
             return {}
-        typed = None
+        typed_pose = None
         if isinstance(self._robot, str):  # refuse an invalid pose before a picture is taken
-            typed = _typed_pose(self._robot, answers)
+            typed_pose = _typed_pose(self._robot, answers)
         image = await self._take_picture()
-        flange = typed or await self._flange()
+        flange = typed_pose or await self._read_flange()
         name = f"view {len(self._samples) + 1}"
-        view, preview, following = await asyncio.to_thread(self._view_in, image, name)
+        view, preview, next_view = await asyncio.to_thread(self._find_view, image, name)
         frames = [flange.target, flange.source]
         return {
             "frames": frames,
             "pose": motion_to_data(flange),
             "view": view.to_data(),
             "preview": preview,
-            "next": {"text": following.text, "gain": following.gain},
+            "next": {"text": next_view.text, "gain": next_view.gain},
         }
 
-    async def _flange(self) -> Transform:
+    async def _read_flange(self) -> Transform:
         if isinstance(self._robot, str):
             raise TypeError("the robot is not read")
         pose = await self._robot()
         return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
 
-    def _view_in(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
-        """Return the view found in a picture, an SVG of it, and the next suggestion.
+    def _find_view(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
+        """Return the view found in a picture, an SVG of the picture, and the next suggestion.
 
-        A large SVG is left out.
+        The SVG is "" if it is too large.
         """
-        view, earlier = find_target(image, self._target, name=name), self._views()
-        following = suggestion([*earlier, view], lens_known=self._camera is not None)
-        svg = draw(
+        view, earlier = find_target(image, self._target, name=name), self._named_views()
+        next_view = suggestion([*earlier, view], lens_known=self._camera is not None)
+        svg = draw_preview(
             image,
             view=view,
             earlier=earlier,
-            suggested=following.outline,
+            suggested=next_view.outline,
             title=f"{name}; orange: the next one, about",
         )
-        return view, svg if len(svg) <= MAX_PREVIEW_BYTES else "", following
+        return view, svg if len(svg) <= MAX_PREVIEW_BYTES else "", next_view
 
-    def _views(self) -> list[TargetView]:
+    def _named_views(self) -> list[TargetView]:
         """Return the views, named by their numbers."""
         views = [
             TargetView.from_data(sample["view"], target=self._target) for sample in self._samples
@@ -353,29 +368,29 @@ class _Views:
             notes=(f"{len(self._samples)} views",),
             timeout=CALCULATION_TIMEOUT,
         )
-        solved = (await ask(step, self._solve)).outcome
-        if "code" in solved:
-            worst, code = len(self._samples), Code(solved["code"])
-            judgement = refused(code, solved["text"], worst=worst, cures=VIEW_CURES)
-            return None, (f"{code}: {solved['text']}",), judgement
-        views = [view.to_data() for view in self._views()]
-        calibration = HandEyeCalibration.from_data({**solved, "views": views})
-        _, _, notes, judgement = _outcome(calibration)
+        solution = (await ask(step, self._solve)).outcome
+        if "code" in solution:
+            worst, code = len(self._samples), Code(solution["code"])
+            judgement = refused(code, solution["text"], worst=worst, cures=VIEW_CURES)
+            return None, (f"{code}: {solution['text']}",), judgement
+        views = [view.to_data() for view in self._named_views()]
+        calibration = HandEyeCalibration.from_data({**solution, "views": views})
+        _, _, notes, judgement = _calibration_outcome(calibration)
         return calibration, notes, judgement
 
     async def _solve(self, _answers: Answers) -> dict[str, Any]:
-        """Return the calibration without the samples' views, or the reason why there is none."""
+        """Return the calibration as data without views, or ``code`` and ``text`` of the error."""
         poses = [motion_from_data(sample["pose"], *sample["frames"]) for sample in self._samples]
-        work = partial(
+        calibrate = partial(
             calibrate_hand_eye,
             poses,
-            self._views(),
+            self._named_views(),
             setup=self._setup,
             camera=self._camera,
             allowed_error=self.allowed,
         )
         try:
-            calibration = await asyncio.to_thread(work)
+            calibration = await asyncio.to_thread(calibrate)
         except CalibrationError as exc:
             return {"code": str(exc.code), "text": str(exc)}
         return {**calibration.to_data(), "views": []}
@@ -387,7 +402,7 @@ class _Views:
         judgement: Judgement,
     ) -> Step:
         options = {
-            "accept": accepting(judgement),
+            "accept": accept_option_text(judgement),
             "verify": "touch the sheet with the robot's tip, to see that it is right",
             "more": "take another view",
             "remove": "remove a view",
@@ -398,7 +413,7 @@ class _Views:
         else:
             worst = 1 + calibration.worst
         label = "View to remove; the worst one stands there"
-        view = pick("view", label, len(self._samples), worst)
+        view = number_input("view", label, len(self._samples), worst)
         preview = self.preview()
         if calibration is not None:
             preview = {"svg": draw_views(calibration, title="Error of each view on the sheet")}
@@ -406,7 +421,7 @@ class _Views:
 
 
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
-    """Return the inputs of a pose; if ``optional``, an empty pose means to calculate."""
+    """Return the inputs of a pose; ``optional``: whether they may be empty."""
     convention = ROBOTS[robot]
     unit = "mm" if convention.metre > 1 else "m"
     return tuple(
@@ -429,7 +444,7 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
     return pose_from(robot, values, source="flange")
 
 
-def _outcome(calibration: HandEyeCalibration) -> Calibrated:
+def _calibration_outcome(calibration: HandEyeCalibration) -> CalibrationOutcome:
     held_out = calibration.held_out_error
     remarks = [f"{warning.code}: {warning.text}" for warning in calibration.warnings]
     judgement = calibration.judged()
@@ -439,8 +454,8 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
         "views": len(calibration.views),
         "held_out_mm": None if held_out is None else 1e3 * held_out,
         "mean_mm": 1e3 * calibration.mean_error,
-        "translation_error_mm": _finite(1e3, calibration.translation_error),
-        "rotation_error_deg": _finite(math.degrees(1.0), calibration.rotation_error),
+        "translation_error_mm": _scaled_or_none(1e3, calibration.translation_error),
+        "rotation_error_deg": _scaled_or_none(math.degrees(1.0), calibration.rotation_error),
         "remarks": remarks,
     }
     notes = [f"{figures['views']} views, {figures['method']}"]
@@ -456,8 +471,8 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
             f"the camera's place is known to {figures['translation_error_mm']:.2g} mm, its "
             f"orientation to {figures['rotation_error_deg']:.2g} deg"
         )
-    return Calibrated(calibration, figures, (*notes, *remarks), judgement)
+    return CalibrationOutcome(calibration, figures, (*notes, *remarks), judgement)
 
 
-def _finite(factor: float, value: float) -> float | None:
+def _scaled_or_none(factor: float, value: float) -> float | None:
     return factor * value if math.isfinite(value) else None

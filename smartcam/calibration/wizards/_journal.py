@@ -1,8 +1,8 @@
-"""Keep the journal of a sequence: a line for each entry, on the disk before it counts.
+"""Keep the journal of a sequence: one line for each entry.
 
-The first line names the wizard, each other line is an entry. A line is written and
-synced before the next step is shown. A killed process leaves at most a part of a line, which the
-next process removes: the answer in it had not been confirmed yet.
+The first line names the wizard, each other line is an entry. A line is written and synced to the
+disk before the next step is shown. A killed process leaves at most a part of a line, which the next
+process removes: the answer in this line was not confirmed yet.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 MAX_ENTRIES = 10_000
-"""A journal has at most this many entries; a calibration by hand has some dozens."""
+"""Largest number of entries of a journal; a calibration by hand has some dozens."""
 
 MAX_LINE_BYTES = 1 << 20
-"""An entry has at most this many bytes; a result of 900 localizations has a quarter of them."""
+"""Largest number of bytes of an entry; a result of 900 localizations has a quarter of it."""
 
 _MAX_FILE = 1 << 28
 
@@ -58,7 +58,7 @@ class Journal:
         self._stream = os.fdopen(os.open(path, flags, 0o644), "r+b", buffering=0)
         try:
             self._lock()
-            self._load()
+            self._read_entries()
         except BaseException:
             self.close()
             raise
@@ -78,21 +78,21 @@ class Journal:
         sync_folder(self.path.parent)
 
     def append(self, entry: dict[str, Any]) -> dict[str, Any]:
-        """Write an entry to the disk, and return it as it will be read.
+        """Write an entry to the disk, and return the entry as it will be read.
 
-        Raises ``NOT_STORABLE`` if the entry is not possible as JSON, too long, or one too many;
-        OSError if it cannot be written, which leaves the file as it was.
+        Raises ``NOT_STORABLE`` if the entry is not possible as JSON, or too long, or if the journal
+        is full; OSError if the entry cannot be written, which leaves the file as it was.
         """
         if len(self.entries) >= MAX_ENTRIES:
             raise Code.NOT_STORABLE.refusal(
                 f"{self.path}: entry {MAX_ENTRIES + 1}, expected {MAX_ENTRIES} at most"
             )
-        read = self._write(entry)
-        self.entries.append(read)
-        return read
+        stored = self._write(entry)
+        self.entries.append(stored)
+        return stored
 
     def close(self) -> None:
-        """Close the file, which frees its lock; does nothing if closed."""
+        """Close the file, which frees its lock. Idempotent."""
         self._stream.close()
 
     def _lock(self) -> None:
@@ -101,7 +101,7 @@ class Journal:
                 f"{self.path}: another sequence writes it; expected one at a time"
             )
 
-    def _load(self) -> None:
+    def _read_entries(self) -> None:
         if os.fstat(self._stream.fileno()).st_size > _MAX_FILE:
             raise self._broken_journal_error(f"more than {_MAX_FILE} bytes")
         data = self._stream.read() or b""
@@ -118,7 +118,7 @@ class Journal:
             else:
                 self.entries.append(value)
         self._size = complete
-        self._cut()
+        self._truncate()
 
     def _write(self, value: dict[str, Any]) -> dict[str, Any]:
         try:
@@ -130,22 +130,22 @@ class Journal:
                 f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE_BYTES} at most"
             )
         try:
-            self._put(line)
+            self._write_bytes(line)
         except BaseException:
             with contextlib.suppress(OSError):
-                self._cut()
+                self._truncate()
             raise
         self._size += len(line)
-        read: dict[str, Any] = json.loads(line)
-        return read
+        stored: dict[str, Any] = json.loads(line)
+        return stored
 
-    def _put(self, line: bytes) -> None:
+    def _write_bytes(self, line: bytes) -> None:
         unwritten = memoryview(line)
         while unwritten:
             unwritten = unwritten[self._stream.write(unwritten) :]
         os.fsync(self._stream.fileno())
 
-    def _cut(self) -> None:
+    def _truncate(self) -> None:
         self._stream.truncate(self._size)
         self._stream.seek(self._size)
 

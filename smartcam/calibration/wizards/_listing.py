@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from smartcam.calibration._files.directory import Folder
 
 MAX_CALIBRATIONS: Final = 200
-"""At most this many calibrations, the first by name, are read."""
+"""Largest number of calibrations that are read; they are the first by name."""
 
 
 def listing(folder: Folder) -> list[dict[str, Any]]:
-    """Return a row for each calibration of a folder, by name, as JSON takes it.
+    """Return a row of JSON data for each calibration of a folder, sorted by name.
 
-    ``name, kind, written_at`` (UTC, ISO 8601)``, held_out_mm`` (RMS; None: not known)``,
-    checked_at`` and ``stale`` of the last check (None without a check)``, problem`` (None without
-    one). A file that cannot be read has only a ``problem``.
+    Its keys are ``name``, ``kind``, ``written_at`` (UTC, ISO 8601), ``held_out_mm`` (RMS; None: not
+    known), ``checked_at`` and ``stale`` of the last check (None without a check), and ``problem``
+    (None if the file can be read). A file that cannot be read has only a name and a ``problem``.
     """
-    return [_row(folder, name) for name in folder.names()[:MAX_CALIBRATIONS]]
+    return [_listing_row(folder, name) for name in folder.names()[:MAX_CALIBRATIONS]]
 
 
-def _row(folder: Folder, name: str) -> dict[str, Any]:
+def _listing_row(folder: Folder, name: str) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(
         ("name", "kind", "written_at", "held_out_mm", "checked_at", "stale", "problem")
     )
@@ -39,7 +39,7 @@ def _row(folder: Folder, name: str) -> dict[str, Any]:
     try:
         document = read_document(folder.find(name))
         row |= {"kind": document.kind, "written_at": document.written_at}
-        row["held_out_mm"] = _held_out(document.kind, document.data)
+        row["held_out_mm"] = _held_out_mm(document.kind, document.data)
         check = _last_check(folder.checks(name))
         # a check before this calibration was written does not count
         if check.get("calibration") == document.written_at:
@@ -49,13 +49,13 @@ def _row(folder: Folder, name: str) -> dict[str, Any]:
     return row
 
 
-def _held_out(kind: str, data: dict[str, Any]) -> float | None:
+def _held_out_mm(kind: str, data: dict[str, Any]) -> float | None:
     """Return the held-out error of a calibration, mm."""
     if kind == HandEyeCalibration.kind:
         error = HandEyeCalibration.from_data(data).held_out_error
     elif kind in KINDS:
-        read = KINDS[kind].from_data(data)
-        plane = read.plane if isinstance(read, SheetCalibration) else read
+        calibration = KINDS[kind].from_data(data)
+        plane = calibration.plane if isinstance(calibration, SheetCalibration) else calibration
         error = plane.held_out_error
     else:
         return None
@@ -63,7 +63,7 @@ def _held_out(kind: str, data: dict[str, Any]) -> float | None:
 
 
 def _last_check(path: Path) -> dict[str, Any]:
-    """Return the last whole line of a file of checks, which may be being written."""
+    """Return the last complete line of a file of checks, to which another process may write."""
     try:
         with path.open("rb") as stream:
             stream.seek(max(0, stream.seek(0, 2) - 2 * MAX_LINE_BYTES))

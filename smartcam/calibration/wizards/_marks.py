@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._steps import Answers
 
 MAX_MARKS = 25
-"""At most this many marks of one picture can be touched: 5 x 5."""
+"""Largest number of marks in one picture that can be touched: 5 x 5."""
 
 Localize = Callable[[], Awaitable[list[Localization]]]
 """Function that takes a picture and returns the localizations in it."""
@@ -37,11 +37,11 @@ class Mark:
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> Mark:
-        """Return the mark of a row that :meth:`MarkCamera.picture` gave."""
+        """Return the mark of a row from :meth:`MarkCamera.take_picture`."""
         return cls(row["feature_id"], row["x"], row["y"], row["theta"])
 
     def text(self, unit: str) -> str:
-        """Return the mark as a text, its place in a ``unit``; metres become millimetres."""
+        """Return the mark as a text with its place; ``unit``: of the place, m is shown as mm."""
         name = self.feature if self.feature.isprintable() else repr(self.feature)
         factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
         return f"{name or 'mark'} at x {factor * self.x:.1f} {unit}, y {factor * self.y:.1f} {unit}"
@@ -54,7 +54,7 @@ class Touch:
     mark: Mark  # mark that the camera sees at the point; for a ray, its origin
     robot: Vector  # position of the tip in the robot's base, metres
     tool_z: Vector | None  # direction of the tool's axis; None if it is not known
-    what: str = "mark"  # ``mark``, or the letter of a point of the rays
+    label: str = "mark"  # ``mark``, or the letter of a point of the rays
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,10 +63,10 @@ class MarkCamera:
 
     localize: Localize
     feature: str = ""  # only localizations with this name are marks; empty for all
-    # whether ``localize`` turns the camera's y axis up, which points down; None: not known
+    # whether the camera's y axis points down, so that ``localize`` turns it up; None: not known
     y_down: bool | None = None
 
-    async def picture(self, _answers: Answers) -> list[dict[str, Any]]:
+    async def take_picture(self, _answers: Answers) -> list[dict[str, Any]]:
         """Take a picture, as the action of a step.
 
         Returns:
@@ -95,30 +95,30 @@ class MarkCamera:
             if self.feature in {"", localization.feature_id}
         ]
         if not 0 < len(rows) <= MAX_MARKS:
-            wanted = f"{self.feature!r} " if self.feature else ""
+            name_text = f"{self.feature!r} " if self.feature else ""
             raise (Code.SHAPE if rows else Code.TOO_FEW).refusal(
-                f"the camera found {len(rows)} marks {wanted}among {len(localizations)} "
+                f"the camera found {len(rows)} marks {name_text}among {len(localizations)} "
                 f"localizations; expected 1 to {MAX_MARKS}",
                 got=len(rows),
             )
         return rows
 
-    def check_y_down(self, before: bool | None, label: str) -> None:
-        """Raise MIRRORED if the direction of the y axis differs from ``before`` (None: unknown).
+    def check_y_down(self, earlier: bool | None, label: str) -> None:
+        """Raise MIRRORED if the direction of the y axis differs from ``earlier`` (None: unknown).
 
         ``label``: name, for people, of the earlier picture or calibration.
         """
-        if None not in {before, self.y_down} and before != self.y_down:
+        if None not in {earlier, self.y_down} and earlier != self.y_down:
             raise Code.MIRRORED.refusal(
-                f"{label} with y_down={before}, now it is {self.y_down}, and everything would be "
-                f"mirrored; expected y_down={before}",
-                before,
+                f"{label} with y_down={earlier}, now it is {self.y_down}, and everything would be "
+                f"mirrored; expected y_down={earlier}",
+                earlier,
                 self.y_down,
             )
 
 
-def clickable(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, Any]:
-    """Return a preview of marks, each of which gives answers when it is clicked."""
+def clickable_preview(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, Any]:
+    """Return a preview of marks; ``answers``: the answers that a click on each mark gives."""
     choices = [
         {"at": [mark.x, mark.y], "label": str(number), "answers": answer}
         for number, (mark, answer) in enumerate(zip(marks, answers, strict=True), 1)
@@ -126,8 +126,8 @@ def clickable(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, An
     return {"points": [], "marks": [choice["at"] for choice in choices], "choices": choices}
 
 
-async def choose(marks: list[Mark], unit: str) -> list[Mark]:
-    """Ask which of several marks will be touched; their places have a ``unit``."""
+async def ask_marks(marks: list[Mark], unit: str) -> list[Mark]:
+    """Ask which of several marks will be touched; ``unit``: unit of the marks' places."""
     if len(marks) == 1:
         return marks
     flags = tuple(
@@ -138,7 +138,7 @@ async def choose(marks: list[Mark], unit: str) -> list[Mark]:
         id="which",
         title="Which ones will be touched?",
         inputs=flags,
-        preview=clickable(marks, [{flag.name: True} for flag in flags]),
+        preview=clickable_preview(marks, [{flag.name: True} for flag in flags]),
     )
     answer = await ask(step)
     return [mark for flag, mark in zip(flags, marks, strict=True) if answer[flag.name]]

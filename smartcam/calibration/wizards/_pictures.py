@@ -35,11 +35,13 @@ class Pictures(Protocol):
         ...
 
 
-def taker(pictures: TakePicture | Pictures) -> TakePicture:
-    """Return a function that takes a picture, or the first frame a source exposes after the call.
+def picture_taker(pictures: TakePicture | Pictures) -> TakePicture:
+    """Return a function that takes a picture.
 
-    The picture is the frame's brightness. Errors of the source are passed on, such as a missing
-    device or no frame in time.
+    For a source of frames, the function returns the first frame that is exposed after the call.
+
+    The picture is then the frame's brightness. Errors of the source are passed on, such as a
+    missing device or no frame in time.
     """
     if callable(pictures):
         return pictures
@@ -53,11 +55,11 @@ def taker(pictures: TakePicture | Pictures) -> TakePicture:
 
 
 MAX_PREVIEW_BYTES: Final = 700_000
-"""Largest number of bytes of a picture's preview, which is kept with its step: a line of a journal
-holds 1 MiB."""
+"""Largest number of bytes of a picture's preview, which the journal keeps in one line: a line holds
+1 MiB."""
 
 PICTURE_TIMEOUT: Final = 60.0
-"""Largest time, seconds, to take a picture and to search it."""
+"""Longest time, seconds, to take a picture and to find the target in it."""
 
 MAX_PICTURE_BYTES: Final = 1 << 26
 """Largest number of bytes of a picture's file: 20 million pixels of colour in a bitmap."""
@@ -66,7 +68,7 @@ MAX_FILES: Final = 10_000
 """Largest number of entries of a folder of pictures, which is listed several times per second."""
 
 PICTURE_DEADLINE: Final = 25.0
-"""Seconds to wait for a picture in a folder."""
+"""Longest time, seconds, to wait for a picture in a folder."""
 
 LISTING_PERIOD: Final = 0.2
 """Seconds between two listings of a folder; a file with the same length in both is complete."""
@@ -89,8 +91,8 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
         raise _picture_error(name, f"{MAX_PICTURE_BYTES} bytes at most", f"{len(data)}")
     cv2 = load("cv2")
     try:
-        how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:  # error for no bytes, and for more pixels than OpenCV allows
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
@@ -105,7 +107,7 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     return picture
 
 
-def how_to_take(awaited: str) -> str:
+def picture_instruction(awaited: str) -> str:
     """Return the last sentence of a step's description, which explains how to take the picture."""
     if not awaited:
         return ""
@@ -121,7 +123,7 @@ class PictureFolder:
 
     Attributes:
         path: the folder.
-        deadline: the deadline as given, seconds.
+        deadline: time for which :meth:`take` waits, seconds.
 
     Raises:
         CalibrationError: NO_PICTURE: the path is no folder.
@@ -130,7 +132,7 @@ class PictureFolder:
     def __init__(self, path: str | os.PathLike[str], *, deadline: float = PICTURE_DEADLINE) -> None:
         self.path: Path = Path(path)
         self.deadline: float = deadline
-        self._look()
+        self._scan_folder()
 
     @property
     def awaited(self) -> str:
@@ -144,55 +146,57 @@ class PictureFolder:
         """Wait for the next picture and return it, (H, W).
 
         Pictures that are in the folder already do not count unless they are written again, since
-        they show an earlier scene. If several come, the newest is used.
+        they show an earlier scene. If several pictures come, the newest is used.
 
         Raises:
-            CalibrationError: NO_PICTURE: none came in time, or the folder is gone or has too many
-                files; BAD_PICTURE: a picture came that cannot be read, or is too large.
+            CalibrationError: NO_PICTURE: no picture came in time, or the folder is missing or has
+                too many files; BAD_PICTURE: the picture cannot be read, or is too large.
 
         Cancellation: safe; no file is changed.
         """
-        before, others = self._look(), self._names()
+        before, other_names = self._scan_folder(), self._other_names()
         last: dict[str, tuple[int, int]] = before
         try:
             async with asyncio.timeout(self.deadline):
                 while True:
                     await asyncio.sleep(LISTING_PERIOD)
-                    now = self._look()
-                    fresh = [
+                    now = self._scan_folder()
+                    complete = [
                         name
                         for name, file in now.items()
                         if file != before.get(name) and file == last.get(name) and file[1]
                     ]
-                    if fresh:
-                        newest = max(fresh, key=lambda name: now[name])
+                    if complete:
+                        newest = max(complete, key=lambda name: now[name])
                         return await asyncio.to_thread(self._read, newest)
                     last = now
         except TimeoutError as exc:
             raise Code.NO_PICTURE.refusal(
                 f"no picture came into {self.path} within {self.deadline:g} s"
-                f"{self._others(before, others)}; expected a file that ends in one of "
-                f"{', '.join(sorted(SUFFIXES))}, written after the button was pressed",
+                f"{self._describe_other_files(before, other_names)}; expected a file that ends in "
+                f"one of {', '.join(sorted(SUFFIXES))}, written after the button was pressed",
                 sorted(SUFFIXES),
             ) from exc
 
-    def _names(self) -> set[str]:
+    def _other_names(self) -> set[str]:
         """Return the names of the entries of the folder that are no pictures."""
         with contextlib.suppress(OSError):
             names = [path.name for path in itertools.islice(self.path.iterdir(), MAX_FILES)]
             return {name for name in names if Path(name).suffix.lower() not in SUFFIXES}
         return set()
 
-    def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
-        """Return a note on files that came instead of a picture, and on earlier ones."""
+    def _describe_other_files(
+        self, before: dict[str, tuple[int, int]], other_names: set[str]
+    ) -> str:
+        """Return a note on new files that are no pictures, and on pictures from before."""
         notes = [f"there before: {len(before)}"] if before else []
-        new_names = sorted(self._names() - others)
+        new_names = sorted(self._other_names() - other_names)
         if new_names:
             more = f" and {len(new_names) - 3} more" if len(new_names) > 3 else ""
             notes.insert(0, f"came, but no picture: {', '.join(new_names[:3])}{more}")
         return f" ({'; '.join(notes)})" if notes else ""
 
-    def _look(self) -> dict[str, tuple[int, int]]:
+    def _scan_folder(self) -> dict[str, tuple[int, int]]:
         """Return the time of writing, ns, and the number of bytes of each picture."""
         files: dict[str, tuple[int, int]] = {}
         try:
@@ -204,10 +208,10 @@ class PictureFolder:
                 if file.suffix.lower() not in SUFFIXES:
                     continue
                 try:
-                    about = file.stat()
+                    status = file.stat()
                 except FileNotFoundError:  # removed or renamed meanwhile
                     continue
-                files[file.name] = (about.st_mtime_ns, about.st_size)
+                files[file.name] = (status.st_mtime_ns, status.st_size)
         except OSError as exc:
             raise Code.NO_PICTURE.unexpected(
                 f"{self.path}: expected a folder that pictures come into", got=exc.strerror

@@ -1,8 +1,8 @@
 """The wizard that calibrates a smart camera's plane against a robot.
 
 The camera localizes marks, and the robot's tip touches any number of them; or the camera localizes
-the origin mark of the printed rays. The wizard knows no client and no robot: it is given a function
-that takes a picture and, if the robot can be asked, one that reads its pose.
+the origin mark of the printed rays. The wizard knows no client and no robot: it gets a function
+that takes a picture and, if the robot can be read, a function that reads the robot's pose.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration._plane.calibration import KIND, fit_plane
 from smartcam.calibration._printing.page_layout import RULER_MM
-from smartcam.calibration.wizards._marks import Mark, MarkCamera, clickable
+from smartcam.calibration.wizards._marks import Mark, MarkCamera, clickable_preview
 from smartcam.calibration.wizards._points import (
     MAX_POINTS,
     PointSource,
     about_step,
-    calibrated_plane,
+    plane_outcome,
 )
 from smartcam.calibration.wizards._sequence import Wizard, ask
 from smartcam.calibration.wizards._steps import Number, Option, Step
-from smartcam.calibration.wizards._target_steps import ruler
+from smartcam.calibration.wizards._target_steps import ruler_input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._plane.calibration import PlaneCalibration
     from smartcam.calibration.wizards._marks import Localize, Touch
-    from smartcam.calibration.wizards._points import Calibrated
+    from smartcam.calibration.wizards._points import CalibrationOutcome
     from smartcam.calibration.wizards._sequence import StepAnswer
     from smartcam.calibration.wizards._steps import Answers
     from smartcam.calibration.wizards._touches import ReadRobot
@@ -49,17 +49,18 @@ def plane_wizard(
     ``tool``, ``unit`` (mm, m), ``side``, ``touch_sigma`` (mm); ``feature``: only marks with this
     name count.
 
-    Its result: ``name, file, model, points, left_out`` (numbers of points, from 1)``, residual_mm,
-    held_out_mm, predicted_mm, remarks``, ``path`` of the file, ``good_for_mm`` (95 of 100 new
-    points lie within it; None: not known, or not good), and lines that ``use`` it, ``command`` and
-    ``python``. Points left out count in none of the errors.
+    Its result has the entries ``name``, ``file``, ``model``, ``points``, ``left_out`` (numbers of
+    points, from 1), ``residual_mm``, ``held_out_mm``, ``predicted_mm``, ``remarks``, ``path`` (of
+    the file), ``good_for_mm`` (error that 95 of 100 new points do not exceed; None: not known, or
+    not good), and ``use`` (lines that use the result: ``command`` and ``python``). Points that were
+    left out count in none of the errors.
 
     Args:
         localize: function that takes a picture and localizes marks in it.
         save_to: function that returns the file for a name.
-        read_robot: function that reads the robot's pose; None: it is typed.
-        y_down: whether ``localize`` turns the camera's y axis up, which points down; None: not
-            known. It is stored with the calibration, and must be the same for all of its pictures.
+        read_robot: function that reads the robot's pose; None: the pose is typed.
+        y_down: whether the camera's y axis points down, so that ``localize`` turns it up; None: not
+            known. The value is stored with the calibration, and must be the same for all pictures.
         connect: arguments of :func:`smartcam.connect` for the camera, ``url`` included, for the
             lines that use the result; None: the camera cannot be asked.
     """
@@ -105,7 +106,7 @@ class _MarkSource(PointSource):
         self.camera_unit = about["camera_unit"]
         self._camera = camera
 
-    async def add(self) -> None:
+    async def add_points(self) -> None:
         done = len(self.touches)
         step = Step(
             id="picture",
@@ -118,12 +119,14 @@ class _MarkSource(PointSource):
         )
         await self.add_marks(await self._ask_for_picture(step), MAX_POINTS, "points")
 
-    async def redo(self, index: int) -> None:
+    async def ask_again(self, index: int) -> None:
         mark = self.touches[index].mark
         title = f"Touch point {index + 1} again"
-        self.touches[index] = await self.touch("redo", title, mark.text(self.camera_unit), mark)
+        self.touches[index] = await self.ask_mark_touch(
+            "redo", title, mark.text(self.camera_unit), mark
+        )
 
-    async def ray_origin(self) -> tuple[Mark, float]:
+    async def find_ray_origin(self) -> tuple[Mark, float]:
         scale = await self._nominal_scale()
         step = Step(
             id="origin",
@@ -141,7 +144,7 @@ class _MarkSource(PointSource):
             id="which",
             title="Which one is the origin?",
             inputs=(Option(name="mark", label="The origin mark", options=options),),
-            preview=clickable(marks, [{"mark": number} for number in options]),
+            preview=clickable_preview(marks, [{"mark": number} for number in options]),
         )
         return marks[int((await ask(step))["mark"]) - 1], scale
 
@@ -157,27 +160,27 @@ class _MarkSource(PointSource):
             title="Was the sheet printed true to size?",
             description="Printers scale. The camera took its metres from the sheet as it should "
             "be, so the ruler measures the scale.",
-            inputs=(ruler("ruler"),),
+            inputs=(ruler_input("ruler"),),
         )
         return float((await ask(step))["ruler"]) / RULER_MM
 
     async def _ask_for_picture(self, step: Step) -> Sequence[Mapping[str, Any]]:
-        """Ask for a picture; remember the direction of its y axis."""
-        rows: Sequence[Mapping[str, Any]] = (await ask(step, self._picture)).outcome
+        """Ask for a picture, and remember the direction of the camera's y axis."""
+        rows: Sequence[Mapping[str, Any]] = (await ask(step, self._take_checked_picture)).outcome
         directions = [row.get("y_down") for row in rows]
         self.y_down = next(
             (direction for direction in directions if direction is not None), self.y_down
         )
         return rows
 
-    async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
+    async def _take_checked_picture(self, answers: Answers) -> list[dict[str, Any]]:
         self._camera.check_y_down(self.y_down, "the picture before was taken")
-        return await self._camera.picture(answers)
+        return await self._camera.take_picture(answers)
 
     def fit(self, *, robust: bool) -> PlaneCalibration:
         return fit_plane(
             [(touch.mark.x, touch.mark.y) for touch in self.touches],
-            self.places,
+            self.tip_positions,
             touch_sigma=self.sigma,
             nominal_scale=1.0 if self.camera_unit == "m" else None,
             tool_z=self.tool_z,
@@ -187,14 +190,14 @@ class _MarkSource(PointSource):
             y_down=self.y_down,
         )
 
-    def sample(self, touch: Touch) -> dict[str, Any]:
+    def sample_entries(self, touch: Touch) -> dict[str, Any]:
         mark = touch.mark
         camera = [mark.x, mark.y, mark.theta]
-        return {"touched": touch.what, "feature_id": mark.feature, "camera": camera}
+        return {"touched": touch.label, "feature_id": mark.feature, "camera": camera}
 
-    def example(self) -> tuple[float, float]:
+    def example_point(self) -> tuple[float, float]:
         mark = self.touches[0].mark
         return mark.x, mark.y
 
-    def outcome(self, plane: PlaneCalibration) -> Calibrated:
-        return calibrated_plane(plane)
+    def calibration_outcome(self, plane: PlaneCalibration) -> CalibrationOutcome:
+        return plane_outcome(plane)

@@ -1,10 +1,10 @@
 """Calibrate a plane by touches of points from any source.
 
-A :class:`PointSource` provides the points: marks that a camera localizes, or a sheet that is found
-in a picture. The robot touches any number of them, or the thesis' three: the origin and one point
-on each of the printed rays A and B.
+A :class:`PointSource` provides the points: marks that a camera localizes, or points of a sheet that
+is found in a picture. The robot touches any number of these points; or it touches three: the origin
+and one point on each of the printed rays A and B.
 
-Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
+Source: the thesis with which smartcam began, 3.2.2 to 3.2.4 (published), for the rays.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from smartcam.calibration._plane.touches import fit_touches
 from smartcam.calibration._plane.validation import extent
 from smartcam.calibration._verdict import CURES, Judgement, refused
 from smartcam.calibration.wizards._sequence import ask
-from smartcam.calibration.wizards._steps import Option, Step, Text, pick
-from smartcam.calibration.wizards._touch_previews import compared, plain
+from smartcam.calibration.wizards._steps import Option, Step, Text, number_input
+from smartcam.calibration.wizards._touch_previews import compare_touches, touch_points
 from smartcam.calibration.wizards._touches import ALLOWED, SIDE, SIDES, SIGMA, UNIT, Touches
 from smartcam.calibration.wizards._usage import usage
 from smartcam.exceptions import CalibrationError
@@ -47,16 +47,16 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_POINTS = 200
-"""A calibration has at most this many touches."""
+"""Largest number of touches of a calibration."""
 
 MIN_TOUCHES = 3
-"""A plane needs at least this many touches."""
+"""Least number of touches of a plane."""
 
 _SIGNS_OF_OUTLIERS = frozenset({Code.OUTLIER, Code.POOR_FIT, Code.NOT_PLANAR})
-"""Warnings after which points may be left out; two wrong points can hide each other."""
+"""Codes of warnings after which the user may leave out points that do not agree with the others."""
 
 
-class Calibrated(NamedTuple):
+class CalibrationOutcome(NamedTuple):
     """A calibration with its figures and notes."""
 
     calibration: AnyCalibration | HandEyeCalibration
@@ -66,7 +66,7 @@ class Calibrated(NamedTuple):
 
 
 class PointSource(Touches, ABC):
-    """The source of a plane's points, and their touches: one run of a wizard.
+    """One run of a wizard: a source of a plane's points, and the touches of these points.
 
     The arguments are those of :class:`~smartcam.calibration.wizards._touches.Touches`; ``about``
     are the answers to :func:`about_step`.
@@ -86,7 +86,7 @@ class PointSource(Touches, ABC):
     ORIGIN: ClassVar[str]
     """Name of the origin of the rays, for people."""
     MORE: ClassVar[str]
-    """Text of the option to touch more."""
+    """Text of the option to touch more points."""
     PREVIEW_EXTRAS: ClassVar[Mapping[str, str]] = {}
     """Further entries of a calibration's preview."""
 
@@ -95,38 +95,40 @@ class PointSource(Touches, ABC):
     y_down: bool | None = None
 
     @abstractmethod
-    async def add(self) -> None:
+    async def add_points(self) -> None:
         """Ask for touches of one or more further points."""
 
     @abstractmethod
-    async def redo(self, index: int) -> None:
-        """Ask for a touch that replaces another one."""
+    async def ask_again(self, index: int) -> None:
+        """Ask for a touch that replaces the touch with an index."""
 
     @abstractmethod
-    async def ray_origin(self) -> tuple[Mark, float]:
+    async def find_ray_origin(self) -> tuple[Mark, float]:
         """Return the origin of the rays, and the metres per unit of the camera."""
 
     @abstractmethod
     def fit(self, *, robust: bool) -> PlaneCalibration:
-        """Fit a plane to the touches; raise CalibrationError if none fits."""
+        """Fit a plane to the touches; raise CalibrationError if no plane fits."""
 
     @abstractmethod
-    def sample(self, touch: Touch) -> dict[str, Any]:
+    def sample_entries(self, touch: Touch) -> dict[str, Any]:
         """Return the entries of a touch in a file's samples, as JSON takes them."""
 
     @abstractmethod
-    def example(self) -> tuple[float, float]:
+    def example_point(self) -> tuple[float, float]:
         """Return a point that the camera saw, in its unit."""
 
     @abstractmethod
-    def outcome(self, plane: PlaneCalibration) -> Calibrated:
+    def calibration_outcome(self, plane: PlaneCalibration) -> CalibrationOutcome:
         """Return the calibration of a plane, with its figures and notes."""
 
     async def run(self, name: str, save_to: Callable[[str], Path]) -> dict[str, Any]:
         """Ask for touches and whether to save the calibration; return the wizard's result."""
         rays = self.about["method"] == "rays"
-        plane = self._allowing(await (self._touch_rays() if rays else self._touch_points()))
-        about, outcome = self.about, self.outcome(plane)
+        plane = self._with_allowed_error(
+            await (self._touch_rays() if rays else self._touch_points())
+        )
+        about, outcome = self.about, self.calibration_outcome(plane)
         context = {
             "frames": {"camera": about["camera_frame"] or None, "robot": about["robot_frame"]},
             "camera_unit": self.camera_unit,
@@ -134,7 +136,7 @@ class PointSource(Touches, ABC):
             "method": about["method"],
             "samples": [
                 {
-                    **self.sample(touch),
+                    **self.sample_entries(touch),
                     "robot": list(touch.robot),
                     "tool_z": None if touch.tool_z is None else list(touch.tool_z),
                 }
@@ -145,23 +147,25 @@ class PointSource(Touches, ABC):
         result = await ask_to_save(name, save_to, self.KIND, outcome, preview, context)
         frame = {} if self.camera_frame is None else {"name": self.camera_frame}
         connect = None if self.connect is None else {**self.connect, **frame}
-        use = usage(self.KIND, save_to(name), connect, self.example())
+        use = usage(self.KIND, save_to(name), connect, self.example_point())
         return {**result, "use": use}
 
     async def _touch_rays(self) -> PlaneCalibration:
-        origin, scale = await self.ray_origin()
+        origin, scale = await self.find_ray_origin()
         for letter, place, mark in (
             ("O", self.ORIGIN, origin),
             ("A", "a point of ray A, as far out as it goes", replace(origin, number=None)),
             ("B", "a point of ray B, as far out as it goes", replace(origin, number=None)),
         ):
-            touched = await self.touch(f"touch-{letter}", f"Touch {letter}", place, mark, letter)
-            self.touches.append(touched)
+            touch = await self.ask_mark_touch(
+                f"touch-{letter}", f"Touch {letter}", place, mark, letter
+            )
+            self.touches.append(touch)
         header = Header(0, datetime.fromtimestamp(0, UTC), self.camera_frame or "")
         pose = Pose(header, Position(origin.x, origin.y), Quaternion.from_theta(origin.theta))
         plane = fit_touches(
             Localization(origin.feature, 1.0, 0, pose),
-            *self.places,
+            *self.tip_positions,
             nominal_scale=scale,
             touch_sigma=self.sigma,
             tool_z=self.tool_z,
@@ -169,7 +173,7 @@ class PointSource(Touches, ABC):
             camera_frame=self.camera_frame,
             y_down=self.y_down,
         )
-        outcome = self.outcome(self._allowing(plane))
+        outcome = self.calibration_outcome(self._with_allowed_error(plane))
         await ask(
             Step(
                 id="review",
@@ -185,14 +189,14 @@ class PointSource(Touches, ABC):
         return plane
 
     async def _touch_points(self) -> PlaneCalibration:
-        wanted, robust = self.MIN_TOUCHES_FOR_RESULT, False
-        again: set[int] = set()  # numbers of the points that were touched again
+        min_count, robust = self.MIN_TOUCHES_FOR_RESULT, False
+        retouched: set[int] = set()  # numbers of the points that were touched again
         while True:
-            while len(self.touches) < wanted:
-                await self.add()
-            wanted = MIN_TOUCHES
+            while len(self.touches) < min_count:
+                await self.add_points()
+            min_count = MIN_TOUCHES
             plane, notes, judgement = self._try_fit(robust=robust)
-            judgement = _other_advice(judgement, again, len(self.touches))
+            judgement = _avoid_repeated_advice(judgement, retouched, len(self.touches))
             order = self._better_order() if judgement.verdict.level == "poor" else None
             choice = await ask(self._review(plane, notes, judgement, order, robust=robust))
             index = choice["point"] - 1
@@ -200,13 +204,13 @@ class PointSource(Touches, ABC):
                 case "accept" if plane is not None:
                     return plane
                 case "more":
-                    await self.add()
+                    await self.add_points()
                 case "redo":
-                    await self.redo(index)
-                    again.add(index + 1)
+                    await self.ask_again(index)
+                    retouched.add(index + 1)
                 case "remove":
                     del self.touches[index]
-                    again.clear()  # the numbers of points have changed
+                    retouched.clear()  # the numbers of points have changed
                 case "reorder" if order is not None:
                     self.touches = [
                         replace(touch, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
@@ -228,26 +232,26 @@ class PointSource(Touches, ABC):
     ) -> tuple[PlaneCalibration | None, tuple[str, ...], Judgement]:
         try:
             fitted = self.fit(robust=robust and len(self.touches) >= MIN_POINTS)
-            plane = self._allowing(fitted)
+            plane = self._with_allowed_error(fitted)
         except CalibrationError as exc:
-            return None, (f"{exc.code}: {exc}",), self._blamed(exc)
-        _, _, notes, judgement = self.outcome(plane)
+            return None, (f"{exc.code}: {exc}",), self._judge_error(exc)
+        _, _, notes, judgement = self.calibration_outcome(plane)
         return plane, notes, judgement
 
-    def _allowing(self, plane: PlaneCalibration) -> PlaneCalibration:
-        """Return a calibration with the user's allowed error."""
+    def _with_allowed_error(self, plane: PlaneCalibration) -> PlaneCalibration:
+        """Set the user's allowed error in a calibration, and return it."""
         allowed = self.about["allowed"]
         return replace(plane, allowed_error=None if allowed is None else 1e-3 * allowed)
 
     def _better_order(self) -> Reordered | None:
-        """Return the order of touches that explains them far better, if there is exactly one."""
-        touched = np.array(self.places)
+        """Return the order of the touches that fits far better; None unless exactly one does."""
+        touched = np.array(self.tip_positions)
         sigma = self.sigma or MAX_SIGMA.of(extent(touched))
         marks = np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
         return better_order(marks, touched, sigma)
 
-    def _blamed(self, error: CalibrationError) -> Judgement:
-        """Return the judgement of an error; one bad touch can look like another scale."""
+    def _judge_error(self, error: CalibrationError) -> Judgement:
+        """Return the judgement of a failed fit; name a wrong or exchanged touch if possible."""
         if (order := self._better_order()) is not None:
             numbers = np.arange(1, 1 + len(self.touches))
             return refused(Code.WRONG_ORDER, order.remark(numbers).text)
@@ -255,19 +259,22 @@ class PointSource(Touches, ABC):
             with contextlib.suppress(CalibrationError):
                 for index in self.fit(robust=True).outliers:
                     return refused(Code.OUTLIER, f"point {1 + index}")
-        elif len(fitting := [i for i in range(len(self.touches)) if self._fits_without(i)]) == 1:
-            return refused(Code.OUTLIER, f"point {1 + fitting[0]}")
+        elif (
+            len(fitting_without := [i for i in range(len(self.touches)) if self._fits_without(i)])
+            == 1
+        ):
+            return refused(Code.OUTLIER, f"point {1 + fitting_without[0]}")
         return refused(error.code or "", str(error))
 
     def _fits_without(self, index: int) -> bool:
-        """Return True if the touches fit without one of them, and another one is left as a test."""
-        without = copy.copy(self)
-        without.touches = [*self.touches[:index], *self.touches[index + 1 :]]
+        """Return True if the touches fit without one, and enough are left to test the fit."""
+        others = copy.copy(self)
+        others.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
-            codes = {warning.code for warning in without.fit(robust=False).warnings}
+            codes = {warning.code for warning in others.fit(robust=False).warnings}
         except CalibrationError:
             return False
-        return len(without.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
+        return len(others.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
 
     def _review(
         self,
@@ -279,7 +286,7 @@ class PointSource(Touches, ABC):
         robust: bool,
     ) -> Step:
         options = {
-            "accept": accepting(judgement),
+            "accept": accept_option_text(judgement),
             "more": self.MORE,
             "redo": "touch a point again",
             "remove": "remove a point",
@@ -290,8 +297,8 @@ class PointSource(Touches, ABC):
         else:
             worst = 1 + min(plane.outliers, default=plane.worst)
         if order is not None and order.sure:
-            moved = ", ".join(str(1 + index) for index in order.moved)
-            options["reorder"] = f"exchange the touches of the points {moved}, as fits best"
+            moved_points = ", ".join(str(1 + index) for index in order.moved)
+            options["reorder"] = f"exchange the touches of the points {moved_points}, as fits best"
         if judgement.option == "side" and self._read_robot is None:
             options["side"] = "say where the tool points"
         doubtful = plane is None or any(
@@ -302,16 +309,16 @@ class PointSource(Touches, ABC):
         elif len(self.touches) >= MIN_POINTS and doubtful:
             options["robust"] = "leave out the points that do not agree with the others"
         label = "Point, to touch again or to remove; the worst one stands there"
-        named = judgement.number or worst
+        advised = judgement.number or worst
         count = len(self.touches)
-        point = pick("point", label, count, named if named <= count else worst)
+        point = number_input("point", label, count, advised if advised <= count else worst)
         return review_step(options, point, notes, judgement, self._preview(plane))
 
     def _preview(self, plane: PlaneCalibration | None) -> dict[str, Any]:
         """Return the data for a picture of the touches."""
         if plane is None:
-            return {**plain(self.touches), "choices": self._choices()}
-        comparison = compared(
+            return {**touch_points(self.touches), "choices": self._choices()}
+        comparison = compare_touches(
             plane,
             self.touches,
             plane.camera_points,
@@ -323,7 +330,7 @@ class PointSource(Touches, ABC):
         return {**comparison, **self.PREVIEW_EXTRAS, "choices": self._choices(comparison["points"])}
 
     def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
-        """Return the touches as clickable choices, at the places where they are drawn."""
+        """Return clickable choices for the touches, at the places where the touches are drawn."""
         places = [point["at"][:2] for point in points] or [
             [t.mark.x, t.mark.y] for t in self.touches
         ]
@@ -333,20 +340,23 @@ class PointSource(Touches, ABC):
         ]
 
 
-def _other_advice(judgement: Judgement, again: Collection[int], count: int) -> Judgement:
-    """Return a judgement that does not ask for the same touch repeatedly.
+def _avoid_repeated_advice(
+    judgement: Judgement, retouched: Collection[int], count: int
+) -> Judgement:
+    """Change a judgement that asks again for a touch that was repeated already.
 
-    ``again``: numbers of the points that were touched again already. ``count``: number of all
-    points.
+    ``retouched``: numbers of the points that were touched again. ``count``: number of all points.
     """
     number = judgement.number
-    if judgement.option != "redo" or number not in again:
+    if judgement.option != "redo" or number not in retouched:
         return judgement
-    leave = "remove it, and touch another one" if count > MIN_TOUCHES else "touch more points first"
+    advice = (
+        "remove it, and touch another one" if count > MIN_TOUCHES else "touch more points first"
+    )
     text = (
         f"Not good enough: point {number} was touched again, and still does not agree with the "
         f"others. Look whether its mark has moved, whether another mark was touched, and whether "
-        f"the tool is held as at the others; or {leave}"
+        f"the tool is held as at the others; or {advice}"
     )
     verdict = replace(judgement.verdict, text=text)
     return judgement._replace(verdict=verdict, option="remove" if count > MIN_TOUCHES else "more")
@@ -361,9 +371,9 @@ def about_step(
 ) -> Step:
     """Return the first step of a wizard with a source of points.
 
-    ``methods``: things that can be touched, for people; ``rays`` is one. ``parameters``: defaults
-    of its inputs; raises WRONG_ANSWERS if one is not valid. ``more``: further inputs, after the
-    method. ``typed``: whether the robot's pose is typed.
+    ``methods``: texts for the things that can be touched; ``rays`` is one key. ``parameters``:
+    defaults of the inputs; raises WRONG_ANSWERS if a default is not valid. ``more``: further
+    inputs, after the method. ``typed``: whether the robot's pose is typed.
     """
     step = Step(
         id="about",
@@ -388,8 +398,8 @@ def about_step(
     return step.with_defaults(parameters)
 
 
-def accepting(judgement: Judgement) -> str:
-    """Return the text of the option to accept the calibration."""
+def accept_option_text(judgement: Judgement) -> str:
+    """Return the text of the option that accepts the calibration."""
     if judgement.verdict.level == "good":
         return "accept it"
     return "accept it all the same; each program that loads it is warned"
@@ -402,7 +412,10 @@ def review_step(
     judgement: Judgement,
     preview: Mapping[str, Any] | None = None,
 ) -> Step:
-    """Return the step that shows the result and asks what to do ``next``, with a ``number``."""
+    """Return the step that shows the result and asks what to do ``next``.
+
+    ``number``: input for the number of a point or view.
+    """
     default = judgement.chosen(options)
     return Step(
         id="review",
@@ -418,7 +431,7 @@ async def ask_to_save(
     name: str,
     save_to: Callable[[str], Path],
     kind: str,
-    outcome: Calibrated,
+    outcome: CalibrationOutcome,
     preview: Mapping[str, Any] | None = None,
     context: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -442,12 +455,15 @@ async def ask_to_save(
     return {"name": name, "file": file.name, "path": str(file), **outcome.figures}
 
 
-def calibrated_plane(
-    calibration: PlaneCalibration, label: str = "the camera's x axis", along: Array | None = None
-) -> Calibrated:
+def plane_outcome(
+    calibration: PlaneCalibration,
+    label: str = "the camera's x axis",
+    direction: Array | None = None,
+) -> CalibrationOutcome:
     """Return a plane's calibration with its figures, in mm, and its notes.
 
-    ``label``: name of a direction, ``along`` (3,) in the robot's frame; None: the camera's x axis.
+    ``label``: name of ``direction`` (3,), a direction in the robot's frame; None: the camera's x
+    axis.
     """
     counted = calibration.weights > 0.0
     residual = 1e3 * math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
@@ -456,9 +472,9 @@ def calibrated_plane(
         at_points = calibration.predicted_error(calibration.camera_points[counted])
         predicted = 1e3 * math.sqrt(float((at_points**2).mean()))
     points, left_out = int(counted.sum()), [1 + index for index in calibration.outliers]
-    of = f" of {points + len(left_out)}" if left_out else ""
+    total_text = f" of {points + len(left_out)}" if left_out else ""
     notes = [
-        f"model {calibration.model} from {points}{of} points",
+        f"model {calibration.model} from {points}{total_text} points",
         f"residual {residual:.3f} mm rms: how well the points fit",
     ]
     if held_out is not None:
@@ -468,7 +484,7 @@ def calibrated_plane(
         )
     if predicted is not None:
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
-    x, y, z = calibration.rotation[:, 0] if along is None else along
+    x, y, z = calibration.rotation[:, 0] if direction is None else direction
     notes.append(
         f"{label} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
         "does, for points in a regular grid fit as well when touched from another corner on"
@@ -485,4 +501,4 @@ def calibrated_plane(
         "predicted_mm": predicted,
         "remarks": [[warning.code.value, warning.text] for warning in calibration.warnings],
     }
-    return Calibrated(calibration, figures, tuple(notes), judgement)
+    return CalibrationOutcome(calibration, figures, tuple(notes), judgement)

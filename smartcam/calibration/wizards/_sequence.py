@@ -1,4 +1,4 @@
-r"""Sequences: a wizard is one coroutine that asks for steps, and any front-end drives it.
+r"""Sequences: a wizard is one coroutine that asks for steps, and any front-end runs it.
 
 ::
 
@@ -12,12 +12,12 @@ r"""Sequences: a wizard is one coroutine that asks for steps, and any front-end 
 
 How it works: the coroutine awaits only :func:`ask`. Everything that uses a camera, a robot or a
 file is an *action* of a step: an async function that runs when the step is answered, and whose
-outcome is written into the journal together with the answers. So the list of its answers and
-outcomes is the whole state of the coroutine. Undo runs the coroutine again with one entry less;
-resuming after a crash runs it again with all of them. Neither repeats an action.
+outcome is written into the journal together with the answers. So the list of answers
+and outcomes is the whole state of the coroutine. Undo runs the coroutine again with one entry less;
+resuming after a crash runs it again with all entries. Neither repeats an action.
 
 After an error the step stays the same, whether the answer was wrong, the action failed, or the
-coroutine failed before its next step. Only an answer that the coroutine accepted is written.
+coroutine failed before its next step. Only an answer that the coroutine accepts is written.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ SCHEMA = "smartcam.sequence/1"
 Action = Callable[["Answers"], Awaitable[Any]]
 """Function that runs when a step is answered: takes the answers, returns JSON data.
 
-If it raises a SmartCamError or an OSError (TimeoutError is one), the error is shown and the step
-stays. A CalibrationError with the code ``WRONG_ANSWERS``, whose ``got`` maps inputs to texts, is
-shown beside those inputs.
+If the function raises a SmartCamError or an OSError, such as TimeoutError, the error is shown and
+the step stays. If it raises a CalibrationError with the code ``WRONG_ANSWERS``, whose ``got`` maps
+inputs to texts, each text is shown at its input.
 """
 
 State = Literal["asking", "ended", "aborted"]
@@ -103,8 +103,7 @@ class Wizard:
 
     Attributes:
         name: name of the wizard in journals.
-        version: number to raise when the steps change, so that no journal is resumed with other
-            steps.
+        version: number to raise when the steps change; a journal of another version is not resumed.
         script: the coroutine function; takes the parameters of the start, returns the result.
         steps: usual number of steps; 0 if it is not known.
     """
@@ -116,71 +115,77 @@ class Wizard:
 
 
 class _ScriptRun:
-    """The coroutine, run to the step after some entries of the journal."""
+    """A run of the coroutine, up to the step after given entries of the journal."""
 
     def __init__(
         self, wizard: Wizard, parameters: Mapping[str, Any], entries: list[dict[str, Any]]
     ) -> None:
         self._coroutine = wizard.script(copy.deepcopy(dict(parameters)))
-        self.request: PendingStep | None = None
-        self.last: Step | None = None  # step that was answered last
+        self.pending: PendingStep | None = None
+        self.last: Step | None = None  # the step that was answered last
         self.result: Any = None
         self._send(None)
         for number, entry in enumerate(entries, 1):
-            if self.request is None or self.request.step.id != entry["step"]:
-                place = "the end" if self.request is None else f"step {self.request.step.id!r}"
+            if self.pending is None or self.pending.step.id != entry["step"]:
+                place = "the end" if self.pending is None else f"step {self.pending.step.id!r}"
                 self.close()
                 raise Code.WRONG_JOURNAL.refusal(
                     f"entry {number} is of step {entry['step']!r}, expected {place}: another "
                     f"version of {wizard.name!r} wrote it"
                 )
-            self.take(entry)
+            self.send_entry(entry)
 
-    def take(self, entry: Mapping[str, Any]) -> None:
-        """Pass an answer to the coroutine."""
+    def send_entry(self, entry: Mapping[str, Any]) -> None:
+        """Send an entry's answers and outcome to the coroutine."""
         self._send(StepAnswer(copy.deepcopy(entry["answers"]), copy.deepcopy(entry["outcome"])))
 
     def _send(self, answer: StepAnswer | None) -> None:
-        self.last = None if self.request is None else self.request.step
+        self.last = None if self.pending is None else self.pending.step
         try:
-            request = self._coroutine.send(answer)
+            pending = self._coroutine.send(answer)
         except StopIteration as stop:
-            self.request, self.result = None, stop.value
+            self.pending, self.result = None, stop.value
             return
-        if not isinstance(request, PendingStep):
+        if not isinstance(pending, PendingStep):
             self._coroutine.close()
-            raise TypeError(f"a wizard awaits steps only, not {request!r}: that is for an action")
-        self.request = request
+            raise TypeError(f"a wizard awaits steps only, not {pending!r}: that is for an action")
+        self.pending = pending
 
     def close(self) -> None:
         self._coroutine.close()
 
 
-_OF_ANSWER = ("token", "step", "answers", "outcome", "acted", "at")
-_NAMES = {"answer": _OF_ANSWER, "repeat": _OF_ANSWER, "undo": ("token",), "abort": ("token",)}
-"""Keys that an entry must have, by its event."""
+_ANSWER_KEYS = ("token", "step", "answers", "outcome", "acted", "at")
+_KEYS_BY_EVENT = {
+    "answer": _ANSWER_KEYS,
+    "repeat": _ANSWER_KEYS,
+    "undo": ("token",),
+    "abort": ("token",),
+}
+"""Keys that an entry must have, by the entry's event."""
 
 
 @dataclass(slots=True)
-class _Replay:
+class _SequenceLog:
     """The state of a sequence after a list of entries."""
 
     entries: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     state: State = "asking"
     undone: Mapping[str, Any] | None = None
 
-    def then(self, entry: dict[str, Any]) -> _Replay:
-        for name in _NAMES[entry["event"]]:
+    def with_entry(self, entry: dict[str, Any]) -> _SequenceLog:
+        """Return the state after one more entry; raise KeyError if the entry lacks a key."""
+        for name in _KEYS_BY_EVENT[entry["event"]]:
             _ = entry[name]
         match entry["event"]:
             case "answer":
-                return _Replay([*self.entries, entry])
+                return _SequenceLog([*self.entries, entry])
             case "repeat":
-                return _Replay([*self.entries[:-1], entry])
+                return _SequenceLog([*self.entries[:-1], entry])
             case "undo":
-                return _Replay(self.entries[:-1], undone=self.entries[-1])
+                return _SequenceLog(self.entries[:-1], undone=self.entries[-1])
             case _:
-                return _Replay(self.entries, "aborted")
+                return _SequenceLog(self.entries, "aborted")
 
 
 class WizardSession:
@@ -188,16 +193,16 @@ class WizardSession:
 
     Args:
         wizard: the wizard.
-        journal: journal of its steps; one with entries is resumed. None: steps are not kept.
-        parameters: JSON values for the wizard's start; a resumed journal has its own.
+        journal: journal of the steps; a journal with entries is resumed. None: steps are not kept.
+        parameters: JSON values for the wizard's start; a resumed journal has its own values.
 
     Attributes:
         wizard: the wizard.
-        flow: name of this run, part of its tokens.
-        parameters: the parameters of its start.
-        resumed: ``since, last, done, parameters``: times at which the journal was begun and last
-            written, its answers, and its parameters; None for a new journal, and once the sequence
-            goes on.
+        flow: name of this run, which its tokens begin with.
+        parameters: the parameters with which the wizard was started.
+        resumed: facts about a resumed journal: ``since`` and ``last``, the times at which it was
+            begun and last written, ``done``, its answers, and its ``parameters``. None for a new
+            journal, and once the sequence goes on.
 
     Raises:
         CalibrationError: ``WRONG_JOURNAL``: the journal belongs to another wizard or version;
@@ -215,28 +220,28 @@ class WizardSession:
     ) -> None:
         self.wizard: Wizard = wizard
         self._journal = journal
-        header = self._header(parameters or {})
-        self._all: list[dict[str, Any]] = [] if journal is None else list(journal.entries)
+        header = self._make_header(parameters or {})
+        self._all_entries: list[dict[str, Any]] = [] if journal is None else list(journal.entries)
         try:
             self.flow: str = str(header["flow"])
             self.parameters: dict[str, Any] = dict(header["parameters"])
-            self._log = functools.reduce(_Replay.then, self._all, _Replay())
+            self._log = functools.reduce(_SequenceLog.with_entry, self._all_entries, _SequenceLog())
         except (KeyError, IndexError, TypeError, ValueError) as exc:
             raise Code.BROKEN_FILE.refusal(
                 f"the journal is incomplete: {exc!r}; expected one as a sequence writes it"
             ) from exc
-        self._run = self._resumed()
+        self._script_run = self._replay_entries()
         if journal is not None and journal.header is None:
             journal.start(header)
         self.resumed: dict[str, Any] | None = self._resumed_facts(header)
         self._errors: dict[str, str] = {}
         self._lock = asyncio.Lock()
-        self._scope: asyncio.Timeout | None = None
+        self._action_timeout: asyncio.Timeout | None = None
 
     def _resumed_facts(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return facts about the resumed journal; None if there is nothing to resume.
 
-        They are shown because measurements may be old: touched marks may have moved since.
+        Front-ends show these facts, since touched marks may have moved in the meantime.
         """
         if self.state != "asking" or not self._log.entries:
             return None
@@ -247,7 +252,7 @@ class WizardSession:
         times = {"since": header.get("started_at"), "last": done[-1]["at"]}
         return {**times, "done": done, "parameters": copy.deepcopy(self.parameters)}
 
-    def _resumed(self) -> _ScriptRun:
+    def _replay_entries(self) -> _ScriptRun:
         try:
             return _ScriptRun(self.wizard, self.parameters, self._log.entries)
         except (AttributeError, LookupError, TypeError, ValueError) as exc:
@@ -255,17 +260,18 @@ class WizardSession:
                 raise
             raise Code.BROKEN_FILE.refusal(
                 f"the journal's answers do not lead through {self.wizard.name!r}: {exc!r}; "
-                "expected those that its steps took"
+                "expected answers that its steps accept"
             ) from exc
 
-    def _header(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    def _make_header(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         wizard, journal = self.wizard, self._journal
         expected = {"schema": SCHEMA, "wizard": wizard.name, "version": wizard.version}
         if journal is not None and journal.header is not None:
             actual = {name: journal.header.get(name) for name in expected}
             if actual != expected:
                 raise Code.WRONG_JOURNAL.refusal(
-                    f"{journal.path}: written by {_named(actual)}, expected {_named(expected)}",
+                    f"{journal.path}: written by {_describe_wizard(actual)}, expected "
+                    f"{_describe_wizard(expected)}",
                     expected,
                     actual,
                 )
@@ -274,26 +280,26 @@ class WizardSession:
             **expected,
             "flow": secrets.token_hex(8),
             "started_at": datetime.now(UTC).isoformat(),
-            "parameters": _stored(dict(parameters), "the parameters"),
+            "parameters": _as_stored(dict(parameters), "the parameters"),
         }
 
     @property
     def state(self) -> State:
         """State of the wizard."""
-        if self._log.state == "asking" and self._run.request is None:
+        if self._log.state == "asking" and self._script_run.pending is None:
             return "ended"
         return self._log.state
 
     @property
     def result(self) -> Any:
         """Return value of the wizard; None before its end."""
-        return self._run.result
+        return self._script_run.result
 
     @property
     def step(self) -> Step | None:
         """The current step; None at the end, and after an abort."""
-        request = self._run.request
-        return None if request is None or self.state != "asking" else request.step
+        pending = self._script_run.pending
+        return None if pending is None or self.state != "asking" else pending.step
 
     @property
     def busy(self) -> bool:
@@ -302,27 +308,31 @@ class WizardSession:
 
     @property
     def samples(self) -> list[dict[str, Any]]:
-        """Answers and outcomes that were not undone, in order: ``step, answers, outcome, at``."""
-        names = ("step", "answers", "outcome", "at")
-        return [{name: copy.deepcopy(entry[name]) for name in names} for entry in self._log.entries]
+        """Answers and outcomes that were not undone, in order.
+
+        Each has ``step``, ``answers``, ``outcome`` and ``at``.
+        """
+        keys = ("step", "answers", "outcome", "at")
+        return [{name: copy.deepcopy(entry[name]) for name in keys} for entry in self._log.entries]
 
     @property
     def token(self) -> str:
-        """Word that a call must repeat, so that no call counts twice; it changes at each entry."""
-        return f"{self.flow}.{len(self._all)}"
+        """Word that a call must repeat, so that no call counts twice; each entry changes it."""
+        return f"{self.flow}.{len(self._all_entries)}"
 
     @property
     def current(self) -> dict[str, Any]:
-        """View for a front-end to show, as JSON takes it.
+        """The current step as JSON data, for a front-end to show.
 
         Returns:
-            ``flow, wizard, token, type, number`` (of the step, from 1)``, of`` (about how many
-            steps; None: not known)``, step`` (its id)``, title, description, button, notes,
-            verdict`` (``level, text``)``, preview, waiting,
-            schema, defaults, errors`` (a text by input, ``base`` for all else)``, can`` (of ``undo,
-            repeat, abort``)``, result``. ``type`` is ``form`` (with inputs), ``confirm`` (without),
-            ``progress`` (its action is under way), ``result`` (with the verdict and the preview of
-            the last step) or ``abort``.
+            A dict with ``flow``, ``wizard``, ``token``, ``type``, ``number`` (of the step, from 1),
+            ``of`` (about how many steps; None: not known), ``step`` (its id), ``title``,
+            ``description``, ``button``, ``notes``, ``verdict`` (``level``, ``text``), ``preview``,
+            ``waiting``, ``schema``, ``defaults``, ``errors`` (a text for each input, ``base`` for
+            other errors), ``can`` (the possible calls among ``undo``, ``repeat``, ``abort``) and
+            ``result``. ``type`` is ``form`` (with inputs), ``confirm`` (without inputs),
+            ``progress`` (the step's action is under way), ``result`` (with the verdict and the
+            preview of the last step) or ``abort``.
         """
         view: dict[str, Any] = {
             "flow": self.flow,
@@ -330,16 +340,16 @@ class WizardSession:
             "token": self.token,
             "type": {"ended": "result", "aborted": "abort"}.get(self.state, "confirm"),
             "number": len(self._log.entries) + 1,
-            "of": self._about(),
+            "of": self._count_steps(),
             "errors": dict(self._errors),
-            "can": self._can(),
+            "can": self._possible_calls(),
             "result": self.result,
         }
         step = self.step
         if step is None:
-            last = self._run.last if self.state == "ended" else None
-            return view if last is None else {**view, **_shown_of(last)}
-        if self._scope is not None:
+            last = self._script_run.last if self.state == "ended" else None
+            return view if last is None else {**view, **_verdict_and_preview(last)}
+        if self._action_timeout is not None:
             view["type"] = "progress"
         elif step.inputs:
             view["type"] = "form"
@@ -350,20 +360,20 @@ class WizardSession:
             "description": step.description,
             "button": step.button,
             "notes": list(step.notes),
-            **_shown_of(step),
+            **_verdict_and_preview(step),
             "waiting": step.waiting,
             "schema": step.schema(),
             "defaults": self._defaults(step),
         }
 
-    def _about(self) -> int | None:
-        """Return the approximate number of steps; None if it is not known."""
+    def _count_steps(self) -> int | None:
+        """Return the approximate number of steps; None: not known."""
         if not self.wizard.steps or self.step is None:
             return None
         remaining = {"save": 0, "review": 1}.get(self.step.id, 2)
         return max(self.wizard.steps, len(self._log.entries) + 1 + remaining)
 
-    def _can(self) -> list[str]:
+    def _possible_calls(self) -> list[str]:
         if self.state != "asking":
             return []
         entries = self._log.entries
@@ -395,20 +405,22 @@ class WizardSession:
         """
         given = {} if answers is None else answers
         async with self._lock:
-            if self._is_done("answer", token, given):
+            if self._is_repeated_call("answer", token, given):
                 return self.current
-            request = self._expect(token)
-            with self._shown():
-                values = request.step.checked(self._with_undone(request.step, given))
-                outcome = await self._act(request, values)
-                self._take(self._run, self._entry("answer", request, values, outcome, given))
+            pending = self._require_token(token)
+            with self._keep_errors():
+                values = pending.step.checked(self._fill_defaults(pending.step, given))
+                outcome = await self._run_action(pending, values)
+                self._accept_answer(
+                    self._script_run, self._make_entry("answer", pending, values, outcome, given)
+                )
             return self.current
 
-    def _with_undone(self, step: Step, given: object) -> object:
+    def _fill_defaults(self, step: Step, given: object) -> object:
         return {**self._defaults(step), **given} if isinstance(given, Mapping) else given
 
     async def undo(self, token: str) -> dict[str, Any]:
-        """Go back to the step before, with its answers as defaults.
+        """Go back to the previous step, with its answers as defaults.
 
         Arguments, result and errors are those of :meth:`submit`.
 
@@ -418,14 +430,14 @@ class WizardSession:
         Cancellation: nothing is undone.
         """
         async with self._lock:
-            if self._is_done("undo", token):
+            if self._is_repeated_call("undo", token):
                 return self.current
-            run = self._before("undo", token)
+            run = self._rerun_to_last_step("undo", token)
             self._commit(run, {"event": "undo", "token": token})
             return self.current
 
     async def repeat(self, token: str) -> dict[str, Any]:
-        """Run the action of the step before again, with the same answers.
+        """Run the action of the previous step again, with the same answers.
 
         The new outcome replaces the old one. An error is shown, and the old outcome stays.
         Arguments, result and errors are those of :meth:`submit`.
@@ -433,15 +445,17 @@ class WizardSession:
         Cancellation: the action is cancelled and the old outcome stays.
         """
         async with self._lock:
-            if self._is_done("repeat", token):
+            if self._is_repeated_call("repeat", token):
                 return self.current
-            run, last = self._before("repeat", token), self._log.entries[-1]
-            request = run.request
-            if request is None or request.action is None:
+            run, last = self._rerun_to_last_step("repeat", token), self._log.entries[-1]
+            pending = run.pending
+            if pending is None or pending.action is None:
                 raise self._impossible_error("repeat")
-            with self._shown():
-                outcome = await self._act(request, last["answers"])
-                self._take(run, self._entry("repeat", request, last["answers"], outcome, None))
+            with self._keep_errors():
+                outcome = await self._run_action(pending, last["answers"])
+                self._accept_answer(
+                    run, self._make_entry("repeat", pending, last["answers"], outcome, None)
+                )
             return self.current
 
     async def abort(self, token: str) -> dict[str, Any]:
@@ -454,24 +468,25 @@ class WizardSession:
 
         Cancellation: the sequence goes on, but a running action is cancelled nevertheless.
         """
-        if self._scope is not None and token == self.token:
-            self._scope.reschedule(asyncio.get_running_loop().time())
+        if self._action_timeout is not None and token == self.token:
+            self._action_timeout.reschedule(asyncio.get_running_loop().time())
         async with self._lock:
-            if self._is_done("abort", token):
+            if self._is_repeated_call("abort", token):
                 return self.current
-            self._expect(token)
-            self._commit(self._run, {"event": "abort", "token": token})
-            self._run.close()
+            self._require_token(token)
+            self._commit(self._script_run, {"event": "abort", "token": token})
+            self._script_run.close()
             return self.current
 
     def close(self) -> None:
-        """Free the coroutine and the journal; the sequence can be resumed from it."""
-        self._run.close()
+        """Free the coroutine and the journal; the sequence can be resumed from the journal."""
+        self._script_run.close()
         if self._journal is not None:
             self._journal.close()
 
-    def _is_done(self, event: str, token: str, given: object = None) -> bool:
-        last = self._all[-1] if self._all else None
+    def _is_repeated_call(self, event: str, token: str, given: object = None) -> bool:
+        """Return True if the last entry is already the result of this call."""
+        last = self._all_entries[-1] if self._all_entries else None
         return (
             last is not None
             and last["token"] == token
@@ -479,9 +494,9 @@ class WizardSession:
             and last.get("given") == (_digest(given) if event == "answer" else None)
         )
 
-    def _expect(self, token: str) -> PendingStep:
-        request = self._run.request
-        if self.state != "asking" or request is None:
+    def _require_token(self, token: str) -> PendingStep:
+        pending = self._script_run.pending
+        if self.state != "asking" or pending is None:
             raise Code.NOT_POSSIBLE.refusal(
                 f"the sequence is over ({self.state}); expected one that asks", got=self.state
             )
@@ -489,74 +504,75 @@ class WizardSession:
             raise Code.STALE_STEP.refusal(
                 "the step has changed meanwhile: look at the current one", self.token, token
             )
-        return request
+        return pending
 
-    def _before(self, label: str, token: str) -> _ScriptRun:
-        """Return the coroutine as it was before the last step; ``label`` names the call."""
-        self._expect(token)
-        if label not in self._can():
+    def _rerun_to_last_step(self, label: str, token: str) -> _ScriptRun:
+        """Run the coroutine again up to the last answered step; ``label`` names the call."""
+        self._require_token(token)
+        if label not in self._possible_calls():
             raise self._impossible_error(label)
         return _ScriptRun(self.wizard, self.parameters, self._log.entries[:-1])
 
     def _impossible_error(self, label: str) -> CalibrationError:
         return Code.NOT_POSSIBLE.refusal(
-            f"{label}: not possible here; expected one of {', '.join(self._can())}", got=label
+            f"{label}: not possible here; expected one of {', '.join(self._possible_calls())}",
+            got=label,
         )
 
-    async def _act(self, request: PendingStep, values: Answers) -> Any:
-        if request.action is None:
+    async def _run_action(self, pending: PendingStep, values: Answers) -> Any:
+        if pending.action is None:
             return None
-        seconds = request.step.timeout
+        seconds = pending.step.timeout
         try:
-            async with asyncio.timeout(seconds) as self._scope:
-                return await request.action(copy.deepcopy(values))
+            async with asyncio.timeout(seconds) as self._action_timeout:
+                return await pending.action(copy.deepcopy(values))
         except TimeoutError as exc:
-            if self._scope is None or not self._scope.expired():
+            if self._action_timeout is None or not self._action_timeout.expired():
                 raise
             raise TimeoutError(f"nothing came within {seconds:g} s") from exc
         finally:
-            self._scope = None
+            self._action_timeout = None
 
-    def _entry(
-        self, event: str, request: PendingStep, values: Answers, outcome: Any, given: object
+    def _make_entry(
+        self, event: str, pending: PendingStep, values: Answers, outcome: Any, given: object
     ) -> dict[str, Any]:
         entry = {
             "event": event,
             "token": self.token,
-            "step": request.step.id,
+            "step": pending.step.id,
             "answers": values,
             "outcome": outcome,
-            "acted": request.action is not None,
+            "acted": pending.action is not None,
             "given": _digest(given) if event == "answer" else None,
         }
-        return _stored(entry, f"step {request.step.id!r}: its outcome")
+        return _as_stored(entry, f"step {pending.step.id!r}: its outcome")
 
-    def _take(self, run: _ScriptRun, entry: dict[str, Any]) -> None:
-        """Pass an answer to a run, and keep both if the coroutine accepts it."""
+    def _accept_answer(self, run: _ScriptRun, entry: dict[str, Any]) -> None:
+        """Send an entry to a run; keep both if the coroutine accepts the answer."""
         try:
-            run.take(entry)
+            run.send_entry(entry)
             self._commit(run, entry)
         except BaseException:
             run.close()
-            if run is self._run:
-                self._run = _ScriptRun(self.wizard, self.parameters, self._log.entries)
+            if run is self._script_run:
+                self._script_run = _ScriptRun(self.wizard, self.parameters, self._log.entries)
             raise
 
     def _commit(self, run: _ScriptRun, entry: dict[str, Any]) -> None:
         entry = {**entry, "at": datetime.now(UTC).isoformat()}
         if self._journal is not None:
             entry = self._journal.append(entry)
-        self._all.append(entry)
-        self._log = self._log.then(entry)
+        self._all_entries.append(entry)
+        self._log = self._log.with_entry(entry)
         self.resumed = None
-        if run is not self._run:
-            self._run.close()
-            self._run = run
+        if run is not self._script_run:
+            self._script_run.close()
+            self._script_run = run
         self._errors = {}
 
     @contextlib.contextmanager
-    def _shown(self) -> Iterator[None]:
-        """Turn exceptions into errors that the step shows."""
+    def _keep_errors(self) -> Iterator[None]:
+        """Catch exceptions, and keep them as errors that the step shows."""
         self._errors = {}
         try:
             yield
@@ -567,25 +583,25 @@ class WizardSession:
             self._errors = errors
 
 
-def _shown_of(step: Step) -> dict[str, Any]:
-    """Return the values that a step shows beside its texts."""
+def _verdict_and_preview(step: Step) -> dict[str, Any]:
+    """Return a step's verdict and preview as JSON data."""
     return {
         "verdict": None if step.verdict is None else asdict(step.verdict),
         "preview": None if step.preview is None else dict(step.preview),
     }
 
 
-def _named(header: Mapping[str, Any]) -> str:
+def _describe_wizard(header: Mapping[str, Any]) -> str:
     return f"{header['wizard']!r} version {header['version']} ({header['schema']})"
 
 
-def _stored(value: dict[str, Any], label: str) -> dict[str, Any]:
-    """Return a value as it will be read, so that a resumed sequence has the same one."""
+def _as_stored(value: dict[str, Any], label: str) -> dict[str, Any]:
+    """Return a value as JSON restores it, so that a resumed sequence has the same value."""
     try:
-        read: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
+        stored: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as exc:
         raise Code.NOT_STORABLE.refusal(f"{label} cannot be stored: {exc}") from exc
-    return read
+    return stored
 
 
 def _digest(answers: object) -> str:

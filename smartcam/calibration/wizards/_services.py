@@ -3,7 +3,8 @@
 A front-end starts a wizard under a name, shows its steps and sends the answers. No request reads or
 writes a file outside of the folder.
 
-Source: thesis 2.2.2, Figures 2.8 to 2.12 (published) for the services.
+Source: the thesis with which smartcam began, 2.2.2, Figures 2.8 to 2.12 (published) for the
+services.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ MATRIX_SUFFIX = ".yaml"
 
 
 class CalibrationService:
-    """Calibrations in a folder, and one wizard at a time that makes or checks one.
+    """Calibrations in a folder, and one wizard at a time that makes or checks a calibration.
 
     Args:
         folder: folder of the calibrations and journals.
@@ -72,10 +73,11 @@ class CalibrationService:
 
     @property
     def listing(self) -> list[dict[str, Any]]:
-        """A row for each calibration, as JSON takes it.
+        """Rows of JSON data, one for each calibration.
 
-        ``name, kind, written_at, held_out_mm, checked_at, stale, problem``, with None for values
-        that are not known; a file that cannot be read has a ``problem``.
+        The keys are ``name``, ``kind``, ``written_at``, ``held_out_mm``, ``checked_at``, ``stale``
+        and ``problem``; values that are not known are None. A file that cannot be read has a
+        ``problem``.
         """
         return listing(self.folder)
 
@@ -86,12 +88,12 @@ class CalibrationService:
 
     @property
     def name(self) -> str | None:
-        """Name that the running wizard was started under; None without one."""
+        """Name under which the running wizard was started; None: no wizard is running."""
         return self._name
 
     @property
     def session(self) -> WizardSession:
-        """The running sequence, or the one that ended last.
+        """The running sequence, or the last one that ended.
 
         Raises:
             CalibrationError: ``NO_SEQUENCE``.
@@ -110,17 +112,18 @@ class CalibrationService:
         *,
         fresh: bool = False,
     ) -> dict[str, Any]:
-        """Start a wizard, or resume the interrupted one of that name.
+        """Start a wizard, or resume the interrupted wizard of this name.
 
         Args:
             name: name of the calibration.
             wizard: kind of the wizard; each kind has a journal of its own for a name.
-            parameters: parameters of the wizard's start; a resumed one has its own.
-            fresh: start from the first step in any case. The journal of the run before is kept as
-                an earlier one.
+            parameters: parameters of the wizard's start; a resumed wizard has its own.
+            fresh: whether to start from the first step in any case. The journal of the run before
+                is kept as an earlier journal.
 
         Returns:
-            The first step, or the one at which it was interrupted: :attr:`WizardSession.current`.
+            The first step, or the step at which the wizard was interrupted, as
+            :attr:`WizardSession.current`.
 
         Raises:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND`` (the wizard), ``IN_USE``,
@@ -138,17 +141,19 @@ class CalibrationService:
                 "an action is under way; expected it to end or to be aborted"
             )
         self.close()
-        given = {**(parameters or {}), "name": name}
-        session = None if fresh else self._opened(path, wizard, given)
+        start_parameters = {**(parameters or {}), "name": name}
+        session = None if fresh else self._open_session(path, wizard, start_parameters)
         if session is None or session.state != "asking":
             if session is not None:
                 session.close()
-            _put_aside(path)
-            session = self._opened(path, wizard, given)
+            _move_aside(path)
+            session = self._open_session(path, wizard, start_parameters)
         self._session, self._name = session, name
         return self.session.current
 
-    def _opened(self, path: Path, wizard: str, parameters: Mapping[str, Any]) -> WizardSession:
+    def _open_session(
+        self, path: Path, wizard: str, parameters: Mapping[str, Any]
+    ) -> WizardSession:
         journal = Journal(path)
         try:
             return WizardSession(self._wizards[wizard], journal, parameters=parameters)
@@ -161,11 +166,11 @@ class CalibrationService:
 
         Args:
             name: name of the calibration.
-            target: name of the file. With ``.json`` it is a copy that :meth:`load` reads; with
-                ``.yaml`` it is the matrix, which PyYAML and ``cv2.FileStorage`` read, as does
-                :func:`~smartcam.calibration.formats.read_matrix`.
-            form: write the frame of its plane in this format instead of the matrix, such as
-                ``tf2``; the scale is in a comment.
+            target: name of the file. A ``.json`` file is a copy that :meth:`load` reads. A
+                ``.yaml`` file holds the matrix, which PyYAML, ``cv2.FileStorage`` and
+                :func:`~smartcam.calibration.formats.read_matrix` read.
+            form: format, such as ``tf2``, in which the frame of the calibration's plane is written
+                instead of the matrix; a comment has the scale.
 
         Returns:
             The file's path in the folder.
@@ -193,7 +198,7 @@ class CalibrationService:
                 path.suffix,
             )
         else:
-            calibration = PlaneCalibration.from_data(_of_kind(document, KIND, source.name))
+            calibration = PlaneCalibration.from_data(_data_of_kind(document, KIND, source.name))
             if form is not None:
                 body = compose(form, calibration, suffix=path.suffix).encode()
             else:
@@ -203,11 +208,11 @@ class CalibrationService:
         return f"{EXPORTS}/{path.name}"
 
     def load(self, name_or_path: str) -> AnyCalibration:
-        """Load a calibration, of a plane or by a sheet, which :meth:`transform` then uses.
+        """Load a calibration of a plane or by a sheet, for :meth:`transform` to use.
 
         Args:
-            name_or_path: name of the calibration; with a ``/`` the path of an exported one in the
-                folder.
+            name_or_path: name of the calibration; or, with a ``/``, path in the folder of an
+                exported calibration.
 
         Raises:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or the calibration cannot be read.
@@ -224,7 +229,7 @@ class CalibrationService:
             x: coordinate to the right, in the unit of the calibration.
             y: coordinate upwards; for a calibration by a sheet, whose pixels count down, it is -v.
             theta: angle, counter-clockwise, radians.
-            frame: frame that the result must be in; None for the calibration's.
+            frame: frame in which the result must be; None for the calibration's frame.
 
         Raises:
             CalibrationError: ``NO_CALIBRATION``, ``WRONG_FRAME``, ``OUT_OF_FIELD``.
@@ -251,7 +256,7 @@ class CalibrationService:
         self._session = self._name = None
 
 
-def _put_aside(path: Path) -> None:
+def _move_aside(path: Path) -> None:
     if not path.exists():
         return
     try:
@@ -263,7 +268,7 @@ def _put_aside(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-def _of_kind(document: Document, kind: str, name: str) -> dict[str, Any]:
+def _data_of_kind(document: Document, kind: str, name: str) -> dict[str, Any]:
     if document.kind != kind:
         raise Code.WRONG_KIND.refusal(
             f"{name}: holds {document.kind!r}, expected {kind!r}", kind, document.kind

@@ -3,10 +3,11 @@
 It asks for the target and the lengths of its rulers, takes a picture and finds the target in it.
 Then the robot touches any number of the target's corners, or the origin and a point on each of the
 rays A and B: half-lines from the origin along the sheet's axes. The wizard
-knows no camera and no robot: it is given a function that takes a picture and, if the robot can be
-asked, one that reads its pose.
+knows no camera and no robot: it gets a function that takes a picture and, if the robot can be read,
+a function that reads the robot's pose.
 
-Source: thesis 3.2.3.2 (published) for the origin that a camera finds in its image.
+Source: the thesis with which smartcam began, 3.2.3.2 (published) for the origin that a camera finds
+in its image.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ from smartcam.calibration.wizards._marks import Mark
 from smartcam.calibration.wizards._pictures import (
     MAX_PREVIEW_BYTES,
     PICTURE_TIMEOUT,
-    how_to_take,
-    taker,
+    picture_instruction,
+    picture_taker,
 )
 from smartcam.calibration.wizards._points import (
     MAX_POINTS,
-    Calibrated,
+    CalibrationOutcome,
     PointSource,
     about_step,
-    calibrated_plane,
+    plane_outcome,
 )
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Step, pick
-from smartcam.calibration.wizards._target_drawing import draw_sheet, place_in, with_ring
+from smartcam.calibration.wizards._steps import Step, number_input
+from smartcam.calibration.wizards._target_drawing import add_ring, draw_sheet, preview_coordinates
 from smartcam.calibration.wizards._target_steps import ask_target
 from smartcam.geometry import CameraModel
 
@@ -57,7 +58,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._touches import ReadRobot
 
 DIAGONALS: Final = ((-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0))
-"""Directions in which the outermost points of a target lie, the origin first."""
+"""Directions towards the outermost points of a target; the first one leads to the origin."""
 
 
 def sheet_wizard(
@@ -75,19 +76,19 @@ def sheet_wizard(
 
     Its parameters: ``name`` (of the calibration, passed to ``save_to``), and as defaults of the
     first step ``method`` (corners, rays), ``camera_frame``, ``robot_frame``, ``tool``, ``unit``
-    (mm, m), ``side``, ``touch_sigma`` (mm); ``target``: a description of the target on the sheet,
-    which is then not asked for.
+    (mm, m), ``side``, ``touch_sigma`` (mm); ``target``: a description of the target on the sheet;
+    the wizard then does not ask for the target.
 
-    Its result: that of the plane's wizard, and ``seen`` (number of the target's points in the
-    picture), ``rms_px`` (RMS distance of these points from their fit); ``predicted_mm`` is the
-    predicted error, RMS over the points that were seen.
+    Its result has the entries of the plane wizard's result, and ``seen`` (number of the target's
+    points in the picture) and ``rms_px`` (RMS distance of these points from their fit).
+    ``predicted_mm`` is the predicted error, RMS over the points that were seen.
 
     Args:
         take_picture: function that takes a picture; or an open source of frames, whose first frame
             after the button was pressed is used.
         save_to: function that returns the file for a name.
-        read_robot: function that reads the robot's pose; None: it is typed.
-        suggested: default of the target that is asked for.
+        read_robot: function that reads the robot's pose; None: the pose is typed.
+        suggested: default of the question for the target.
         camera: the lens, stored with each picture; None: a homography is fitted instead.
         lens_covariance: covariance of the lens' values, as for :func:`calibrate_sheet`.
         connect: arguments of :func:`smartcam.connect` for the camera, ``url`` included, for the
@@ -118,7 +119,7 @@ def sheet_wizard(
         source = _SheetSource(about, read_robot, target)
         # v of pixels grows downwards, y of mapped positions upwards
         source.connect = None if connect is None else {**connect, "y_down": True}
-        await source.ask_picture(taker(take_picture), camera, lens_covariance, awaited)
+        await source.ask_picture(picture_taker(take_picture), camera, lens_covariance, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
 
     return Wizard(name=KIND, version=1, script=script, steps=10)
@@ -152,9 +153,9 @@ class _SheetSource(PointSource):
     ) -> None:
         """Ask for the picture, and keep the view found in it."""
 
-        async def look(_answers: Answers) -> dict[str, Any]:
+        async def find_sheet(_answers: Answers) -> dict[str, Any]:
             image = await take_picture()
-            sighting = await asyncio.to_thread(_sheet_in, image, self._target, lens)
+            sighting = await asyncio.to_thread(_find_sheet, image, self._target, lens)
             covariance = None if lens_covariance is None else np.asarray(lens_covariance).tolist()
             return {**sighting, "lens_covariance": covariance}
 
@@ -162,13 +163,13 @@ class _SheetSource(PointSource):
             id="picture",
             title="The sheet in the camera's field",
             description="Lay the sheet flat into the camera's field and fix it. The robot must not "
-            f"hide it, and nothing must move until all is touched.{how_to_take(awaited)}",
+            f"hide it, and nothing must move until all is touched.{picture_instruction(awaited)}",
             button="Wait for the picture" if awaited else "Take a picture",
             notes=("picture 1 of 1; to end without it, abort",) if awaited else (),
             waiting=f"Waiting: {awaited}" if awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
-        outcome = (await ask(step, look)).outcome
+        outcome = (await ask(step, find_sheet)).outcome
         self._view = TargetView.from_data(outcome["view"], target=self._target)
         self._camera = (
             None if outcome["camera"] is None else CameraModel.from_data(outcome["camera"])
@@ -176,48 +177,50 @@ class _SheetSource(PointSource):
         self._lens_covariance = outcome.get("lens_covariance")  # missing in older journals
         self._svg = outcome["preview"]
 
-    def shown(self, mark: Mark) -> dict[str, Any]:
-        """Return notes on the picture, and the picture with a ring around the point."""
+    def step_extras(self, mark: Mark) -> dict[str, Any]:
+        """Return notes on the picture, and the picture with a ring around a mark, for a step."""
         view = self._view
         notes = [f"{len(view.ids)} of {len(self._target.points)} points of the target seen"]
         if view.margin is not None:
             notes.append(
                 f"the origin differs from the other corners by {view.margin:.0f} of 255 grey levels"
             )
-        svg, seen = self._svg, np.flatnonzero(view.ids == mark.number)
-        if svg and len(seen):
-            svg = with_ring(svg, view.size, view.points[seen[0]])
-        preview = {"svg": svg, "choices": self._corners()} if svg else None
+        svg, index_in_view = self._svg, np.flatnonzero(view.ids == mark.number)
+        if svg and len(index_in_view):
+            svg = add_ring(svg, view.size, view.points[index_in_view[0]])
+        preview = {"svg": svg, "choices": self._clickable_corners()} if svg else None
         return {"notes": tuple(notes), "preview": preview}
 
-    def _corners(self) -> list[dict[str, Any]]:
-        """Return the visible points as clickable choices, at their places in the picture."""
-        columns, view = shape_of(self._target)[0], self._view
-        places = np.round(place_in(view.size, view.points), 1).tolist()
+    def _clickable_corners(self) -> list[dict[str, Any]]:
+        """Return clickable choices for the visible points, at the points' places in the picture."""
+        columns, view = grid_size(self._target)[0], self._view
+        places = np.round(preview_coordinates(view.size, view.points), 1).tolist()
         return [
-            {"at": at, "label": f"{1 + column}, {1 + row}", "answers": _answers(column, row)}
+            {"at": at, "label": f"{1 + column}, {1 + row}", "answers": _corner_answers(column, row)}
             for at, number in zip(places, view.ids.tolist(), strict=True)
             for row, column in [divmod(number, columns)]
         ]
 
-    async def ray_origin(self) -> tuple[Mark, float]:
+    async def find_ray_origin(self) -> tuple[Mark, float]:
         return Mark("", 0.0, 0.0, 0.0, number=0), 1.0  # a mark on the sheet is in metres
 
-    async def add(self) -> None:
+    async def add_points(self) -> None:
         self.check_count(1, MAX_POINTS, "points")
         number = len(self.touches) + 1
-        touched = await self._touch_corner(f"touch-{number}", f"Touch point {number}", self._next())
+        touched = await self._touch_corner(
+            f"touch-{number}", f"Touch point {number}", self._choose_next_point()
+        )
         self.touches.append(touched)
 
-    async def redo(self, index: int) -> None:
+    async def ask_again(self, index: int) -> None:
         number = self.touches[index].mark.number or 0
         self.touches[index] = await self._touch_corner(
             "redo", f"Touch point {index + 1} again", number
         )
 
     async def _touch_corner(self, step_id: str, title: str, suggested: int) -> Touch:
-        """Ask for the touch of a point of the target, or of another point that the user names."""
-        columns, rows = shape_of(self._target)
+        """Ask for the touch of the suggested point, or of another point that the user names."""
+        columns, rows = grid_size(self._target)
         row, column = divmod(suggested, columns)
         step = Step(
             id=step_id,
@@ -227,55 +230,57 @@ class _SheetSource(PointSource):
             "and say which. The origin is point 1 of row 1, points count along ray A, "
             "rows along ray B.",
             inputs=(
-                pick("column", "Point of its row, counted along ray A", columns, column + 1),
-                pick("row", "Row, counted along ray B", rows, row + 1),
+                number_input(
+                    "column", "Point of its row, counted along ray A", columns, column + 1
+                ),
+                number_input("row", "Row, counted along ray B", rows, row + 1),
             ),
-            **self.shown(self._mark(column, row)),
+            **self.step_extras(self._corner_mark(column, row)),
         )
         return await self.ask_touch(
-            step, lambda answer: self._mark(answer["column"] - 1, answer["row"] - 1)
+            step, lambda answer: self._corner_mark(answer["column"] - 1, answer["row"] - 1)
         )
 
-    def _mark(self, column: int, row: int) -> Mark:
-        number = row * shape_of(self._target)[0] + column
+    def _corner_mark(self, column: int, row: int) -> Mark:
+        number = row * grid_size(self._target)[0] + column
         x, y, _ = self._target.points[number].tolist()
         return Mark(f"point {column + 1} of row {row + 1}", x, y, 0.0, number)
 
-    def _next(self) -> int:
+    def _choose_next_point(self) -> int:
         """Return the number of the point to touch next.
 
-        First come the outermost visible points, then the points farthest from all touched ones.
+        First come the outermost visible points, then the points farthest from all touched points.
         """
         ids = self._view.ids
         places = self._target.points[ids, :2]
         for direction in DIAGONALS:
             outermost = int(ids[int(np.argmax(places @ direction))])
-            if outermost not in self._touched():
+            if outermost not in self._touched_numbers():
                 return outermost
-        offsets = places[:, None] - self._target.points[self._touched(), :2]
+        offsets = places[:, None] - self._target.points[self._touched_numbers(), :2]
         nearest_squared = (offsets**2).sum(axis=2).min(axis=1).round(12)
         return int(ids[int(np.argmax(nearest_squared))])
 
-    def _touched(self) -> list[int]:
+    def _touched_numbers(self) -> list[int]:
         return [touch.mark.number or 0 for touch in self.touches]
 
     def fit(self, *, robust: bool) -> PlaneCalibration:
         return fit_corners(
             self._target,
-            self._touched(),
-            self.places,
+            self._touched_numbers(),
+            self.tip_positions,
             touch_sigma=self.sigma,
             tool_z=self.tool_z,
             robust=robust,
             robot_frame=self.about["robot_frame"],
         )
 
-    def sample(self, touch: Touch) -> dict[str, Any]:
+    def sample_entries(self, touch: Touch) -> dict[str, Any]:
         mark = touch.mark
-        touched = mark.feature if touch.what == "mark" else touch.what
+        touched = mark.feature if touch.label == "mark" else touch.label
         return {"touched": touched, "sheet": [mark.x, mark.y]}
 
-    def outcome(self, plane: PlaneCalibration) -> Calibrated:
+    def calibration_outcome(self, plane: PlaneCalibration) -> CalibrationOutcome:
         frame = self.about["camera_frame"] or None
         calibration = calibrate_sheet(
             self._view,
@@ -287,11 +292,11 @@ class _SheetSource(PointSource):
         middle = self._view.points.mean(axis=0)
         ends = calibration.transform(np.add(middle, [[0.0, 0.0], [1.0, 0.0]]))
         right = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        of_plane = calibrated_plane(plane, "what is to the right in the picture", right)
-        seen, predicted = len(self._view.ids), None
+        of_touches = plane_outcome(plane, "what is to the right in the picture", right)
+        seen_count, predicted = len(self._view.ids), None
         notes = [
-            *of_plane.notes,
-            f"{seen} points seen, {calibration.rms:.2g} px beside their plane",
+            *of_touches.notes,
+            f"{seen_count} points seen, {calibration.rms:.2g} px beside their plane",
         ]
         if plane.touch_sigma is not None:
             errors = calibration.predicted_error(self._view.points)
@@ -311,23 +316,23 @@ class _SheetSource(PointSource):
         notes += [f"{remark.code}: {remark.text}" for remark in calibration.remarks]
         remarks = [[warning.code.value, warning.text] for warning in calibration.warnings]
         judgement = calibration.judged()
-        more = {
+        figures = {
             "predicted_mm": predicted,
-            "seen": seen,
+            "seen": seen_count,
             "rms_px": calibration.rms,
             "remarks": remarks,
         }
-        return Calibrated(
-            calibration, of_plane.figures | more | judgement.figures, tuple(notes), judgement
+        return CalibrationOutcome(
+            calibration, of_touches.figures | figures | judgement.figures, tuple(notes), judgement
         )
 
-    def example(self) -> tuple[float, float]:
+    def example_point(self) -> tuple[float, float]:
         u, v = self._view.points[0].tolist()
         return u, v
 
 
-def _sheet_in(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
-    """Return a picture's view, the lens, and an SVG if it is small, as JSON takes them."""
+def _find_sheet(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
+    """Find the sheet in a picture; return the view, the lens and a small SVG as JSON data."""
     view = find_target(image, target)
     preview = draw_sheet(image, view, look_at_sheet(view, lens).plane)
     return {
@@ -337,11 +342,11 @@ def _sheet_in(image: Any, target: Target, lens: CameraModel | None) -> dict[str,
     }
 
 
-def _answers(column: int, row: int) -> Answers:
+def _corner_answers(column: int, row: int) -> Answers:
     return {"column": 1 + column, "row": 1 + row}
 
 
-def shape_of(target: Target) -> tuple[int, int]:
+def grid_size(target: Target) -> tuple[int, int]:
     """Return the number of points in a target's row, and the number of rows."""
     if isinstance(target, Charuco):
         return target.columns - 1, target.rows - 1

@@ -3,8 +3,8 @@
 A step is data. Its inputs have a JSON Schema, and check answers by the same rules, so a front-end
 does not depend on any wizard.
 
-Source: thesis 2.2.1 and Figure 2.9 (published) for a step's parts and for the three lists of
-numbers, texts and options, which :func:`as_lists` and :func:`from_lists` derive.
+Source: the thesis with which smartcam began, 2.2.1 and Figure 2.9 (published), for a step's parts
+and for the three lists of numbers, texts and options of :func:`as_lists` and :func:`from_lists`.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ Answers = dict[str, Any]
 """Answers by the names of their inputs."""
 
 _MAX_SHOWN_LENGTH = 40
-"""A message shows at most this many characters of a wrong answer."""
+"""Largest number of characters of a wrong answer that a message shows."""
 
 _YES_NO = {"no": False, "yes": True}
 """Values of a flag by their words in the thesis' lists."""
 
 
-def _shown(value: object) -> str:
+def _short_repr(value: object) -> str:
     text = repr(value)
     return text if len(text) <= _MAX_SHOWN_LENGTH else f"{text[:_MAX_SHOWN_LENGTH]}..."
 
 
-def _misfit_error(value: object, expected: str) -> ValueError:
-    return ValueError(f"{_shown(value)}: expected {expected}")
+def _wrong_value_error(value: object, expected: str) -> ValueError:
+    return ValueError(f"{_short_repr(value)}: expected {expected}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ class Input(ABC):
     Attributes:
         name: name of the answer.
         label: name for people.
-        default: value that is filled in at first; None: nothing.
+        default: value that is filled in at first; None: no value.
     """
 
     name: str
@@ -66,14 +66,14 @@ class Input(ABC):
         return {"title": self.label, **self._schema()}
 
     def checked(self, value: object) -> Any:
-        """Return an answer in its internal form; raise ValueError with the expected form."""
-        return self._checked(value)
+        """Convert an answer; raise ValueError with the expected form if it is not valid."""
+        return self._check_value(value)
 
     @abstractmethod
     def _schema(self) -> dict[str, Any]: ...
 
     @abstractmethod
-    def _checked(self, value: object) -> Any: ...
+    def _check_value(self, value: object) -> Any: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,18 +104,18 @@ class Number(Input):
             **({"x-unit": self.unit} if self.unit else {}),
         }
 
-    def _checked(self, value: object) -> Any:
+    def _check_value(self, value: object) -> Any:
         if value is None and self.optional:
             return None
         expected = "a whole number" if self.integer else "a number"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise _misfit_error(value, expected)
+            raise _wrong_value_error(value, expected)
         if not self.minimum <= value <= self.maximum:  # NaN is outside of every range
-            raise _misfit_error(value, f"{expected} from {self.minimum:g} to {self.maximum:g}")
+            raise _wrong_value_error(value, f"{expected} from {self.minimum:g} to {self.maximum:g}")
         if not self.integer:
             return float(value)
         if value != math.floor(value):
-            raise _misfit_error(value, expected)
+            raise _wrong_value_error(value, expected)
         return int(value)
 
 
@@ -124,8 +124,8 @@ class Text(Input):
     """Input for a text of one line.
 
     Attributes:
-        pattern: regular expression that the whole text must match, with only such syntax as Python
-            and ECMAScript share.
+        pattern: regular expression that the whole text must match, in the syntax that Python and
+            ECMAScript share.
         expected: meaning of the pattern, for people.
         max_length: largest number of characters.
     """
@@ -136,13 +136,13 @@ class Text(Input):
     max_length: int = 200
 
     def _schema(self) -> dict[str, Any]:
-        # not $, which in Python allows a line feed after it
+        # not $, since Python allows a line feed after the end
         pattern = rf"^(?:{self.pattern})(?![\s\S])"
         return {"type": "string", "pattern": pattern, "maxLength": self.max_length}
 
-    def _checked(self, value: object) -> Any:
+    def _check_value(self, value: object) -> Any:
         if not isinstance(value, str) or not re.fullmatch(self.pattern, value):
-            raise _misfit_error(value, self.expected)
+            raise _wrong_value_error(value, self.expected)
         if len(value) > self.max_length:
             raise ValueError(
                 f"{len(value)} characters: expected {self.expected}, {self.max_length} at most"
@@ -152,7 +152,7 @@ class Text(Input):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option(Input):
-    """Input for one of several options; without a default the first one is preselected.
+    """Input for one of several options; without a default, the first option is preselected.
 
     Attributes:
         options: texts for people, by the answer that each stands for.
@@ -165,9 +165,9 @@ class Option(Input):
         rows = [{"const": value, "title": text} for value, text in self.options.items()]
         return {"type": "string", "oneOf": rows}
 
-    def _checked(self, value: object) -> Any:
+    def _check_value(self, value: object) -> Any:
         if not isinstance(value, str) or value not in self.options:
-            raise _misfit_error(value, f"one of {', '.join(self.options)}")
+            raise _wrong_value_error(value, f"one of {', '.join(self.options)}")
         return value
 
 
@@ -180,13 +180,13 @@ class Flag(Input):
     def _schema(self) -> dict[str, Any]:
         return {"type": "boolean"}
 
-    def _checked(self, value: object) -> Any:
+    def _check_value(self, value: object) -> Any:
         if not isinstance(value, bool):
-            raise _misfit_error(value, "true or false")
+            raise _wrong_value_error(value, "true or false")
         return value
 
 
-def pick(name: str, label: str, count: int, default: int) -> Number:
+def number_input(name: str, label: str, count: int, default: int) -> Number:
     """Return an input for a number from 1 to ``count``."""
     return Number(name=name, label=label, integer=True, minimum=1, maximum=count, default=default)
 
@@ -196,7 +196,7 @@ class Step:
     """A page of a wizard: texts to show, and inputs to ask for.
 
     Attributes:
-        id: name of the step; the same one may come again.
+        id: name of the step; a step may come again.
         title: heading of one line.
         description: the task of the user.
         button: text on the button that goes on.
@@ -221,7 +221,7 @@ class Step:
     timeout: float = 30.0
 
     def schema(self) -> dict[str, Any]:
-        """Return the JSON Schema (2020-12) of its answers."""
+        """Return the JSON Schema (2020-12) of the step's answers."""
         return {
             "$schema": DIALECT,
             "type": "object",
@@ -235,7 +235,7 @@ class Step:
         }
 
     def defaults(self) -> Answers:
-        """Return the default answers by their inputs' names; inputs may have none."""
+        """Return the default answers by the names of those inputs that have a default."""
         values: Answers = {}
         for input_field in self.inputs:
             value = input_field.default
@@ -257,15 +257,15 @@ class Step:
         )
 
     def checked(self, answers: object) -> Answers:
-        """Return answers in their internal form, with defaults for missing ones.
+        """Convert answers, and fill in defaults for missing answers.
 
         Raises:
             CalibrationError: ``WRONG_ANSWERS``; ``got`` has a text for each wrong answer, and under
-                ``base`` one for those that belong to no input.
+                ``base`` a text for answers that belong to no input.
         """
         if not isinstance(answers, Mapping):
             raise _wrong_answers_error(
-                {"base": f"{_shown(answers)}: expected answers by the names of inputs"}
+                {"base": f"{_short_repr(answers)}: expected answers by the names of inputs"}
             )
         given = {**self.defaults(), **cast("Mapping[str, Any]", answers)}
         errors: dict[str, str] = {}
@@ -279,7 +279,7 @@ class Step:
                 errors[input_field.name] = str(exc)
         if given:
             names = ", ".join(input_field.name for input_field in self.inputs) or "nothing"
-            errors["base"] = f"{_shown(next(iter(given)))} is not asked for, but {names}"
+            errors["base"] = f"{_short_repr(next(iter(given)))} is not asked for, but {names}"
         if errors:
             raise _wrong_answers_error(errors)
         return values
@@ -311,8 +311,8 @@ def as_lists(step: Step) -> dict[str, list[Any]]:
     Returns:
         ``descriptions_for_needed_values``, ``default_needed_values`` and the same for ``strings``
         and ``options``. An option is one text, ``"DEFAULT OPT1 OPT2 ..."``; a flag is an option of
-        ``no`` and ``yes``; a number without a default has 0.0, which stands for no number if it may
-        be missing and cannot be 0.
+        ``no`` and ``yes``; a number without a default has 0.0, which stands for no answer if the
+        number is optional and cannot be 0.
 
     Source: thesis Figure 2.9 (published).
     """
@@ -321,7 +321,7 @@ def as_lists(step: Step) -> dict[str, list[Any]]:
         lists[f"descriptions_for_needed_{kind}"] = []
         lists[f"default_needed_{kind}"] = []
     for input_field in step.inputs:
-        kind, default = _as_listed(input_field, step.defaults().get(input_field.name))
+        kind, default = _list_entry(input_field, step.defaults().get(input_field.name))
         unit = (
             f" [{input_field.unit}]" if isinstance(input_field, Number) and input_field.unit else ""
         )
@@ -330,7 +330,7 @@ def as_lists(step: Step) -> dict[str, list[Any]]:
     return lists
 
 
-def _as_listed(input_field: Input, default: Any) -> tuple[str, Any]:
+def _list_entry(input_field: Input, default: Any) -> tuple[str, Any]:
     match input_field:
         case Number():
             return "values", 0.0 if default is None else float(default)
@@ -348,7 +348,7 @@ def from_lists(
     texts: Sequence[str] = (),
     options: Sequence[str] = (),
 ) -> Answers:
-    """Return the answers in the thesis' three lists, which the step then checks.
+    """Return the answers in the thesis' three lists, for the step to check.
 
     Raises:
         CalibrationError: ``WRONG_ANSWERS``, a list is too short or too long.
@@ -358,14 +358,14 @@ def from_lists(
         "strings": list(texts),
         "options": list(options),
     }
-    wanted = as_lists(step)
+    expected_lists = as_lists(step)
     for kind, row in given.items():
-        count = len(wanted[f"default_needed_{kind}"])
+        count = len(expected_lists[f"default_needed_{kind}"])
         if len(row) != count:
             raise _wrong_answers_error({"base": f"{len(row)} {kind}: expected {count}"})
     answers: Answers = {}
     for input_field in step.inputs:
-        value = given[_as_listed(input_field, None)[0]].pop(0)
+        value = given[_list_entry(input_field, None)[0]].pop(0)
         if isinstance(input_field, Flag):
             value = _YES_NO.get(value, value)
         elif (

@@ -25,7 +25,7 @@ _COUNTS: Final = (
 )
 
 
-def _length(name: str, label: str, *, optional: bool = False) -> Number:
+def _length_input(name: str, label: str, *, optional: bool = False) -> Number:
     return Number(
         name=name, label=label, unit="mm", minimum=0.1, maximum=10_000.0, optional=optional
     )
@@ -34,28 +34,30 @@ def _length(name: str, label: str, *, optional: bool = False) -> Number:
 _INPUTS: Final[Mapping[str, tuple[Input, ...]]] = {
     "checkerboard": (
         *(replace(count, label=f"{count.label} of inner corners") for count in _COUNTS),
-        _length("square", "Side of a square"),
+        _length_input("square", "Side of a square"),
         Flag(name="origin_mark", label="A black dot marks the origin", default=True),
     ),
     "charuco": (
         *(replace(count, label=f"{count.label} of squares") for count in _COUNTS),
-        _length("square", "Side of a square"),
-        _length("marker", "Side of a marker"),
+        _length_input("square", "Side of a square"),
+        _length_input("marker", "Side of a marker"),
         Text(name="dictionary", label="Dictionary of the markers", default="DICT_5X5_250"),
         Flag(name="legacy_pattern", label="Printed by an OpenCV before 4.6"),
     ),
     "circles": (
         *(replace(count, label=f"{count.label} of dots") for count in _COUNTS),
-        _length("spacing", "Distance of two dots of a row"),
-        _length("diameter", "Diameter of a dot"),
+        _length_input("spacing", "Distance of two dots of a row"),
+        _length_input("diameter", "Diameter of a dot"),
         Flag(name="asymmetric", label="Every other row is shifted"),
-        _length("origin_diameter", "Diameter of the dot at the origin, if larger", optional=True),
+        _length_input(
+            "origin_diameter", "Diameter of the dot at the origin, if larger", optional=True
+        ),
     ),
 }
-"""Inputs for each kind of target; names are those of its attributes, lengths are in mm."""
+"""Inputs for each kind of target, named like the target's attributes; lengths are in mm."""
 
 
-def ruler(name: str, along: str = "") -> Number:
+def ruler_input(name: str, along: str = "") -> Number:
     """Return an input for the length of a printed ruler, mm."""
     return Number(
         name=name,
@@ -70,23 +72,22 @@ def ruler(name: str, along: str = "") -> Number:
 async def ask_target(
     suggested: Target | None = None, *, known: object = None, square: float | None = None
 ) -> Target:
-    """Ask for the target on the sheet and its printed size: lengths are those on paper.
+    """Ask for the target on the sheet and for its printed rulers; return it with printed lengths.
 
-    ``suggested``: default of the target. ``known``: a description of the target, which is then not
-    asked for; None: there is none. ``square``: default of a square's side, mm. A wrong description
-    of a target is refused as the step shows it, and so are rulers that
-    :func:`~smartcam.calibration.scaled` refuses.
+    ``suggested``: default of the question. ``known``: a description of the target; the question is
+    then skipped. ``square``: default of a square's side, mm. Raises CalibrationError for a wrong
+    description of a target, and for rulers that :func:`~smartcam.calibration.scaled` refuses.
     """
     if known is None:
         target = await _which_target(suggested, square)
     else:
-        target = target_from_data(_checked(known))
+        target = target_from_data(_require_mapping(known))
     step = Step(
         id="rulers",
         title="Was the sheet printed true to size?",
-        description=f"Printers scale. Measure both rulers; leave {RULER_MM:g} mm where the lengths "
-        "that were given are already those of the paper.",
-        inputs=tuple(ruler(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
+        description=f"Printers scale. Measure both rulers; leave {RULER_MM:g} mm if the lengths "
+        "that you gave were measured on the paper.",
+        inputs=tuple(ruler_input(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
     )
     measured = await ask(step)
     return scaled(target, (measured["ruler_x"], measured["ruler_y"]))
@@ -118,21 +119,21 @@ async def _which_target(suggested: Target | None, square: float | None) -> Targe
             data: object = json.loads(answer["description"])
         except (ValueError, RecursionError):
             data = None
-        return target_from_data(_checked(data))
+        return target_from_data(_require_mapping(data))
     step = Step(id="target", title="What is on it", inputs=_INPUTS[kind])
-    given = await ask(step.with_defaults({"square": square}))
+    answers = await ask(step.with_defaults({"square": square}))
     lengths = {field.name for field in _INPUTS[kind] if isinstance(field, Number) and field.unit}
     values = {
         name: 1e-3 * value if name in lengths and value is not None else value
-        for name, value in given.items()
+        for name, value in answers.items()
     }
     return target_from_data({"kind": kind, **values})
 
 
-def _checked(data: object) -> dict[str, Any]:
+def _require_mapping(data: object) -> dict[str, Any]:
     if not isinstance(data, dict):
-        wrong = "expected the description of a target, such as "
-        wrong += '{"kind": "checkerboard", "columns": 9, "rows": 6, "square": 0.025}'
-        raise Code.WRONG_ANSWERS.refusal(wrong, got={"description": wrong})
+        message = "expected the description of a target, such as "
+        message += '{"kind": "checkerboard", "columns": 9, "rows": 6, "square": 0.025}'
+        raise Code.WRONG_ANSWERS.refusal(message, got={"description": message})
     target: dict[str, Any] = data
     return target

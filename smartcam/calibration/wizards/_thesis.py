@@ -1,11 +1,12 @@
-"""Offer a camera's calibrations as the thesis' five services: one wizard, without tokens.
+"""Offer a camera's calibrations as five services, which the thesis behind smartcam defines.
 
-The steps are those of the page and of the terminal, after a first step that asks for facts without
-a field in the request: the name, the camera's place, the source of pictures. A request does not
-name its step, so only one call is answered at a time, and a sequence belongs to the client that
-started it until it ends, is aborted or is abandoned.
+The steps are the steps of the web page and the terminal. Before them, a first step asks for facts
+that have no field in the request: the name, the camera's place, the source of pictures. A request
+does not name its step, so only one call is answered at a time, and only one calibration runs at a
+time, until it ends, is aborted or is abandoned.
 
-Source: thesis 2.2.2, Figures 2.8 to 2.12 (published) for the services and their fields.
+Source: the thesis with which smartcam began, 2.2.2, Figures 2.8 to 2.12 (published) for the
+services and their fields.
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 SMARTCAMERA: Final = "SMARTCAMERA"
-"""Text, instead of a topic, for the smart camera itself."""
+"""Text that names the smart camera itself, in place of a topic."""
 
 ABANDONED_AFTER: Final = 1800.0
-"""Seconds without a call after which a running calibration is given up; its journal stays."""
+"""Seconds without a call after which a running calibration is abandoned; its journal is kept."""
 
-FIXED: Final[Mapping[str, str]] = {
+CAMERA_PLACES: Final[Mapping[str, str]] = {
     "True": "fixed in the cell, beside the robot",
     "False": "on the flange of the robot",
 }
-"""Places of a camera, for people, by their words in a request."""
+"""Texts for the places of a camera, by the words of the request's ``fixed_camera``."""
 
 
 _ABORTED: Final = Step(
@@ -63,12 +64,12 @@ T = TypeVar("T")
 
 
 class CalibrationCamera(Protocol):
-    """The smart camera that is calibrated, as the front-end of a call reaches it.
+    """The smart camera that is calibrated, as a front-end reaches it.
 
     Attributes:
         name: name of the camera.
-        y_down: whether its localizations have a y axis that was turned up.
-        unit: unit of its positions, ``m`` or ``px``.
+        y_down: whether the y axis of the camera's localizations was turned up.
+        unit: unit of the camera's positions, ``m`` or ``px``.
     """
 
     @property
@@ -90,7 +91,7 @@ class CalibrationCamera(Protocol):
 
 
 class RobotGraph(Protocol):
-    """The part of ROS other than the camera: pictures on topics, and the frames of TF."""
+    """The part of ROS that is not the smart camera: pictures on topics, and the frames of TF."""
 
     def check_topic(self, topic: str) -> None:
         """Raise ConfigurationError if a topic cannot have this name."""
@@ -107,11 +108,11 @@ class RobotGraph(Protocol):
         ...
 
     async def pose(self, frame: str, base: str, utc: float | None) -> Transform:
-        """Return the pose of a frame in another one, at a time, or now for None."""
+        """Return the pose of a frame in the frame ``base`` at a time; None for now."""
         ...
 
     async def root(self, frame: str) -> str:
-        """Return the root of the tree that a frame is in."""
+        """Return the root of the frame's tree."""
         ...
 
 
@@ -128,16 +129,16 @@ class CalibrationStart(NamedTuple):
     @property
     def topics(self) -> list[str]:
         """Topics with pictures that the request names, the preferred one first."""
-        named = (self.topic_image2, self.topic_image1)
-        return [topic for topic in named if topic not in {"", SMARTCAMERA}]
+        names = (self.topic_image2, self.topic_image1)
+        return [topic for topic in names if topic not in {"", SMARTCAMERA}]
 
     @property
     def source(self) -> str:
-        """Source of pictures: a topic, SMARTCAMERA, or an empty text for neither."""
+        """Source of pictures: a topic or SMARTCAMERA; "" if the request names neither."""
         if self.topic_image2 == SMARTCAMERA and self.fixed_camera == "True":
             return SMARTCAMERA
-        smart = SMARTCAMERA if SMARTCAMERA in {self.topic_image1, self.topic_image2} else ""
-        return next(iter(self.topics), smart)
+        smart_camera = SMARTCAMERA if SMARTCAMERA in {self.topic_image1, self.topic_image2} else ""
+        return next(iter(self.topics), smart_camera)
 
 
 class StepRequest(NamedTuple):
@@ -157,9 +158,9 @@ class PixelPoseRequest(NamedTuple):
         x: coordinate to the right, in the unit of the calibration.
         y: coordinate upwards, in the same unit.
         theta: angle, counter-clockwise, radians.
-        frame: frame that the pose was seen in; empty for the calibration's.
-        reference: frame that the result must be in; empty for the calibration's.
-        seq: number of the call.
+        frame: frame in which the pose was seen; empty for the calibration's frame.
+        reference: frame in which the result must be; empty for the calibration's frame.
+        seq: sequence number of the call.
         utc: time at which the pose was seen; None for now.
     """
 
@@ -177,52 +178,52 @@ class _Sequence:
     """A running calibration: the first step, then the wizard.
 
     Attributes:
-        asked: request that began the sequence, with the robot's base that was found.
-        first: step before the wizard.
-        service: service that runs the wizard; None before it was chosen.
-        shown: whether the current step was returned to a client.
-        aborted: whether a call has ended it.
-        pictured: time of the last picture, UTC; None if it is not known.
+        start_request: request that started the sequence; the robot's base is filled in.
+        first_step: step before the wizard.
+        service: service that runs the wizard; None: no wizard was chosen yet.
+        was_returned: whether a step was returned to a client.
+        is_aborted: whether a call has aborted the sequence.
+        picture_time: time of the last picture, UTC; None: not known.
     """
 
     start_request: CalibrationStart
-    first: Step
+    first_step: Step
     service: CalibrationService | None = None
-    shown: bool = False
-    aborted: bool = False
-    pictured: float | None = field(default=None)
+    was_returned: bool = False
+    is_aborted: bool = False
+    picture_time: float | None = field(default=None)
 
     @property
     def session(self) -> WizardSession | None:
-        """The wizard's sequence; None before it was chosen."""
+        """The wizard's sequence; None: no wizard was chosen yet."""
         return None if self.service is None else self.service.session
 
     @property
     def step(self) -> Step | None:
-        """Current step, with the answers that were undone; None at the end."""
+        """Current step, with answers that were undone as defaults; None at the end."""
         session = self.session
         if session is None:
-            return self.first
+            return self.first_step
         step = session.step
         return None if step is None else step.with_defaults(session.current["defaults"])
 
     def close(self) -> None:
-        """Free the wizard; its journal stays."""
+        """Free the wizard; its journal is kept."""
         if self.service is not None:
             self.service.close()
         self.service = None
 
 
 class ThesisCalibration:
-    """The calibrations of one camera, and the running one, for all front-ends together.
+    """The calibrations of one camera, and the running calibration, for all front-ends together.
 
     Args:
         folder: folder of calibrations and journals; nothing is written outside of it.
         name: name of the camera.
-        abandoned: seconds without a call after which a running calibration is given up.
+        abandoned: seconds without a call after which a running calibration is abandoned.
 
     Attributes:
-        graph: topics and frames of ROS; None if the camera is not in ROS.
+        graph: topics and frames of ROS; None: the camera is not in ROS.
 
     Raises:
         OSError: the folder cannot be created.
@@ -232,14 +233,14 @@ class ThesisCalibration:
         self, folder: str | os.PathLike[str], name: str, *, abandoned: float = ABANDONED_AFTER
     ) -> None:
         self._files = CalibrationService(Folder(folder))
-        self._name, self._abandoned = name, abandoned
+        self._name, self._abandon_timeout = name, abandoned
         self.graph: RobotGraph | None = None
         self._sequence: _Sequence | None = None
         self._loaded: AnyCalibration | None = None
         self._camera: CalibrationCamera | None = None
         self._busy = False
-        self._last = "none was started"
-        self._called = 0.0
+        self._last_end = "none was started"
+        self._last_call_at = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
     # ------------------------------------------------------------------ StartCalibration
@@ -248,8 +249,8 @@ class ThesisCalibration:
         """Begin a calibration; :meth:`perform` returns its first step.
 
         Raises:
-            CalibrationError: ``IN_USE``: one is running; ``NOT_POSSIBLE``: topics or frames are
-                named, but there is no ROS; ``WRONG_FRAME``: TF does not know the frame.
+            CalibrationError: ``IN_USE``: a calibration is running; ``NOT_POSSIBLE``: topics or
+                frames are named, but there is no ROS; ``WRONG_FRAME``: TF does not know the frame.
             ConfigurationError: a topic cannot have this name.
         """
         self._check_free()
@@ -257,24 +258,24 @@ class ThesisCalibration:
         self._check_graph(request.topics, request.tf_frame_robot_tcp)
         base = request.tf_frame_robot_base
         if graph is not None and request.tf_frame_robot_tcp and not base:
-            with self._alone("StartCalibration"):
+            with self._refuse_concurrent("StartCalibration"):
                 base = await graph.root(request.tf_frame_robot_tcp)
             self._check_free()
         request = request._replace(tf_frame_robot_base=base)
         self._sequence = _Sequence(request, _first_step(request, self._name))
-        self._touch()
+        self._restart_timer()
 
     def _check_free(self) -> None:
         if self._sequence is not None:
-            since = asyncio.get_running_loop().time() - self._called
+            since = asyncio.get_running_loop().time() - self._last_call_at
             raise Code.IN_USE.refusal(
                 f"{self._name}: a calibration is under way, whose last call came {since:.0f} s ago;"
                 " expected PerformCurrentAndGetNextStep to go on with it or, with abort, to end "
-                f"it. It is given up after {self._abandoned:g} s without a call"
+                f"it. It is given up after {self._abandon_timeout:g} s without a call"
             )
 
     def _check_graph(self, topics: Sequence[str], frame: str) -> None:
-        """Refuse topics and frames without ROS, and names that no topic can have."""
+        """Refuse topics and frames if there is no ROS, and names that no topic can have."""
         named = [*topics, *((frame,) if frame else ())]
         if named and self.graph is None:
             raise Code.NOT_POSSIBLE.refusal(
@@ -303,20 +304,22 @@ class ThesisCalibration:
         sequence = self._sequence
         if sequence is None:
             raise Code.NO_SEQUENCE.refusal(
-                f"{self._name}: no calibration is under way ({self._last}); expected "
+                f"{self._name}: no calibration is under way ({self._last_end}); expected "
                 "StartCalibration first"
             )
         if request.abort:
             return await self._abort(sequence)
-        with self._alone("PerformCurrentAndGetNextStep"):
+        with self._refuse_concurrent("PerformCurrentAndGetNextStep"):
             self._camera = camera
-            errors = await self._performed(sequence, request)
-        if sequence.aborted:
-            return _fields(_ABORTED, f"{self._name}: another call has aborted the calibration")
+            errors = await self._carry_out(sequence, request)
+        if sequence.is_aborted:
+            return _reply_fields(
+                _ABORTED, f"{self._name}: another call has aborted the calibration"
+            )
         return self._reply(sequence, errors)
 
     @contextlib.contextmanager
-    def _alone(self, label: str) -> Iterator[None]:
+    def _refuse_concurrent(self, label: str) -> Iterator[None]:
         """Refuse a call while another call is running."""
         if self._busy:
             raise Code.NOT_POSSIBLE.refusal(
@@ -324,43 +327,43 @@ class ThesisCalibration:
                 "answer to come first, or abort"
             )
         self._busy = True
-        self._touch()
+        self._restart_timer()
         try:
             yield
         finally:
             self._busy = False
-            self._touch()
+            self._restart_timer()
 
-    async def _performed(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
-        """Carry out a request; return its errors by the inputs' names."""
-        first, sequence.shown = not sequence.shown, True
+    async def _carry_out(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
+        """Carry out a request; return errors by the names of inputs."""
+        is_first_call, sequence.was_returned = not sequence.was_returned, True
         try:
             if self.graph is not None and sequence.start_request.tf_frame_robot_tcp:
-                self.graph.listen()  # so that the robot's pose at the picture is known
+                self.graph.listen()  # then the robot's pose at the time of a picture is known
             if request.repeat_last_step:
-                return await self._back(sequence)
-            if first:
-                return _early_inputs(request)
-            return await self._answered(sequence, request)
+                return await self._go_back(sequence)
+            if is_first_call:
+                return _check_no_inputs(request)
+            return await self._submit_answers(sequence, request)
         except SmartCamError as exc:
             return {"base": str(exc)}
         except OSError as exc:
             return {"base": f"the journal: {exc.strerror or exc}"}
 
-    async def _answered(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
+    async def _submit_answers(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
         step, session = sequence.step, sequence.session
         if step is None:
             return {}
-        given = from_lists(step, request.value_inputs, request.text_inputs, request.option_inputs)
+        answers = from_lists(step, request.value_inputs, request.text_inputs, request.option_inputs)
         if session is None:
-            await self._begin(sequence, step.checked(given))
+            await self._start_wizard(sequence, step.checked(answers))
             return {}
-        view = await session.submit(session.token, given)
+        view = await session.submit(session.token, answers)
         errors: Mapping[str, str] = view["errors"]
         return errors
 
-    async def _back(self, sequence: _Sequence) -> Mapping[str, str]:
-        """Go back to the step before."""
+    async def _go_back(self, sequence: _Sequence) -> Mapping[str, str]:
+        """Go back to the previous step."""
         session = sequence.session
         if session is None:
             return {"base": "repeat_last_step: there is no step before this one"}
@@ -371,23 +374,23 @@ class ThesisCalibration:
         return {}
 
     async def _abort(self, sequence: _Sequence) -> dict[str, Any]:
-        sequence.aborted = True
+        sequence.is_aborted = True
         session = sequence.session
         if session is not None and session.state == "asking":
             await session.abort(session.token)
-        self._end(sequence, "the last one was aborted")
-        return _fields(_ABORTED, "")
+        self._end_sequence(sequence, "the last one was aborted")
+        return _reply_fields(_ABORTED, "")
 
     # ------------------------------------------------------------------ the wizard
 
-    async def _begin(self, sequence: _Sequence, answers: Answers) -> None:
+    async def _start_wizard(self, sequence: _Sequence, answers: Answers) -> None:
         """Start the wizard that the answers of the first step choose.
 
         Raises:
             CalibrationError: as :meth:`CalibrationService.start`.
         """
         request, name = sequence.start_request, answers["name"]
-        self._files.folder.calibration(name)  # refused before anything is measured
+        self._files.folder.calibration(name)  # a wrong name is refused before anything is measured
         fixed = request.fixed_camera or answers["fixed_camera"]
         source = request._replace(fixed_camera=fixed).source or answers["pictures"]
         if source != SMARTCAMERA:
@@ -395,63 +398,69 @@ class ThesisCalibration:
         lens = None
         if self.graph is not None and source != SMARTCAMERA:
             lens = await self.graph.lens(source)
-            if sequence.aborted:
+            if sequence.is_aborted:
                 return
-        wizard = self._wizard(sequence, fixed == "True", source, lens)
+        wizard = self._make_wizard(sequence, fixed == "True", source, lens)
         parameters = {**_parameters(request, self._camera), "asked": [fixed, source, *request]}
         service = CalibrationService(self._files.folder, [wizard])
-        _start(service, name, wizard.name, parameters)
+        _start_or_resume(service, name, wizard.name, parameters)
         sequence.service = service
-        sequence.first = sequence.first.with_defaults(answers)
+        sequence.first_step = sequence.first_step.with_defaults(answers)
 
-    def _wizard(
+    def _make_wizard(
         self, sequence: _Sequence, fixed: bool, source: str, lens: CameraModel | None
     ) -> Wizard:
-        """Return the wizard for a camera in this place with this source of pictures."""
+        """Return the wizard for the camera's place and the source of pictures.
+
+        ``fixed``: whether the camera is fixed in the cell. ``lens``: None: not known.
+        """
         save_to = self._files.folder.calibration
-        read = bool(sequence.start_request.tf_frame_robot_tcp)
+        can_read_robot = bool(sequence.start_request.tf_frame_robot_tcp)
 
-        async def take() -> Any:
-            return await self._picture(sequence, source)
+        async def take_picture() -> Any:
+            return await self._take_picture(sequence, source)
 
-        async def tip() -> Pose:
-            tip = await self._tool(sequence, None)
+        async def read_tip_pose() -> Pose:
+            tip = await self._read_robot_pose(sequence, None)
             return replace(tip, at=tip.at or datetime.now(UTC)).pose()
 
-        async def flange() -> Transform:
-            return await self._tool(sequence, sequence.pictured)
+        async def read_flange_pose() -> Transform:
+            return await self._read_robot_pose(sequence, sequence.picture_time)
 
         if not fixed:
             return hand_eye_wizard(
-                take_picture=take,
+                take_picture=take_picture,
                 save_to=save_to,
-                read_robot=flange if read else None,
+                read_robot=read_flange_pose if can_read_robot else None,
                 camera=lens,
             )
         if source != SMARTCAMERA:
             return sheet_wizard(
-                take_picture=take, save_to=save_to, read_robot=tip if read else None, camera=lens
+                take_picture=take_picture,
+                save_to=save_to,
+                read_robot=read_tip_pose if can_read_robot else None,
+                camera=lens,
             )
         return plane_wizard(
             localize=self._localize,
             save_to=save_to,
-            read_robot=tip if read else None,
+            read_robot=read_tip_pose if can_read_robot else None,
             y_down=None if self._camera is None else self._camera.y_down,
         )
 
     async def _localize(self) -> list[Localization]:
-        return await _checked(self._camera).localize()
+        return await _require(self._camera).localize()
 
-    async def _picture(self, sequence: _Sequence, source: str) -> Any:
-        sequence.pictured = None
+    async def _take_picture(self, sequence: _Sequence, source: str) -> Any:
+        sequence.picture_time = None
         if source == SMARTCAMERA:
-            return await _checked(self._camera).take_picture()
-        image, sequence.pictured = await _checked(self.graph).picture(source)
+            return await _require(self._camera).take_picture()
+        image, sequence.picture_time = await _require(self.graph).picture(source)
         return image
 
-    async def _tool(self, sequence: _Sequence, utc: float | None) -> Transform:
+    async def _read_robot_pose(self, sequence: _Sequence, utc: float | None) -> Transform:
         request = sequence.start_request
-        return await _checked(self.graph).pose(
+        return await _require(self.graph).pose(
             request.tf_frame_robot_tcp, request.tf_frame_robot_base, utc
         )
 
@@ -465,33 +474,37 @@ class ThesisCalibration:
         step, session = sequence.step, sequence.session
         if step is None and session is not None:
             view, name = session.current, str(session.parameters["name"])
-            step = _last_step(name, view)
+            step = _done_step(name, view)
             if session.state == "ended":
-                self._end(sequence, f"{name!r} was finished")
-                # a calibration that maps no pixels
+                self._end_sequence(sequence, f"{name!r} was finished")
+                # loading fails for a calibration that maps no pixels
                 with contextlib.suppress(CalibrationError, OSError):
                     self.load(name)
-        return _fields(step or sequence.first, error)
+        return _reply_fields(step or sequence.first_step, error)
 
-    def _end(self, sequence: _Sequence, how: str) -> None:
+    def _end_sequence(self, sequence: _Sequence, reason: str) -> None:
         sequence.close()
-        self._sequence, self._last = None, how
-        self._touch()
+        self._sequence, self._last_end = None, reason
+        self._restart_timer()
 
-    def _touch(self) -> None:
-        """Restart the time after which a running calibration is given up."""
+    def _restart_timer(self) -> None:
+        """Restart the timer that abandons a running calibration."""
         loop = asyncio.get_running_loop()
-        self._called = loop.time()
+        self._last_call_at = loop.time()
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None
         if self._sequence is not None and not self._busy:
-            self._timer = loop.call_later(self._abandoned, self._give_up)
+            self._timer = loop.call_later(self._abandon_timeout, self._abandon)
 
-    def _give_up(self) -> None:
+    def _abandon(self) -> None:
         if self._sequence is not None:
-            text = f"the last one was left for {self._abandoned:g} s; it goes on where it was when "
-            self._end(self._sequence, text + "the same is started under the same name")
+            text = (
+                f"the last one was left for {self._abandon_timeout:g} s; it goes on where it was "
+            )
+            self._end_sequence(
+                self._sequence, text + "when the same is started under the same name"
+            )
 
     def close(self) -> None:
         """End the running calibration, which can be resumed. Idempotent."""
@@ -520,8 +533,8 @@ class ThesisCalibration:
         """
         self._loaded = self._files.load(name_or_path)
 
-    async def transform(self, seen: PixelPoseRequest) -> Pose:
-        """Return the robot's pose for a pose that a camera saw, in the wanted frame.
+    async def transform(self, request: PixelPoseRequest) -> Pose:
+        """Return the robot's pose for a pose that the camera saw, in the request's reference frame.
 
         Raises:
             CalibrationError: ``NO_CALIBRATION``, ``WRONG_FRAME``, ``OUT_OF_FIELD``, ``BAD_TIME``.
@@ -531,31 +544,33 @@ class ThesisCalibration:
             raise Code.NO_CALIBRATION.refusal(
                 f"{self._name}: no calibration is loaded; expected LoadCalibration first"
             )
-        pose = self._files.transform(seen.x, seen.y, seen.theta)
-        if seen.frame and calibration.camera_frame not in {None, seen.frame}:
+        pose = self._files.transform(request.x, request.y, request.theta)
+        if request.frame and calibration.camera_frame not in {None, request.frame}:
             raise Code.WRONG_FRAME.unexpected(
                 f"frame_id: expected {calibration.camera_frame!r}, the camera's frame",
                 calibration.camera_frame,
-                seen.frame,
+                request.frame,
             )
-        robot, wanted = calibration.robot_frame, seen.reference or calibration.robot_frame
-        at = datetime.now(UTC) if seen.utc is None else datetime.fromtimestamp(seen.utc, UTC)
-        if wanted != robot:
-            lead = await self._lead(robot, wanted, seen.utc)
-            part = lead.undated() @ Transform.from_pose(pose, "part").undated()
-            pose = replace(part, at=at).pose()
-        return pose._replace(header=Header(seen.seq, at, wanted))
+        robot, reference = calibration.robot_frame, request.reference or calibration.robot_frame
+        time = (
+            datetime.now(UTC) if request.utc is None else datetime.fromtimestamp(request.utc, UTC)
+        )
+        if reference != robot:
+            reference_pose = await self._frame_pose(robot, reference, request.utc)
+            part_pose = reference_pose.undated() @ Transform.from_pose(pose, "part").undated()
+            pose = replace(part_pose, at=time).pose()
+        return pose._replace(header=Header(request.seq, time, reference))
 
-    async def _lead(self, robot: str, wanted: str, utc: float | None) -> Transform:
-        """Return the pose of the robot's frame in the wanted frame."""
+    async def _frame_pose(self, robot: str, reference: str, utc: float | None) -> Transform:
+        """Return the pose of the robot's frame in the reference frame."""
         if self.graph is None:
             raise Code.WRONG_FRAME.unexpected(
                 f"tf_frame_reference: expected {robot!r}, since this camera is not seen in ROS, "
                 "whose TF would lead elsewhere",
                 robot,
-                wanted,
+                reference,
             )
-        return await self.graph.pose(robot, wanted, utc)
+        return await self.graph.pose(robot, reference, utc)
 
 
 class CalibrationDesks:
@@ -585,8 +600,8 @@ class CalibrationDesks:
             desk.close()
 
 
-def _checked(value: T | None) -> T:
-    """Return a value that earlier checks found not to be None."""
+def _require(value: T | None) -> T:
+    """Return a value; raise NOT_POSSIBLE if it became None since it was checked."""
     if value is None:
         raise Code.NOT_POSSIBLE.refusal(
             "the camera is not seen in ROS any more; expected it to come back, or abort"
@@ -595,7 +610,7 @@ def _checked(value: T | None) -> T:
 
 
 def _first_step(request: CalibrationStart, camera: str) -> Step:
-    """Return the step that asks for the facts that a request lacks."""
+    """Return the step that asks for the facts that the request does not have."""
     inputs: list[Input] = [
         Text(
             name="name",
@@ -610,13 +625,15 @@ def _first_step(request: CalibrationStart, camera: str) -> Step:
         label = f"Topic with pictures of the camera, or {SMARTCAMERA} for this camera itself"
         inputs.append(Text(name="pictures", label=label, default=SMARTCAMERA))
     if not request.fixed_camera:
-        inputs.append(Option(name="fixed_camera", label="Where the camera is", options=FIXED))
+        inputs.append(
+            Option(name="fixed_camera", label="Where the camera is", options=CAMERA_PLACES)
+        )
     text = "A calibration of this name that was broken off goes on where it was."
     return Step(id="first", title="Calibration", description=text, inputs=tuple(inputs))
 
 
 def _parameters(request: CalibrationStart, camera: CalibrationCamera | None) -> dict[str, Any]:
-    """Return the defaults of a wizard's steps that a request gives."""
+    """Return defaults for a wizard's steps from a request and the camera."""
     defaults: dict[str, Any] = {"setup": "eye-in-hand"}
     if camera is not None:
         defaults["camera_unit"] = camera.unit
@@ -627,29 +644,29 @@ def _parameters(request: CalibrationStart, camera: CalibrationCamera | None) -> 
     return defaults
 
 
-def _start(
+def _start_or_resume(
     service: CalibrationService, name: str, wizard: str, parameters: Mapping[str, Any]
 ) -> None:
-    """Start a wizard, or resume an interrupted one that was started in the same way."""
+    """Start a wizard, or resume an interrupted wizard that was started by the same request."""
     try:
         service.start(name, wizard, parameters)
-        same = service.session.parameters["asked"] == parameters["asked"]
+        has_same_request = service.session.parameters["asked"] == parameters["asked"]
     except CalibrationError as exc:
         if exc.code not in {Code.WRONG_JOURNAL, Code.BROKEN_FILE}:
             raise
-        same = False
-    if not same:
+        has_same_request = False
+    if not has_same_request:
         service.start(name, wizard, parameters, fresh=True)
 
 
-def _early_inputs(request: StepRequest) -> Mapping[str, str]:
-    """Return the error for answers to a step that was never returned to a client."""
+def _check_no_inputs(request: StepRequest) -> Mapping[str, str]:
+    """Return an error if a request answers a step that was not returned to a client yet."""
     if request.value_inputs or request.text_inputs or request.option_inputs:
         return {"base": "this step was not shown before; expected no inputs in the first call"}
     return {}
 
 
-def _last_step(name: str, view: Mapping[str, Any]) -> Step:
+def _done_step(name: str, view: Mapping[str, Any]) -> Step:
     """Return a step that reports the result."""
     verdict, file = view["verdict"], view["result"]["file"]
     verdict_text = "" if verdict is None else f"{verdict['text']} "
@@ -657,7 +674,7 @@ def _last_step(name: str, view: Mapping[str, Any]) -> Step:
     return Step(id="done", title=f"The calibration {name} is done", description=text, button="")
 
 
-def _fields(step: Step, error: str) -> dict[str, Any]:
+def _reply_fields(step: Step, error: str) -> dict[str, Any]:
     """Return the fields of a reply with a step."""
     texts = [step.description]
     for input_field in step.inputs:

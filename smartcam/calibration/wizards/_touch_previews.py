@@ -1,7 +1,7 @@
 """Make previews of a wizard's touches: JSON data, in metres, for a front-end to draw.
 
-Touches without a calibration are drawn in the camera's frame; others are drawn along the axes of
-the plane, from the centre of the touches that the calibration was made from.
+Touches without a calibration are drawn in the camera's frame. Touches with a calibration are drawn
+along the axes of the plane; the centre is the mean of the calibration's own touches.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ HEAT_MAP_CELLS = 24
 """Number of cells of the heat map along its longer side."""
 
 MARGIN_RATIO = 0.25
-"""Width of the border around the drawn points, as a part of their extent."""
+"""Width of the border around the drawn points, as a share of the points' extent."""
 
 
-def plain(touches: Sequence[Touch]) -> dict[str, Any]:
+def touch_points(touches: Sequence[Touch]) -> dict[str, Any]:
     """Return touches without a calibration: ``points`` of ``label, feature, camera, robot``."""
     points = [
         {
-            "label": str(number) if touch.what == "mark" else touch.what,
+            "label": str(number) if touch.label == "mark" else touch.label,
             "feature": touch.mark.feature,
             "camera": [touch.mark.x, touch.mark.y],
             "robot": list(touch.robot),
@@ -41,21 +41,23 @@ def plain(touches: Sequence[Touch]) -> dict[str, Any]:
     return {"points": points}
 
 
-def before(touches: Sequence[Touch], marks: Sequence[Mark], mark: Mark) -> dict[str, Any] | None:
+def next_touch_preview(
+    touches: Sequence[Touch], marks: Sequence[Mark], mark: Mark
+) -> dict[str, Any] | None:
     """Return touches with the ``marks`` of a picture and the mark to touch ``next``.
 
-    None if no marks are given, since the camera does not see the next point.
+    The result is None without marks, since then the camera does not see the next point.
     """
     if not marks:
         return None
     return {
-        **plain(touches),
+        **touch_points(touches),
         "marks": [[other.x, other.y] for other in marks],
         "next": [mark.x, mark.y],
     }
 
 
-def compared(
+def compare_touches(
     calibration: PlaneCalibration,
     touches: Sequence[Touch],
     seen: Array,
@@ -71,58 +73,64 @@ def compared(
     ``held_out`` (N, 3): touched minus predicted by the other touches; NaN or None: not known.
     ``worst``: index of the worst touch. ``left_out``: indices of the touches that do not count.
 
-    The result is that of :func:`plain`, each point with ``at``, ``residual``, ``left_out``,
-    ``held_out`` (or None) and ``covariance`` (2 x 2, of the mapped point; None if no sigma is
-    known); ``worst``, ``camera_origin``, ``robot_axes``; ``view``, the lower left and upper right
-    corner of the drawn area; ``heat``, rows of predicted errors in mm that cover the view, the
-    lowest row first, or None.
+    The result has the entries of :func:`touch_points`, each point also with ``at``, ``residual``,
+    ``left_out``, ``held_out`` (or None) and ``covariance`` (2 x 2, of the mapped point; None if no
+    sigma is known); ``worst``, ``camera_origin``, ``robot_axes``; ``view``, the lower left and
+    upper right corner of the drawn area; ``heat``, rows of predicted errors in mm that cover the
+    view, the lowest row first, or None.
     """
-    preview = plain(touches)
-    across = calibration.rotation.T
+    preview = touch_points(touches)
+    to_plane = calibration.rotation.T
     counted = calibration.robot_points[calibration.weights > 0.0]
     centre = counted.mean(axis=0)
     errors = None if calibration.touch_sigma is None else calibration.covariance_at(seen)
     for index, point in enumerate(preview["points"]):
-        without = None if held_out is None else (across @ held_out[index]).tolist()
-        out = index in left_out
-        point["at"] = (across @ (touches[index].robot - centre)).tolist()
-        point["residual"] = (across @ offsets[index]).tolist()
-        point["left_out"] = out
-        point["held_out"] = None if out or without is None or math.isnan(sum(without)) else without
-        point["covariance"] = (
-            None if out or errors is None else (across @ errors[index] @ across.T)[:2, :2].tolist()
+        held_out_offset = None if held_out is None else (to_plane @ held_out[index]).tolist()
+        is_excluded = index in left_out
+        point["at"] = (to_plane @ (touches[index].robot - centre)).tolist()
+        point["residual"] = (to_plane @ offsets[index]).tolist()
+        point["left_out"] = is_excluded
+        point["held_out"] = (
+            None
+            if is_excluded or held_out_offset is None or math.isnan(sum(held_out_offset))
+            else held_out_offset
         )
-    origin = across @ (calibration.origin - centre)
-    at = np.array([touch.robot for touch in touches]).reshape(-1, 3)
-    is_left_out = np.isin(np.arange(len(at)), [*left_out])
-    view = _view(
-        across @ (np.concatenate([counted, at[~is_left_out]]) - centre).T,
-        np.column_stack([origin, across @ (at[is_left_out] - centre).T]),
+        point["covariance"] = (
+            None
+            if is_excluded or errors is None
+            else (to_plane @ errors[index] @ to_plane.T)[:2, :2].tolist()
+        )
+    origin = to_plane @ (calibration.origin - centre)
+    positions = np.array([touch.robot for touch in touches]).reshape(-1, 3)
+    is_left_out = np.isin(np.arange(len(positions)), [*left_out])
+    view = _drawn_area(
+        to_plane @ (np.concatenate([counted, positions[~is_left_out]]) - centre).T,
+        np.column_stack([origin, to_plane @ (positions[is_left_out] - centre).T]),
     )
     return {
         **preview,
         "worst": worst,
         "camera_origin": origin.tolist(),
-        "robot_axes": across.T.tolist(),
+        "robot_axes": to_plane.T.tolist(),
         "view": view.tolist(),
-        "heat": None if errors is None else _heat(calibration, view, across, centre),
+        "heat": None if errors is None else _heat_map(calibration, view, to_plane, centre),
     }
 
 
-def _view(points: Array, others: Array) -> Array:
-    """Return the corners of the area with the points (3, N), and those of others (3, K) nearby."""
+def _drawn_area(points: Array, others: Array) -> Array:
+    """Return two corners of the area with all points (3, N), and with others (3, K) nearby."""
     low, high = points[:2].min(axis=1), points[:2].max(axis=1)
     half = 0.5 * (high - low)
-    flat = others[:2].T
-    visible = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
-    shown = np.vstack([low, high, visible])
-    low, high = shown.min(axis=0), shown.max(axis=0)
+    other_points = others[:2].T
+    visible = other_points[((other_points > low - half) & (other_points < high + half)).all(axis=1)]
+    drawn_points = np.vstack([low, high, visible])
+    low, high = drawn_points.min(axis=0), drawn_points.max(axis=0)
     margin = MARGIN_RATIO * float((high - low).max())
     return np.array([low - margin, high + margin])
 
 
-def _heat(
-    calibration: PlaneCalibration, view: Array, across: Array, centre: Array
+def _heat_map(
+    calibration: PlaneCalibration, view: Array, to_plane: Array, centre: Array
 ) -> list[list[float]] | None:
     """Return the predicted errors at the centres of the view's cells, mm."""
     low, extent = view[0], view[1] - view[0]
@@ -133,7 +141,7 @@ def _heat(
     y = low[1] + extent[1] * (np.arange(rows) + 0.5) / rows
     middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     try:
-        seen = calibration.inverse(middles @ across[:2] + centre)
+        seen = calibration.inverse(middles @ to_plane[:2] + centre)
         errors = calibration.predicted_error(seen)
     except CalibrationError:  # a part of the view is beyond the camera's horizon
         return None

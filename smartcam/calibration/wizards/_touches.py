@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.calibration.wizards._marks import Mark, Touch, Vector, choose
+from smartcam.calibration.wizards._marks import Mark, Touch, Vector, ask_marks
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Number, Option, Step
-from smartcam.calibration.wizards._touch_previews import before
+from smartcam.calibration.wizards._touch_previews import next_touch_preview
 from smartcam.geometry._inside import Code
 from smartcam.models import Pose, Quaternion
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 ReadRobot = Callable[[], Awaitable[Pose]]
-"""Function that returns the pose of the robot's tip in the robot's base, metres; its z points out
-of the tool."""
+"""Function that returns the pose of the tool's tip in the robot's base, metres; the tip's z axis
+points out of the tool."""
 
 UNITS: Mapping[str, float] = {"mm": 1e-3, "m": 1.0}
-"""Metres per unit, for the units that coordinates of the robot may be typed in."""
+"""Metres per unit, for the units in which coordinates of the robot may be typed."""
 
 UNIT = Option(
     name="unit",
@@ -66,7 +66,7 @@ SIDES: Mapping[str, Vector | None] = {
     "+y": (0.0, 1.0, 0.0),
     "unknown": None,
 }
-"""Directions of a tool's axis in the robot's base, by their names for people."""
+"""Directions of a tool's axis in the robot's base, by the names that people choose."""
 
 SIDE = Option(
     name="side",
@@ -79,7 +79,7 @@ SIDE = Option(
 
 @dataclass(eq=False)
 class Touches:
-    """Touches of one run of a wizard; the state follows from the answers alone.
+    """Touches of one run of a wizard; the state depends only on the answers.
 
     Attributes:
         about: answers of the first step: ``touch_sigma``, and, if the robot's pose is typed,
@@ -99,7 +99,7 @@ class Touches:
         self.side = str(self.about.get("side", "unknown"))
 
     @property
-    def places(self) -> list[Vector]:
+    def tip_positions(self) -> list[Vector]:
         """Positions of the tip at the touches, metres."""
         return [touch.robot for touch in self.touches]
 
@@ -124,62 +124,66 @@ class Touches:
     async def add_marks(self, rows: Sequence[Mapping[str, Any]], most: int, noun: str) -> None:
         """Ask which marks of a picture will be touched, then for their touches.
 
-        ``rows``: result of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.picture`.
+        ``rows``: result of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.take_picture`.
         ``most``: largest number of touches of a run; raises SHAPE for more. ``noun``: name of the
         points, for people.
         """
-        marks = await choose([Mark.of(row) for row in rows], self.camera_unit)
+        marks = await ask_marks([Mark.of(row) for row in rows], self.camera_unit)
         self.check_count(len(marks), most, noun)
         self.marks = marks
         for number, mark in enumerate(marks, 1):
             title = f"Touch mark {number} of {len(marks)}"
             place = mark.text(self.camera_unit)
-            self.touches.append(await self.touch(f"touch-{number}", title, place, mark))
+            self.touches.append(await self.ask_mark_touch(f"touch-{number}", title, place, mark))
 
-    async def touch(
+    async def ask_mark_touch(
         self, step_id: str, title: str, place: str, mark: Mark, label: str = "mark"
     ) -> Touch:
         """Ask for a touch.
 
-        ``place``: text that names the place to touch. ``mark``: the camera's mark there.
-        ``label``: value of ``what`` of :class:`Touch`.
+        ``place``: text that names the place to touch. ``mark``: the camera's mark at this place.
+        ``label``: label of the :class:`Touch`.
         """
         description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"
-        step = Step(id=step_id, title=title, description=f"{description}.", **self.shown(mark))
+        step = Step(
+            id=step_id, title=title, description=f"{description}.", **self.step_extras(mark)
+        )
         return await self.ask_touch(step, lambda _: mark, label)
 
-    def shown(self, mark: Mark) -> dict[str, Any]:
-        """Return the ``notes`` and the ``preview`` of a step that asks for a touch."""
-        return {"preview": before(self.touches, self.marks, mark)}
+    def step_extras(self, mark: Mark) -> dict[str, Any]:
+        """Return the ``preview`` of a step that asks for a touch; a subclass may add ``notes``."""
+        return {"preview": next_touch_preview(self.touches, self.marks, mark)}
 
     async def ask_touch(
         self, step: Step, mark_of: Callable[[StepAnswer], Mark], label: str = "mark"
     ) -> Touch:
-        """Ask for a touch by a step that names the point; its answer decides the mark.
+        """Ask for a touch by a step that names the point.
 
-        If the robot cannot be read, inputs for ``x, y, z`` follow those of the step.
+        ``mark_of``: function that returns the mark for the step's answer.
+
+        If the robot cannot be read, inputs for ``x, y, z`` follow the inputs of the step.
         """
         if self._read_robot is not None:
             answer = await ask(
-                replace(step, button="It is there"), partial(_read, self._read_robot)
+                replace(step, button="It is there"), partial(_read_pose, self._read_robot)
             )
             x, y, z = answer.outcome["position"]
             axis = _axis_z(Quaternion(*answer.outcome["orientation"]))
             return Touch(mark_of(answer), (x, y, z), axis, label)
         unit = self.about.get("unit", "m")
-        place = tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz")
+        position_inputs = tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz")
         text = f"{step.description} Then take its position from the robot, in its base."
-        answer = await ask(replace(step, description=text, inputs=(*step.inputs, *place)))
+        answer = await ask(replace(step, description=text, inputs=(*step.inputs, *position_inputs)))
         x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
         return Touch(mark_of(answer), (x, y, z), SIDES[self.side], label)
 
 
-async def _read(read_robot: ReadRobot, _answers: Answers) -> dict[str, Any]:
+async def _read_pose(read_robot: ReadRobot, _answers: Answers) -> dict[str, Any]:
     pose = await read_robot()
     return {"position": list(pose.position), "orientation": list(pose.orientation)}
 
 
 def _axis_z(q: Quaternion) -> Vector:
-    """Return the direction of a turned z axis."""
+    """Return the direction of the z axis after a rotation."""
     x, y, z, w = q
     return 2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z

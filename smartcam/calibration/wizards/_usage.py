@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-_TRIGGERED = """\
+_TRIGGER_TEMPLATE = """\
 import smartcam.sync
 from smartcam.calibration import load_calibration
 
@@ -24,14 +24,14 @@ with smartcam.sync.connect(
         print(part.feature_id, part.pose.position)  # of the robot, metres
 """
 
-_TRANSFORMED = """\
+_TRANSFORM_TEMPLATE = """\
 from smartcam.calibration import load_calibration
 
 calibration = load_calibration({path!r})
 print(calibration.transform([{point!r}]))  # metres
 """
 
-_LOADED = """\
+_LOAD_TEMPLATE = """\
 from smartcam.calibration import HandEyeCalibration
 
 calibration = HandEyeCalibration.load({path!r})
@@ -47,20 +47,21 @@ def usage(
 ) -> dict[str, str]:
     """Return lines that use a calibration: ``command`` for a shell, and ``python``.
 
-    ``path``: path of its file. ``connect``: arguments of :func:`smartcam.connect` for the camera,
-    ``url`` included; None: there is no camera to ask. ``point`` (2,): a point that the camera saw.
+    ``path``: path of the calibration's file. ``connect``: arguments of :func:`smartcam.connect` for
+    the camera, ``url`` included; None: the camera is not known. ``point`` (2,): a point that the
+    camera saw.
     """
     text = str(path)
     if kind == HAND_EYE or connect is None:
         listing = ["smartcam", "calibrate", "--list", "--folder", str(path.parent)]
-        form = _LOADED if kind == HAND_EYE else _TRANSFORMED
-        python = form.format(path=text, point=[round(value, 4) for value in point])
+        template = _LOAD_TEMPLATE if kind == HAND_EYE else _TRANSFORM_TEMPLATE
+        python = template.format(path=text, point=[round(value, 4) for value in point])
         return {"command": shlex.join(listing), "python": python}
-    given = {name: value for name, value in connect.items() if value not in (None, "", False)}
-    url = str(given.pop("url"))
+    options = {name: value for name, value in connect.items() if value not in (None, "", False)}
+    url = str(options.pop("url"))
     words = ["smartcam", "trigger", url, "--calibration", text]
-    for name, value in given.items():
+    for name, value in options.items():
         words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
-    arguments = [repr(url), *(f"{name}={value!r}" for name, value in given.items())]
-    python = _TRIGGERED.format(path=text, arguments=",\n    ".join(arguments))
+    arguments = [repr(url), *(f"{name}={value!r}" for name, value in options.items())]
+    python = _TRIGGER_TEMPLATE.format(path=text, arguments=",\n    ".join(arguments))
     return {"command": shlex.join(words), "python": python}

@@ -1,7 +1,7 @@
 """Check whether a calibration still holds: touch some marks again, and compare.
 
-A knocked camera sees all points shifted, which a few touches show. Their offsets are
-compared with the noise of the touches, both of the new ones and of those in the calibration.
+A camera that was knocked sees all points shifted, which a few touches show. The offsets are
+compared with the noise of the new touches and of the calibration's touches.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._marks import MarkCamera
 from smartcam.calibration.wizards._sequence import Wizard, ask
 from smartcam.calibration.wizards._steps import Option, Step
-from smartcam.calibration.wizards._touch_previews import compared
+from smartcam.calibration.wizards._touch_previews import compare_touches
 from smartcam.calibration.wizards._touches import SIGMA, UNIT, Touches
 from smartcam.geometry._inside import Code
 
@@ -42,17 +42,18 @@ if TYPE_CHECKING:
 WIZARD = "drift"
 """Name of the wizard."""
 
-CHECKS = "smartcam.checks/1"
+CHECKS_FORMAT = "smartcam.checks/1"
 """Name of the format of a file of checks, in its first line."""
 
 KNOCK_M = 0.001
 """Shift of a knocked camera, metres, in the direction that is hardest to notice."""
 
 NOTICED_SHARE = 0.95
-"""Part of all checks that should notice such a knock."""
+"""Share of all checks that should notice such a knock."""
 
 MAX_TOUCHES = 100
-"""Largest number of touches of a check; more would add less than the calibration's own error."""
+"""Largest number of touches of a check; more touches hardly help, since the calibration has an
+error of its own."""
 
 
 def drift_wizard(
@@ -68,8 +69,10 @@ def drift_wizard(
     Its parameters: ``name`` (of the calibration), ``feature`` (only marks with this name count),
     and as defaults of the first step ``unit`` (mm, m) and ``touch_sigma`` (mm).
 
-    Its result: ``name, stale, touches, offsets_mm`` (the length of each)``, rms_mm, expected_mm,
-    z, chance, needed, needed_at`` (at the best mark, see :func:`touches_needed`)``, file``.
+    Its result has the entries ``name``, ``stale``, ``touches``, ``offsets_mm`` (length of each
+    touch's offset), ``rms_mm``, ``expected_mm``, ``z``, ``chance``, ``needed`` (see
+    :func:`touches_needed`; at the best mark), ``needed_at`` (number of this mark's touch) and
+    ``file``.
 
     Each finished check is a line of a file, whose first line names its format: so the file shows a
     drift that is too slow for a single check. The calibration's own file is not changed. The file
@@ -80,17 +83,17 @@ def drift_wizard(
         find: function that returns the file of a calibration by its name, or raises
             CalibrationError.
         record_to: function that returns the file of its checks.
-        read_robot: function that reads the robot's pose; None: it is typed.
-        y_down: whether ``localize`` turns the camera's y axis up, which points down; None: not
-            known. A calibration that was made the other way is refused.
+        read_robot: function that reads the robot's pose; None: the pose is typed.
+        y_down: whether the camera's y axis points down, so that ``localize`` turns it up; None: not
+            known. A calibration with another direction of y is refused.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
         name = str(parameters.get("name", "plane"))
         feature = str(parameters.get("feature") or "")
         camera = MarkCamera(localize=localize, feature=feature, y_down=y_down)
-        step = _about(name, typed=read_robot is None).with_defaults(parameters)
-        about = await ask(step, partial(_loaded, find, name, camera))
+        step = _about_step(name, typed=read_robot is None).with_defaults(parameters)
+        about = await ask(step, partial(_load_calibration, find, name, camera))
         return await _DriftCheck(about, read_robot, camera, name, record_to).run()
 
     return Wizard(name=WIZARD, version=1, script=script, steps=5)
@@ -114,7 +117,7 @@ def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> in
         variance = own_variance + sigma**2 / count
         shift = min(KNOCK_M**2 / max(variance, KNOCK_M**2 / _MAX_SHIFT), _MAX_SHIFT)
         if (
-            _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift)
+            _detection_probability(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift)
             >= NOTICED_SHARE
         ):
             return count
@@ -122,11 +125,15 @@ def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> in
 
 
 _MAX_SHIFT = 1e4
-"""A shift whose square is more than this many times its variance is always noticed."""
+"""Ratio of a squared shift to its variance, above which a shift is always noticed."""
 
 
-def _power(level: float, freedom: int | None, shift: float) -> float:
-    """Return the probability that a test at a level notices a shift of three coordinates."""
+def _detection_probability(level: float, freedom: int | None, shift: float) -> float:
+    """Return the probability that a test notices a shift of three coordinates.
+
+    ``level``: probability that the test reports a shift that does not exist. ``freedom``: degrees
+    of freedom of the noise; None: it is known. ``shift``: squared shift relative to its variance.
+    """
     special = load("scipy.special")
     if freedom is None:
         return 1.0 - float(special.chndtr(special.chdtri(3, level), 3, shift))
@@ -134,7 +141,7 @@ def _power(level: float, freedom: int | None, shift: float) -> float:
     return 1.0 - float(special.ncfdtr(3, freedom, shift, limit))
 
 
-def _about(name: str, *, typed: bool) -> Step:
+def _about_step(name: str, *, typed: bool) -> Step:
     sigma = replace(
         SIGMA, label="How well a touch repeats, standard deviation; empty: as the calibration says"
     )
@@ -147,10 +154,10 @@ def _about(name: str, *, typed: bool) -> Step:
     )
 
 
-async def _loaded(
+async def _load_calibration(
     find: Callable[[str], Path], name: str, camera: MarkCamera, answers: Answers
 ) -> dict[str, Any]:
-    """Read the file of a calibration into the journal, so that a resumed check has the same one."""
+    """Read a calibration into the journal, so that a resumed check uses the same calibration."""
     file = find(name)
     calibration = PlaneCalibration.load(file)
     camera.check_y_down(calibration.y_down, f"{name} was made")
@@ -194,18 +201,20 @@ class _DriftCheck(Touches):
             await self._touch_marks()
             if not self.touches:
                 continue
-            drift = self.calibration.check(self._touched_marks(), self.places)
+            drift = self.calibration.check(self._touched_marks(), self.tip_positions)
             figures = self._figures(drift)
-            choice = await ask(self._verdict(drift, figures), partial(self._end, drift, figures))
+            choice = await ask(
+                self._verdict_step(drift, figures), partial(self._record_check, drift, figures)
+            )
             if choice["next"] == "finish":
                 return {"name": self.name, **figures, **choice.outcome}
 
     def _touched_marks(self) -> Array:
         return np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
 
-    async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
+    async def _take_checked_picture(self, answers: Answers) -> list[dict[str, Any]]:
         self._camera.check_y_down(self.calibration.y_down, f"{self.name} was made")
-        rows = await self._camera.picture(answers)
+        rows = await self._camera.take_picture(answers)
         wanted = self.calibration.camera_frame
         frames = {row["frame_id"] for row in rows} - {wanted}
         if wanted is not None and frames:
@@ -230,12 +239,14 @@ class _DriftCheck(Touches):
             notes=(
                 f"{self.name} was made at {self.about.outcome['written_at'][:19]} UTC"
                 + (f", with the tool {tool!r}" if tool else ""),
-                *((f"{_touches(len(self.touches))} so far",) if self.touches else ()),
+                *((f"{_touches_text(len(self.touches))} so far",) if self.touches else ()),
             ),
         )
-        await self.add_marks((await ask(step, self._picture)).outcome, MAX_TOUCHES, "touches")
+        await self.add_marks(
+            (await ask(step, self._take_checked_picture)).outcome, MAX_TOUCHES, "touches"
+        )
 
-    def _verdict(self, drift: Drift, figures: Mapping[str, Any]) -> Step:
+    def _verdict_step(self, drift: Drift, figures: Mapping[str, Any]) -> Step:
         stale, offsets = figures["stale"], figures["offsets_mm"]
         return Step(
             id="verdict",
@@ -259,7 +270,7 @@ class _DriftCheck(Touches):
                     },
                 ),
             ),
-            preview=compared(
+            preview=compare_touches(
                 self.calibration,
                 self.touches,
                 self._touched_marks(),
@@ -271,7 +282,7 @@ class _DriftCheck(Touches):
     def _figures(self, drift: Drift) -> dict[str, Any]:
         offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
         needed = [touches_needed(self.calibration, point) for point in self._touched_marks()]
-        enough = [count for count in needed if count is not None]
+        possible_counts = [count for count in needed if count is not None]
         return {
             "stale": drift.stale,
             "touches": len(self.touches),
@@ -280,24 +291,25 @@ class _DriftCheck(Touches):
             "expected_mm": 1e3 * drift.expected,
             "z": drift.z,
             "chance": drift.chance,
-            "needed": min(enough, default=None),
-            "needed_at": 1 + needed.index(min(enough)) if enough else None,
+            "needed": min(possible_counts, default=None),
+            "needed_at": 1 + needed.index(min(possible_counts)) if possible_counts else None,
         }
 
-    async def _end(
+    async def _record_check(
         self, drift: Drift, figures: Mapping[str, Any], answers: Answers
     ) -> dict[str, str] | None:
-        """Write the check to its file if the user ends it, as the action of the last step."""
+        """Write the check to its file if the user finishes; this is the action of the last step."""
         if answers["next"] != "finish":
             return None
         file = self._record_to(self.name)
         with Journal(file) as checks:
             if checks.header is None:
-                checks.start({"schema": CHECKS, "name": self.name})
-            elif checks.header.get("schema") != CHECKS:
+                checks.start({"schema": CHECKS_FORMAT, "name": self.name})
+            elif checks.header.get("schema") != CHECKS_FORMAT:
                 raise Code.BROKEN_FILE.refusal(
-                    f"{file.name}: schema {checks.header.get('schema')!r}, expected {CHECKS!r}",
-                    CHECKS,
+                    f"{file.name}: schema {checks.header.get('schema')!r}, expected "
+                    f"{CHECKS_FORMAT!r}",
+                    CHECKS_FORMAT,
                     checks.header.get("schema"),
                 )
             checks.append(
@@ -325,17 +337,17 @@ def _notes(figures: Mapping[str, Any]) -> list[str]:
     knock = f"a knock of {1e3 * KNOCK_M:g} mm is noticed in {100 * NOTICED_SHARE:g} of 100 checks"
     needed = figures["needed"]
     return [
-        f"{_touches(count)}: {figures['rms_mm']:.3f} mm rms off, where noise explains "
+        f"{_touches_text(count)}: {figures['rms_mm']:.3f} mm rms off, where noise explains "
         f"{figures['expected_mm']:.3f} mm; the furthest is touch "
         f"{1 + offsets.index(max(offsets))}, {max(offsets):.3f} mm",
         f"noise alone gives as much in {100 * figures['chance']:.2g} % of checks "
         f"(z = {figures['z']:.2f})",
-        f"{knock} with {_touches(needed)} of the mark of touch {figures['needed_at']}"
+        f"{knock} with {_touches_text(needed)} of the mark of touch {figures['needed_at']}"
         if needed is not None
         else f"{knock} with no number of touches of these marks: the calibration is too "
         "uncertain there",
     ]
 
 
-def _touches(count: int) -> str:
+def _touches_text(count: int) -> str:
     return f"{count} touch{'es' if count != 1 else ''}"

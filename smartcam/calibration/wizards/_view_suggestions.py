@@ -1,7 +1,7 @@
 """Suggest the views from which a camera should look at a target, and draw their outlines.
 
-The first views are always the same. As soon as they determine a lens, its uncertainty decides which
-view helps most.
+The first views are always the same. As soon as the views determine a lens, the next view is the one
+that reduces the lens' uncertainty most.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 
 class Look(NamedTuple):
-    """A view that adds information to the others."""
+    """One of the standard views, each of which adds information to the views before."""
 
     text: str  # text for people
     # direction in the image about which the target is tilted, degrees from u towards v
     axis: float = 0.0
     tilt: float = 0.0  # tilt, degrees
     roll: float = 0.0  # turn about the line of sight, degrees
-    fill: float = 0.6  # part of the image's width or height that the target takes
-    place: tuple[float, float] = (0.5, 0.5)  # centre, as parts of the image's width and height
+    fill: float = 0.6  # share of the image's width or height that the target fills
+    place: tuple[float, float] = (0.5, 0.5)  # centre, as shares of the image's width and height
 
 
 LOOKS: Final = (
@@ -58,7 +58,8 @@ LOOKS: Final = (
 """Views to take, in the best order."""
 
 ROLLS_RADIANS: Final = (0.0, math.pi / 2, -math.pi / 2)
-"""Turns about the line of sight, radians, one after the other, which a camera on a robot needs."""
+"""Turns about the line of sight, radians, that a camera on a robot needs; one for each view in
+turn."""
 
 
 class Suggestion(NamedTuple):
@@ -72,22 +73,22 @@ class Suggestion(NamedTuple):
 def suggestion(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
     """Return the next view to take after views (one or more) of one target.
 
-    ``lens_known``: True if the views need not determine the lens.
+    ``lens_known``: whether the lens is known already, so that the views need not determine it.
     """
-    guided = None if lens_known else _guided(views)
-    if guided is None:
+    next_view = None if lens_known else _most_helpful_view(views)
+    if next_view is None:
         look = LOOKS[len(views) % len(LOOKS)]
         return Suggestion(look.text, outline(look, views[0].target, views[0].size))
     return Suggestion(
-        f"with the sheet {guided.text}",
-        guided.outline,
-        f"the lens is sure to {guided.present:.2g} pixels over the image, with this view to "
-        f"{guided.mean:.2g}",
+        f"with the sheet {next_view.text}",
+        next_view.outline,
+        f"the lens is sure to {next_view.present:.2g} pixels over the image, with this view to "
+        f"{next_view.mean:.2g}",
     )
 
 
-def _guided(views: Sequence[TargetView]) -> NextView | None:
-    """Return the view that helps the lens most; None if the views do not determine it yet."""
+def _most_helpful_view(views: Sequence[TargetView]) -> NextView | None:
+    """Return the view that improves the lens most; None if no lens is determined yet."""
     if len(views) < MIN_VIEWS:
         return None
     try:
@@ -103,7 +104,7 @@ def _guided(views: Sequence[TargetView]) -> NextView | None:
 
 
 FOCAL_LENGTH_WIDTHS: Final = 1.2
-"""Focal length, in image widths, of the camera that outlines are drawn for."""
+"""Focal length, in image widths, of the camera for which outlines are drawn."""
 
 
 def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
@@ -115,14 +116,16 @@ def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
     half = (high - low) / 2
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half
     axis, tilt, roll = np.radians([look.axis, look.tilt, look.roll]).tolist()
-    facing = np.diag([1.0, -1.0, -1.0])
-    tilted = rotation_zyx(axis, 0.0, tilt) @ rotation_zyx(-axis, 0.0, 0.0) @ facing
-    placed = corners @ (rotation_zyx(roll, 0.0, 0.0) @ tilted).T
+    towards_camera = np.diag([1.0, -1.0, -1.0])
+    tilted = rotation_zyx(axis, 0.0, tilt) @ rotation_zyx(-axis, 0.0, 0.0) @ towards_camera
+    rotated = corners @ (rotation_zyx(roll, 0.0, 0.0) @ tilted).T
     focal, image = FOCAL_LENGTH_WIDTHS * size[0], np.array(size, dtype=np.float64)
-    away = 10.0 * float(np.linalg.norm(half))
+    distance = 10.0 * float(np.linalg.norm(half))
     for _ in range(5):  # the distance also changes the perspective
-        seen = focal * placed[:, :2] / (placed[:, 2:] + away)
-        away *= float((np.ptp(seen, axis=0) / image).max()) / look.fill
-    seen = focal * placed[:, :2] / (placed[:, 2:] + away)
-    outline_px: Array = seen - (seen.max(axis=0) + seen.min(axis=0)) / 2 + image * look.place
+        projected = focal * rotated[:, :2] / (rotated[:, 2:] + distance)
+        distance *= float((np.ptp(projected, axis=0) / image).max()) / look.fill
+    projected = focal * rotated[:, :2] / (rotated[:, 2:] + distance)
+    outline_px: Array = (
+        projected - (projected.max(axis=0) + projected.min(axis=0)) / 2 + image * look.place
+    )
     return outline_px

@@ -55,7 +55,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
     ) -> None:
         camera = find_camera(url)
         self._device = SoftwareDevice(camera)
-        usual = {
+        defaults = {
             "name": camera.name,
             "interpret_as": self._device.interpret_as,
             "application_names": {
@@ -63,8 +63,8 @@ class SoftwareCamera(SmartCamera[ValueT]):
             },
         }
         given = {
-            **usual,
-            **{name: value for name, value in options.items() if value or name not in usual},
+            **defaults,
+            **{name: value for name, value in options.items() if value or name not in defaults},
         }
         emulator = self._device.emulator
         address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)
@@ -118,7 +118,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
             raise CameraFaultError(f"{exc}: {self.frame_trouble or 'it is closed'}") from exc
 
     async def _read_image(self, timeout: float) -> bytes:
-        return await self._picture(timeout, drawn=False)
+        return await self._read_last_picture(timeout, drawn=False)
 
     async def read_drawn_image(self, *, timeout: float | None = None) -> bytes:
         """Return the last inspected picture with the marks of its tools, as a PNG's bytes.
@@ -130,7 +130,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         Cancellation: safe.
         """
         limit = self._limit(timeout, self.settings.request_timeout)
-        return await self._picture(limit, drawn=True)
+        return await self._read_last_picture(limit, drawn=True)
 
     async def read_judged_image(
         self, result: Result[Any], *, drawn: bool = False, timeout: float | None = None
@@ -155,26 +155,26 @@ class SoftwareCamera(SmartCamera[ValueT]):
         check_kind(result, Result, "result", "a Result", "read_judged_image")
         drawn = check_flag(drawn, "drawn", "read_judged_image")
         limit = self._limit(timeout, self.settings.request_timeout)
-        judged = self._pairs.judged_of(result)
+        judged = self._pairs.find_judged(result)
         if judged is None:
             raise UnsupportedError(
                 f"{self.name}: the picture of result {result.number} is not here: expected one of "
                 f"the last {MAX_PICTURES_KEPT} results of this camera"
             )
-        return await self._png(judged, limit, drawn=drawn)
+        return await self._encode_png(judged, limit, drawn=drawn)
 
     def _report_picture(self, result: Result[Any], judged: Judged) -> None:
         if self._observers.see_pictures:
             self._observers.picture(result, judged.marked_frame)
 
-    async def _picture(self, timeout: float, *, drawn: bool) -> bytes:
+    async def _read_last_picture(self, timeout: float, *, drawn: bool) -> bytes:
         self._require_session()
         judged = self.judged
         if judged is None:
             raise UnsupportedError(f"{self.name}: no picture was judged yet: trigger first")
-        return await self._png(judged, timeout, drawn=drawn)
+        return await self._encode_png(judged, timeout, drawn=drawn)
 
-    async def _png(self, judged: Judged, timeout: float, *, drawn: bool) -> bytes:
+    async def _encode_png(self, judged: Judged, timeout: float, *, drawn: bool) -> bytes:
         try:
             async with asyncio.timeout(timeout):
                 return await asyncio.to_thread(png_of, judged, drawn=drawn)

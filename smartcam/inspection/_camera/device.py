@@ -38,7 +38,7 @@ MAX_RECORDS: Final = 32
 NO_VALUE: Final = "#ERR"
 """Text of a cell without a value."""
 
-_RECORDED: Final = re.compile(r"^(?:[A-Za-z]:[\\/]|(?![A-Za-z][A-Za-z0-9+.-]*:)|file:)")
+_RECORDING_ADDRESS: Final = re.compile(r"^(?:[A-Za-z]:[\\/]|(?![A-Za-z][A-Za-z0-9+.-]*:)|file:)")
 
 
 class SoftwareDevice(Server):
@@ -85,14 +85,14 @@ class SoftwareDevice(Server):
         port = check_port(port, "SoftwareDevice")
         if quirks is not None:
             check_kind(quirks, Mapping, "quirks", "a mapping, or None", "SoftwareDevice")
-        recorded = _RECORDED.match(camera.frames) is not None
-        make = partial(source_of, camera.frames, recorded=recorded)
-        make()  # raises errors of the address now
+        is_recording = _RECORDING_ADDRESS.match(camera.frames) is not None
+        make_frames = partial(make_source, camera.frames, recorded=is_recording)
+        make_frames()  # a wrong address raises its error now
         self.inspector: FrameInspector = FrameInspector(
             camera.name,
-            make,
+            make_frames,
             camera.programs,
-            recorded=recorded,
+            recorded=is_recording,
             grey=protocol == "insight",
             on_trouble=self._report_trouble,
         )
@@ -101,7 +101,7 @@ class SoftwareDevice(Server):
             self._keeper = PictureKeeper(
                 camera.name, camera.folder / camera.keep.folder, camera.keep
             )
-            self.inspector.viewers.add(self._keeper.take)
+            self.inspector.viewers.add(self._keeper.add_picture)
         self.emulator: WireCamera
         if protocol == "insight":
             for name, value in (("transport", transport), ("dialect", dialect)):
@@ -234,7 +234,7 @@ class SoftwareDevice(Server):
 
 
 class _CellInspector(Inspector):
-    """Convert a program's values to the units of its layout, as In-Sight cells show them.
+    """Inspect frames, and convert a program's values to the units that In-Sight cells show.
 
     Args:
         inspector: inspector of the frames.
@@ -243,14 +243,14 @@ class _CellInspector(Inspector):
 
     def __init__(self, inspector: FrameInspector, program: Program) -> None:
         self._inspector, self._layout = inspector, program.layout
-        plain = [str(replace(field, unit=None)) for field in program.layout.fields]
+        unitless = [str(replace(field, unit=None)) for field in program.layout.fields]
         if program.layout.repeat is None:
-            text = ", ".join(plain)
+            text = ", ".join(unitless)
         else:
             name = next(step.name for step in program.steps if step.records)
             head = [str(replace(field, unit=None)) for field in program.layout.head]
-            text = ", ".join([*head, f"{name}: ({', '.join(plain)})*"])
-        self._plain = Layout(text)
+            text = ", ".join([*head, f"{name}: ({', '.join(unitless)})*"])
+        self._unitless_layout = Layout(text)
 
     def begin(
         self,
@@ -258,20 +258,20 @@ class _CellInspector(Inspector):
         seen: Callable[[], None],
         done: Callable[[Values | None], None],
     ) -> None:
-        """Start an inspection, whose values are converted."""
+        """Start an inspection; ``done`` gets its values in the units of the layout."""
         number = None if self._layout.sequence_field is None else order.number & 0x7FFFFFFF
 
-        def converted(found_values: Values | None) -> None:
+        def convert(found_values: Values | None) -> None:
             values: Values | None = None
             try:
                 if found_values is not None:
                     data = self._layout.build(found_values, sequence=number)
-                    values = _as_mapping(self._plain.parse(data))
+                    values = _as_mapping(self._unitless_layout.parse(data))
             except Exception:  # noqa: BLE001 - the run has to end
                 _log.exception("%s ! a result does not fit its cells", self._inspector.name)
             done(values)
 
-        self._inspector.begin(order, seen, converted)
+        self._inspector.begin(order, seen, convert)
 
     def cancel(self) -> None:
         """Cancel the running inspection."""
@@ -286,8 +286,8 @@ def _as_mapping(record: Any) -> dict[str, Any]:
     }
 
 
-def source_of(address: str, *, recorded: bool) -> FrameSource:
-    """Return the source of an address; a recording is read only as fast as runs need pictures.
+def make_source(address: str, *, recorded: bool) -> FrameSource:
+    """Return the source of an address, not open; a recording is read as fast as runs need pictures.
 
     Raises:
         ConfigurationError: the address is wrong.

@@ -1,4 +1,4 @@
-"""Inspect the frames of a software camera's source by its programs."""
+"""Inspect the frames of a software camera's source with the camera's programs."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("smartcam.inspection")
 
 FIRST_FRAME_TIMEOUT: Final = 5.0
-"""Seconds to wait for the first frame; afterwards the camera starts without a frame."""
+"""Longest time, seconds, to wait for the first frame; then the camera starts without a frame."""
 
 FRAME_WAIT: Final = 10.0
 """Longest time, seconds, between a trigger and a frame exposed after it."""
 
 TOOLS_TIMEOUT: Final = 60.0
-"""Longest time, seconds, of a program's tools; a longer run gives a result that is not ok."""
+"""Longest time, seconds, that a program's tools may take; then the result is not ok."""
 
 MAX_HUNG_THREADS: Final = 4
-"""Largest number of threads with hanging tools; at this number, new runs wait for the last."""
+"""Largest number of threads with hanging tools; at this number, new runs wait for a thread."""
 
 THREAD_GRACE: Final = 1.0
 """Longest time, seconds, that closing the camera waits for a running tool."""
@@ -79,27 +79,27 @@ class _OrderedRun:
     order: InspectionOrder
     seen: Callable[[], None]
     done: Callable[[Values | None], None]
-    moment: float  # earliest start of the frame's exposure, time.monotonic()
+    earliest_exposure: float  # earliest start of the frame's exposure, time.monotonic()
     deadline: asyncio.TimerHandle
     frame: Frame | None = None
-    work: Future[Inspection] | None = None
+    future: Future[Inspection] | None = None
 
 
 class FrameInspector(Inspector):
-    """Inspect the first frame that is exposed after a run has begun.
+    """Inspect, for each run, the first frame that is exposed after the run's start.
 
     A thread runs the tools, one picture at a time. If a run is cancelled while a tool works, the
     thread finishes this tool, and a new thread inspects the next picture.
 
     Args:
         name: name of the camera, for logs.
-        make: function that returns the unopened source of frames.
+        make: function that returns the source of frames, not open.
         programs: programs by the ids of their applications.
-        recorded: whether the source is a recording: each run gets its next picture, and after the
-            last picture the first again.
+        recorded: whether the source is a recording. Each run gets the next picture of a recording;
+            the first picture follows the last one.
         grey: whether the thread computes the grey levels of each picture for later use.
-        on_trouble: function that is called with the reason when frames are lost, and with "" when
-            they come again.
+        on_trouble: function that is called with the reason when no frames come, and with "" when
+            frames come again.
 
     Attributes:
         name: name of the camera.
@@ -125,9 +125,9 @@ class FrameInspector(Inspector):
         self.format: StreamFormat | None = None
         self.viewers: set[Callable[[Judged], None]] = set()
         self.name = name
-        self._make, self._programs = make, programs
+        self._make_source, self._programs = make, programs
         self._recorded, self._grey = recorded, grey
-        self._order: _OrderedRun | None = None
+        self._run: _OrderedRun | None = None
         self._frame_wanted = asyncio.Event()  # set while a run waits for a frame
         self._first_frame_done = asyncio.Event()  # set when the first frame came or cannot come
         self._task: asyncio.Task[None] | None = None
@@ -148,12 +148,12 @@ class FrameInspector(Inspector):
             return
         self._first_frame_done.clear()
         self._thread = self._new_thread()
-        self._task = asyncio.create_task(self._watch(), name=f"inspector of {self.name}")
+        self._task = asyncio.create_task(self._read_source(), name=f"inspector of {self.name}")
         try:
             async with asyncio.timeout(FIRST_FRAME_TIMEOUT):
                 await self._first_frame_done.wait()
         except TimeoutError:
-            self._frames_lost(f"no frame came within {FIRST_FRAME_TIMEOUT:g} s")
+            self._report_frames_lost(f"no frame came within {FIRST_FRAME_TIMEOUT:g} s")
         except BaseException:
             await self.stop()
             raise
@@ -186,163 +186,163 @@ class FrameInspector(Inspector):
         """Start a run, which inspects the first frame exposed from now on."""
         self.cancel()
         loop = asyncio.get_running_loop()
-        deadline = loop.call_later(FRAME_WAIT, self._give_up)
-        self._order = _OrderedRun(order, seen, done, time.monotonic(), deadline)
+        deadline = loop.call_later(FRAME_WAIT, self._end_without_frame)
+        self._run = _OrderedRun(order, seen, done, time.monotonic(), deadline)
         self._frame_wanted.set()
-        if self.trouble:  # a restart of the device has cleared it there
-            loop.call_soon(self._report, self.trouble)
+        if self.trouble:  # a restart of the device has cleared the condition there
+            loop.call_soon(self._set_trouble, self.trouble)
 
     def cancel(self) -> None:
         """Cancel the run; the next run does not wait for its thread."""
-        order, self._order = self._order, None
+        run, self._run = self._run, None
         self._frame_wanted.clear()
-        if order is not None:
-            order.deadline.cancel()
-            if order.work is not None:
-                order.work.cancel()
+        if run is not None:
+            run.deadline.cancel()
+            if run.future is not None:
+                run.future.cancel()
 
     # ------------------------------------------------------------------ frames
 
-    async def _watch(self) -> None:
+    async def _read_source(self) -> None:
         """Read the source, and open it again whenever it is lost."""
         delays = RETRY.delays()
         while True:
             try:
-                async with self._make() as source:
+                async with self._make_source() as source:
                     self.format = source.format
                     if self._recorded:
-                        self._frames_back()
+                        self._report_frames_back()
                     while True:
-                        if await self._follow(source):
+                        if await self._pass_frames(source):
                             delays = RETRY.delays()
                         if not self._recorded:
                             raise FrameSourceError(
                                 f"{source.name}: no more frames", source=source.name
                             )
             except (SmartCamError, OSError) as exc:
-                self._frames_lost(str(exc))
+                self._report_frames_lost(str(exc))
             except Exception as exc:  # noqa: BLE001 - a driver may be a plug-in
                 _log.exception("%s ! the source of its frames failed", self.name)
-                self._frames_lost(repr(exc))
+                self._report_frames_lost(repr(exc))
             await asyncio.sleep(next(delays))
 
-    async def _follow(self, source: FrameSource) -> bool:
-        """Pass frames to waiting runs until the source ends; return whether any frame came."""
-        arrived = False
-        held: Frame | None = None  # frame of a recording, whose run was cancelled
+    async def _pass_frames(self, source: FrameSource) -> bool:
+        """Pass frames to waiting runs until the source ends; return True if a frame came."""
+        has_frames = False
+        kept_frame: Frame | None = None  # frame of a recording that no run has inspected yet
         async with source.reader(timeout=None) as reader:
             while True:
                 if self._recorded:
                     await self._frame_wanted.wait()
                 try:
-                    frame: Frame = await anext(reader) if held is None else held
+                    frame: Frame = await anext(reader) if kept_frame is None else kept_frame
                 except StopAsyncIteration:
-                    return arrived
-                arrived, held = True, None
+                    return has_frames
+                has_frames, kept_frame = True, None
                 if self._recorded and frame.lost:  # a run with a damaged picture has no result
-                    held = dataclasses.replace(frame, lost=0)
+                    kept_frame = dataclasses.replace(frame, lost=0)
                     why = f"{frame.lost} damaged pictures before picture {frame.sequence}"
-                    self._frames_lost(why)
+                    self._report_frames_lost(why)
                     await asyncio.sleep(RETRY.initial)
-                    self._frames_back()
+                    self._report_frames_back()
                     continue
-                self._frames_back()
-                order = self._order
-                if order is None or order.frame is not None:
-                    held = frame if self._recorded else None
-                elif self._recorded or frame.began >= order.moment:
-                    self._inspect(order, frame)
+                self._report_frames_back()
+                run = self._run
+                if run is None or run.frame is not None:
+                    kept_frame = frame if self._recorded else None
+                elif self._recorded or frame.began >= run.earliest_exposure:
+                    self._inspect(run, frame)
 
-    def _frames_back(self) -> None:
-        """Note that frames come again."""
+    def _report_frames_back(self) -> None:
+        """Report that frames come again."""
         if self.trouble:
             _log.info("%s = frames come again", self.name)
-            self._report("")
+            self._set_trouble("")
         self._first_frame_done.set()
 
-    def _frames_lost(self, why: str) -> None:
-        """Note that no frames come, which cancels the run."""
+    def _report_frames_lost(self, why: str) -> None:
+        """Report that no frames come, which cancels the run."""
         if why != self.trouble:
             _log.warning("%s ! no frames: %s", self.name, why)
-        self._report(why)
+        self._set_trouble(why)
         self._first_frame_done.set()
 
-    def _report(self, trouble: str) -> None:
+    def _set_trouble(self, trouble: str) -> None:
         self.trouble = trouble
         self.on_trouble(trouble)
 
-    def _give_up(self) -> None:
+    def _end_without_frame(self) -> None:
         """End the run without a result, since no frame came in time."""
-        order, self._order = self._order, None
+        run, self._run = self._run, None
         self._frame_wanted.clear()
-        if order is not None:
+        if run is not None:
             _log.warning(
                 "%s ! no frame was exposed within %g s after the trigger: no result",
                 self.name,
                 FRAME_WAIT,
             )
-            order.done(None)
+            run.done(None)
 
     # ------------------------------------------------------------------ tools
 
-    def _inspect(self, order: _OrderedRun, frame: Frame) -> None:
+    def _inspect(self, run: _OrderedRun, frame: Frame) -> None:
         """Run the tools on a frame in the thread."""
         thread = self._free_thread()
         if thread is None:
             return
         loop = asyncio.get_running_loop()
-        order.deadline.cancel()
-        order.deadline = loop.call_later(TOOLS_TIMEOUT, self._give_up_tools, order, frame)
-        order.frame = frame
+        run.deadline.cancel()
+        run.deadline = loop.call_later(TOOLS_TIMEOUT, self._end_hung_run, run, frame)
+        run.frame = frame
         self._frame_wanted.clear()
-        program = self._programs[order.order.application]
-        work = thread.submit(partial(_inspected, program, frame, order.order.input, self._grey))
-        order.work = work
+        program = self._programs[run.order.application]
+        future = thread.submit(partial(_inspect_frame, program, frame, run.order.input, self._grey))
+        run.future = future
 
-        def ended(_: Future[Inspection]) -> None:
+        def hand_over(_: Future[Inspection]) -> None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(self._finish, order, frame, work)
+                loop.call_soon_threadsafe(self._report_findings, run, frame, future)
 
-        work.add_done_callback(ended)
-        order.seen()
+        future.add_done_callback(hand_over)
+        run.seen()
 
     def _free_thread(self) -> ToolThread | None:
-        """Return the thread for tools, or a new thread if it is busy with a cancelled run."""
+        """Return the thread for tools; a new thread if the old one is busy with a cancelled run."""
         thread = self._thread
-        if thread is not None and thread.at_work:
-            self._hung_threads = [hung for hung in self._hung_threads if hung.at_work]
+        if thread is not None and thread.is_busy:
+            self._hung_threads = [hung for hung in self._hung_threads if hung.is_busy]
             if len(self._hung_threads) < MAX_HUNG_THREADS:
                 self._hung_threads.append(thread)
                 thread.close()
                 thread = self._thread = self._new_thread()
         return thread
 
-    def _give_up_tools(self, order: _OrderedRun, frame: Frame) -> None:
-        """End a run whose tools take too long; another thread will run the next."""
-        if order is not self._order:
+    def _end_hung_run(self, run: _OrderedRun, frame: Frame) -> None:
+        """End a run whose tools take too long; another thread inspects the next picture."""
+        if run is not self._run:
             return
-        if order.work is not None:
-            order.work.cancel()
+        if run.future is not None:
+            run.future.cancel()
         text = f"the tools did not end within {TOOLS_TIMEOUT:g} s"
-        self._end(order, frame, None, TimeoutError(text))
+        self._end_run(run, frame, None, TimeoutError(text))
 
-    def _finish(self, order: _OrderedRun, frame: Frame, work: Future[Inspection]) -> None:
+    def _report_findings(self, run: _OrderedRun, frame: Frame, future: Future[Inspection]) -> None:
         """Report the tools' findings, unless the run was cancelled."""
-        if order is not self._order:
+        if run is not self._run:
             return
-        error = work.exception()
-        self._end(order, frame, work.result() if error is None else None, error)
+        error = future.exception()
+        self._end_run(run, frame, future.result() if error is None else None, error)
 
-    def _end(
+    def _end_run(
         self,
-        order: _OrderedRun,
+        run: _OrderedRun,
         frame: Frame,
         inspection: Inspection | None,
         error: BaseException | None,
     ) -> None:
-        self._order = None
-        order.deadline.cancel()
-        number, application = order.order.number, order.order.application
+        self._run = None
+        run.deadline.cancel()
+        number, application = run.order.number, run.order.application
         values: Values | None = None
         try:
             if inspection is not None:
@@ -353,13 +353,13 @@ class FrameInspector(Inspector):
         except Exception:  # noqa: BLE001 - the run has to end
             _log.exception("%s ! application %d has no result", self.name, application)
         self.judged = Judged(number, frame, inspection, application)
-        order.done(values)
-        for show in self.viewers:
-            show(self.judged)
+        run.done(values)
+        for viewer in self.viewers:
+            viewer(self.judged)
 
 
-def _inspected(program: Program, frame: Frame, data: bytes, grey: bool) -> Inspection:
-    """Return the inspection of a frame; values that do not fit the layout are an error."""
+def _inspect_frame(program: Program, frame: Frame, data: bytes, grey: bool) -> Inspection:
+    """Inspect a frame; raise an error if the values do not fit the layout."""
     inspection = program.inspect(frame, input=data)
     inspection.payload()
     if grey:
@@ -372,7 +372,7 @@ def failed_values(program: Program, reason: str) -> dict[str, Any]:
     layout = program.layout
     fields = layout.fields if layout.repeat is None else layout.head
     values = {
-        field.name: _EMPTY.get(field.type, math.nan if "real" in field.type else 0)
+        field.name: _EMPTY_VALUES.get(field.type, math.nan if "real" in field.type else 0)
         for field in fields
     }
     values |= {step.name: [] for step in program.steps if step.records}
@@ -384,4 +384,4 @@ def failed_values(program: Program, reason: str) -> dict[str, Any]:
     }
 
 
-_EMPTY: Final[dict[str, Any]] = {"bool": False, "string": ""}
+_EMPTY_VALUES: Final[dict[str, Any]] = {"bool": False, "string": ""}

@@ -18,7 +18,7 @@ _log: Final = logging.getLogger("smartcam.inspection")
 
 
 class JudgedDriver(FrameDriver):
-    """Deliver inspected pictures; if they come faster than they are drawn, only the newest.
+    """Deliver inspected pictures; skip all but the newest if drawing them takes too long.
 
     Args:
         inspector: inspector of the camera's frames.
@@ -28,7 +28,7 @@ class JudgedDriver(FrameDriver):
     def __init__(self, inspector: FrameInspector, *, drawn: bool) -> None:
         super().__init__(FrameAddress.parse("judged://"))
         self._inspector, self._drawn = inspector, drawn
-        self._next: asyncio.Queue[Judged] = asyncio.Queue(1)
+        self._newest: asyncio.Queue[Judged] = asyncio.Queue(1)
         self._task: asyncio.Task[None] | None = None
         self._sink: FrameSink | None = None
 
@@ -48,20 +48,20 @@ class JudgedDriver(FrameDriver):
             raise FrameSourceError(
                 f"{self.name}: no pictures yet: {self._inspector.trouble}", source=self.name
             )
-        kind = find_format("RGB8") if self._drawn else form.format
-        return StreamFormat(kind, form.width, form.height)
+        pixel_format = find_format("RGB8") if self._drawn else form.format
+        return StreamFormat(pixel_format, form.width, form.height)
 
     async def start(self, sink: FrameSink) -> None:
         """Deliver the last inspected picture, then all later ones."""
         self._sink = sink
-        self._inspector.viewers.add(self._take)
+        self._inspector.viewers.add(self._queue_picture)
         if self._inspector.judged is not None:
-            self._take(self._inspector.judged)
-        self._task = asyncio.create_task(self._give(sink), name=f"judged frames of {self.name}")
+            self._queue_picture(self._inspector.judged)
+        self._task = asyncio.create_task(self._deliver(sink), name=f"judged frames of {self.name}")
 
     async def stop(self) -> None:
         """Stop delivering pictures."""
-        self._inspector.viewers.discard(self._take)
+        self._inspector.viewers.discard(self._queue_picture)
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
@@ -71,19 +71,19 @@ class JudgedDriver(FrameDriver):
         """Release everything."""
         await self.stop()
 
-    def _take(self, judged: Judged) -> None:
-        if self._next.full():
-            self._next.get_nowait()
+    def _queue_picture(self, judged: Judged) -> None:
+        if self._newest.full():
+            self._newest.get_nowait()
             if self._sink is not None:
                 self._sink.skipped(1)
-        self._next.put_nowait(judged)
+        self._newest.put_nowait(judged)
 
-    async def _give(self, sink: FrameSink) -> None:
+    async def _deliver(self, sink: FrameSink) -> None:
         try:
             while True:
-                judged = await self._next.get()
+                judged = await self._newest.get()
                 try:
-                    frame = await self._frame(judged)
+                    frame = await self._make_frame(judged)
                 except SmartCamError as exc:  # a damaged picture
                     _log.debug("%s ! a picture is not shown: %s", self.name, exc)
                     sink.lost(1)
@@ -93,8 +93,8 @@ class JudgedDriver(FrameDriver):
             _log.exception("%s ! its pictures are not shown any more", self.name)
             sink.ended(FrameSourceError(f"{self.name}: {exc!r}", source=self.name))
 
-    async def _frame(self, judged: Judged) -> Frame:
-        return await asyncio.to_thread(_drawn, judged) if self._drawn else judged.marked_frame
+    async def _make_frame(self, judged: Judged) -> Frame:
+        return await asyncio.to_thread(_draw_marks, judged) if self._drawn else judged.marked_frame
 
 
 def judged_source(inspector: FrameInspector, *, drawn: bool) -> FrameSource:
@@ -102,7 +102,7 @@ def judged_source(inspector: FrameInspector, *, drawn: bool) -> FrameSource:
     return FrameSource(JudgedDriver(inspector, drawn=drawn), timeout=None, stall=None, linger=2.0)
 
 
-def _drawn(judged: Judged) -> Frame:
+def _draw_marks(judged: Judged) -> Frame:
     """Return the frame with the marks of the tools."""
     frame = judged.frame
     pixels = frame.rgb() if judged.inspection is None else judged.inspection.drawn()

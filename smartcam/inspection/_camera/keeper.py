@@ -25,7 +25,8 @@ _log: Final = logging.getLogger("smartcam.inspection")
 MAX_WAITING_PICTURES: Final = 16
 """Largest number of pictures that wait to be written; more are dropped and counted."""
 
-_FORBIDDEN: Final = re.compile(r'[\x00-\x1f/\\:*?"<>|]')  # in names of files
+# characters that names of files cannot have
+_FORBIDDEN: Final = re.compile(r'[\x00-\x1f/\\:*?"<>|]')
 
 
 class PictureKeeper:
@@ -40,20 +41,20 @@ class PictureKeeper:
         keep: settings of keeping.
 
     Attributes:
-        missed: number of pictures that were dropped while others were written.
+        dropped_count: number of pictures that were dropped because too many others waited.
     """
 
     def __init__(self, name: str, folder: Path, keep: Keep) -> None:
         self._name, self._folder, self._keep = name, folder, keep
-        self._file_prefix = _FORBIDDEN.sub("-", name)  # in the names of its files
+        self._file_prefix = _FORBIDDEN.sub("-", name)
         self._own_names = re.compile(
             rf"\d{{8}}-\d{{6}}-\d{{6}}-{re.escape(self._file_prefix)}-\d+-(ok|bad)\.png"
         )
-        self.missed: int = 0
+        self.dropped_count: int = 0
         self._waiting: collections.deque[Judged] = collections.deque()
         self._wake = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
-        self._failed = False
+        self._has_failed = False
 
     def start(self) -> None:
         """Start the writer of queued pictures."""
@@ -70,13 +71,13 @@ class PictureKeeper:
         while self._waiting:
             await asyncio.to_thread(self._write, self._waiting.popleft())
 
-    def take(self, judged: Judged) -> None:
+    def add_picture(self, judged: Judged) -> None:
         """Queue a picture, unless it is ok and only bad pictures are kept."""
         ok = judged.inspection is not None and judged.inspection.ok
         if ok and self._keep.which == "bad":
             return
         if len(self._waiting) >= MAX_WAITING_PICTURES:
-            self.missed += 1
+            self.dropped_count += 1
             return
         self._waiting.append(judged)
         self._wake.set()
@@ -93,14 +94,14 @@ class PictureKeeper:
         """Write a picture, and delete the oldest beyond the limit."""
         inspection = judged.inspection
         ok = inspection is not None and inspection.ok
-        at = datetime.fromtimestamp(judged.frame.utc, UTC)
+        captured_at = datetime.fromtimestamp(judged.frame.utc, UTC)
         verdict = "ok" if ok else "bad"
-        stem = f"{at:%Y%m%d-%H%M%S-%f}-{self._file_prefix}-{judged.application}-{verdict}"
+        stem = f"{captured_at:%Y%m%d-%H%M%S-%f}-{self._file_prefix}-{judged.application}-{verdict}"
         record: dict[str, Any] = {
             "camera": self._name,
             "application": judged.application,
             "number": judged.number,
-            "captured": at.isoformat(),
+            "captured": captured_at.isoformat(),
             "ok": ok,
             "value": None if inspection is None else jsonable(inspection.value),
         }
@@ -112,12 +113,12 @@ class PictureKeeper:
             pictures = sorted(
                 path for path in self._folder.iterdir() if self._own_names.fullmatch(path.name)
             )
-            for old in pictures[: max(0, len(pictures) - self._keep.most)]:
-                old.unlink(missing_ok=True)
-                old.with_suffix(".json").unlink(missing_ok=True)
+            for oldest in pictures[: max(0, len(pictures) - self._keep.most)]:
+                oldest.unlink(missing_ok=True)
+                oldest.with_suffix(".json").unlink(missing_ok=True)
         except (OSError, ValueError, SmartCamError) as exc:
-            if not self._failed:  # log the first failure only
+            if not self._has_failed:  # log the first failure only
                 _log.error("%s ! pictures are not kept: %s", self._name, exc)
-            self._failed = True
+            self._has_failed = True
         else:
-            self._failed = False
+            self._has_failed = False

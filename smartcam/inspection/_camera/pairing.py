@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.models import CameraEvent, Result
 
 MAX_PICTURES_KEPT: Final = 8
-"""Number of last results whose pictures are kept, which bounds the memory."""
+"""Number of latest results whose pictures are kept."""
 
 MAX_PENDING: Final = 64
 """Largest number of sent containers whose results have not arrived yet."""
@@ -33,16 +33,16 @@ class _SentContainer(NamedTuple):
 class JudgedResults(Observer):
     """Find the picture of each result that a client gets from a device in this process.
 
-    Device and client count the containers of their session, which arrive in order and complete. A
-    result gets no picture if its bytes differ from the container's.
+    Device and client both count the containers of a session, since all containers arrive, and in
+    order. A result gets no picture if its bytes differ from the container with the same count.
 
     Args:
-        session: function that returns the number of the device's session (0: no session) and the
+        session: function that returns the number of the device's session (0: no session), and the
             last report of a run.
         received: function that returns the number of containers that the client has received.
         on_found: function that is called with each result and its picture, before other observers
             get the result.
-        max_kept: number of last results whose pictures are kept for :meth:`judged_of`.
+        max_kept: number of latest results whose pictures are kept for :meth:`find_judged`.
     """
 
     def __init__(
@@ -53,12 +53,13 @@ class JudgedResults(Observer):
         *,
         max_kept: int = MAX_PICTURES_KEPT,
     ) -> None:
-        self._session, self._received, self._on_found = session, received, on_found
+        self._get_session, self._count_received, self._on_found = session, received, on_found
         self._max_kept = max_kept
-        self._number = 0  # number of the session
-        self._sent = 0  # number of containers sent in the session
+        self._session_number = 0  # 0: no session
+        self._sent_count = 0  # number of containers sent in the session
         self._report: LastReport | None = None
-        self._before = 0  # number of containers that the client received before the session
+        # number of containers that the client received before the session
+        self._received_before = 0
         self._pending: dict[int, _SentContainer] = {}  # containers by their count in the session
         self._judged: collections.OrderedDict[tuple[int, datetime], Judged] = (
             collections.OrderedDict()
@@ -66,29 +67,29 @@ class JudgedResults(Observer):
 
     def take(self, judged: Judged) -> None:
         """Record the picture of the container that the device has just sent."""
-        number, report = self._session()
-        if number != self._number:
-            self._number, self._sent = number, 0
+        session_number, report = self._get_session()
+        if session_number != self._session_number:
+            self._session_number, self._sent_count = session_number, 0
             self._pending.clear()
-        new, self._report = report is not self._report, report
-        if number and new and report is not None:
-            self._sent += 1
-            self._pending[self._sent] = _SentContainer(report.result.data, judged)
-            self._pending.pop(self._sent - MAX_PENDING, None)
+        is_new, self._report = report is not self._report, report
+        if session_number and is_new and report is not None:
+            self._sent_count += 1
+            self._pending[self._sent_count] = _SentContainer(report.result.data, judged)
+            self._pending.pop(self._sent_count - MAX_PENDING, None)
 
     def on_state(self, event: CameraEvent) -> None:
         """Restart the count with each session."""
         if isinstance(event, (Connected, Reconnected)):
-            self._before = self._received()
+            self._received_before = self._count_received()
         elif isinstance(event, Disconnected):
             self._pending.clear()
 
     def on_result(self, result: Result) -> None:
         """Find the picture of a result."""
-        count = result.number - self._before
+        count = result.number - self._received_before
         sent = self._pending.pop(count, None)
-        for older in [key for key in self._pending if key < count]:
-            del self._pending[older]  # their results were not awaited
+        for unmatched in [key for key in self._pending if key < count]:
+            del self._pending[unmatched]  # their results never arrived
         if sent is None or (sent.data, sent.judged.application) != (result.raw, result.application):
             return
         self._judged[result.number, result.received_at] = sent.judged
@@ -96,6 +97,6 @@ class JudgedResults(Observer):
             self._judged.popitem(last=False)
         self._on_found(result, sent.judged)
 
-    def judged_of(self, result: Result) -> Judged | None:
+    def find_judged(self, result: Result) -> Judged | None:
         """Return the picture of a recent result; None if it is no longer kept."""
         return self._judged.get((result.number, result.received_at))

@@ -1,4 +1,4 @@
-"""A thread for tools that does not keep the process from exiting."""
+"""A thread for tools; the process can exit while it runs."""
 
 from __future__ import annotations
 
@@ -28,44 +28,45 @@ class ToolThread:
     def __init__(self, name: str) -> None:
         self._jobs: collections.deque[tuple[Future[Any], Callable[[], Any]]] = collections.deque()
         self._lock = threading.Lock()  # guards the jobs
-        # Locked while there are no jobs. A condition would cost one more switch of threads.
-        self._bell = threading.Lock()
-        self._bell.acquire()
+        # Locked while there are no jobs: the thread waits for it. A condition would cost one more
+        # switch of threads.
+        self._no_jobs = threading.Lock()
+        self._no_jobs.acquire()
         self._closing = False
-        self._at_work = False
+        self._is_busy = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     @property
-    def at_work(self) -> bool:
+    def is_busy(self) -> bool:
         """True while a job is running."""
-        return self._at_work
+        return self._is_busy
 
-    def submit(self, do: Callable[[], Any]) -> Future[Any]:
-        """Queue a job, and drop cancelled jobs from the queue."""
+    def submit(self, function: Callable[[], Any]) -> Future[Any]:
+        """Queue a job; cancelled jobs are removed from the queue."""
         future: Future[Any] = Future()
         with self._lock:
             if self._jobs:
                 waiting = [job for job in self._jobs if not job[0].cancelled()]
                 self._jobs = collections.deque(waiting)
-            self._jobs.append((future, do))
-        self._ring()
+            self._jobs.append((future, function))
+        self._wake_thread()
         return future
 
     def close(self) -> None:
         """End the thread after its queued jobs; return at once."""
         self._closing = True
-        self._ring()
+        self._wake_thread()
 
-    def _ring(self) -> None:
+    def _wake_thread(self) -> None:
         with contextlib.suppress(RuntimeError):  # already released: the thread will look for jobs
-            self._bell.release()
+            self._no_jobs.release()
 
     def _run(self) -> None:
         while True:
-            self._bell.acquire()
+            self._no_jobs.acquire()
             while (job := self._next_job()) is not None:
-                self._do(*job)
+                self._run_job(*job)
                 del job  # releases its picture
             if self._closing and not self._jobs:
                 return
@@ -74,19 +75,19 @@ class ToolThread:
         with self._lock:
             if not self._jobs:
                 return None
-            self._at_work = True
+            self._is_busy = True
             return self._jobs.popleft()
 
-    def _do(self, future: Future[Any], do: Callable[[], Any]) -> None:
+    def _run_job(self, future: Future[Any], function: Callable[[], Any]) -> None:
         if not future.set_running_or_notify_cancel():
-            self._at_work = False
+            self._is_busy = False
             return
         try:
             with short_turns(MAX_TURN_SECONDS):
-                result = do()
+                result = function()
         except BaseException as exc:  # noqa: BLE001 - passed on by the future
-            self._at_work = False
+            self._is_busy = False
             future.set_exception(exc)
         else:
-            self._at_work = False
+            self._is_busy = False
             future.set_result(result)

@@ -1,9 +1,9 @@
 """Find places where a part may be, by the directions of gradients, from coarse to fine.
 
 The gradient of a pixel of a pyramid level has one of sixteen directions. A map for each direction
-gives the agreement of the pixels around a place with it. The agreement of a part's points is read
-from these maps, for all places at once, one rotation of the part after the other. The best places
-are refined at the larger levels of the pyramid.
+gives the agreement of the pixels around a place with this direction. The agreement of a part's
+points is read from these maps, for all places at once, one rotation of the part after the other.
+The best places are refined at the larger levels of the pyramid.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DIRECTIONS: Final = 16
 """Number of directions of gradients in the full circle that are distinguished."""
 
 AGREEMENT: Final = (np.uint8(4), np.uint8(3), np.uint8(1))
-"""Agreement of two directions by the steps between them; 0 for more steps."""
+"""Agreement of two directions that are 0, 1 or 2 steps apart; 0 for more steps."""
 
 MAX_TOP_POINTS: Final = 44
 """Largest number of points of a part that are compared at all places: each adds 4 at most to the
@@ -120,20 +120,20 @@ class Ranges:
     least_score: float
 
     @property
-    def is_round(self) -> bool:
-        """True if all angles are searched."""
+    def covers_all_angles(self) -> bool:
+        """True if the range includes all angles."""
         return self.angles[1] - self.angles[0] >= self.period - 1e-9
 
-    def turns(self, step: float) -> tuple[Array, bool]:
-        """Return angles with distances of a step at most, and whether they close a circle."""
+    def list_angles(self, step: float) -> tuple[Array, bool]:
+        """Return angles at most a step apart, and True if the last one is next to the first one."""
         start, span = self.angles[0], min(self.angles[1] - self.angles[0], self.period)
-        if self.is_round:
+        if self.covers_all_angles:
             count = max(math.ceil(span / step), 1)
             return start + span * np.arange(count) / count, self.period > 6.28
         return np.linspace(start, start + span, max(math.ceil(span / step), 0) + 1), False
 
-    def sizes(self, step: float) -> Array:
-        """Return scales with distances of a step at most."""
+    def list_scales(self, step: float) -> Array:
+        """Return scales that grow by the factor ``1 + step`` at most."""
         low, high = self.scales
         count = math.ceil(math.log(high / low) / step) + 1 if high > low else 1
         return np.geomspace(low, high, count)
@@ -153,7 +153,7 @@ class PyramidLevel:
         return cv2.Sobel(self.grey, cv2.CV_16S, 1, 0), cv2.Sobel(self.grey, cv2.CV_16S, 0, 1)
 
     def least_response(self, contrast: float) -> float:
-        """Return the response from which on a pixel has a direction."""
+        """Return the least response at which a pixel has a direction."""
         return max(EDGE_RESPONSE * contrast, NOISE_RESPONSE * self._noise)
 
     def unit_gradient(self, contrast: float) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -161,8 +161,8 @@ class PyramidLevel:
         cv2 = load("cv2", "inspection needs")
         across, down = (component.astype(np.float32) for component in self.gradient)
         size = cv2.magnitude(across, down)
-        least = np.float32(self.least_response(contrast))
-        size[size < least] = np.inf
+        min_response = np.float32(self.least_response(contrast))
+        size[size < min_response] = np.inf
         return cv2.divide(across, size), cv2.divide(down, size)
 
     def agreement(self, contrast: float, *, any_polarity: bool) -> list[NDArray[np.uint8]]:
@@ -170,19 +170,24 @@ class PyramidLevel:
         cv2 = load("cv2", "inspection needs")
         across, down = (component.astype(np.float32) for component in self.gradient)
         size, angle = cv2.cartToPolar(across, down)
-        number = (angle * (DIRECTIONS / (2 * math.pi)) + 0.5).astype(np.uint8) % DIRECTIONS
-        count = DIRECTIONS // 2 if any_polarity else DIRECTIONS
-        number %= count
-        number[size < self.least_response(contrast)] = 255
-        around = np.ones((3, 3), np.uint8)
-        spread_directions = [cv2.dilate((number == k).view(np.uint8), around) for k in range(count)]
+        direction_index = (angle * (DIRECTIONS / (2 * math.pi)) + 0.5).astype(np.uint8) % DIRECTIONS
+        direction_count = DIRECTIONS // 2 if any_polarity else DIRECTIONS
+        direction_index %= direction_count
+        direction_index[size < self.least_response(contrast)] = 255
+        neighbourhood = np.ones((3, 3), np.uint8)
+        spread_directions = [
+            cv2.dilate((direction_index == k).view(np.uint8), neighbourhood)
+            for k in range(direction_count)
+        ]
         agreements = []
-        for k in range(count):
-            best = spread_directions[k] * AGREEMENT[0]
+        for k in range(direction_count):
+            agreement = spread_directions[k] * AGREEMENT[0]
             for apart in (1, 2):
-                both = spread_directions[(k + apart) % count] | spread_directions[k - apart]
-                best = np.maximum(best, both * AGREEMENT[apart])
-            agreements.append(best)
+                both_sides = (
+                    spread_directions[(k + apart) % direction_count] | spread_directions[k - apart]
+                )
+                agreement = np.maximum(agreement, both_sides * AGREEMENT[apart])
+            agreements.append(agreement)
         return agreements
 
 
@@ -198,34 +203,34 @@ class PicturePyramid:
         self._levels = [PyramidLevel(grey, noise)]
         self._noise = noise
         self._agreement: dict[tuple[int, float, bool], list[NDArray[np.uint8]]] = {}
-        self._units: dict[tuple[int, float], tuple[NDArray[Any], NDArray[Any]]] = {}
+        self._unit_gradients: dict[tuple[int, float], tuple[NDArray[Any], NDArray[Any]]] = {}
 
     def level(self, number: int) -> PyramidLevel:
         """Return a level; 0 is the picture."""
         cv2 = load("cv2", "inspection needs")
         while len(self._levels) <= number:
-            below = self._levels[-1].grey
-            # a pixel of the level above has 0.4 of the noise, further ones half of it
+            larger = self._levels[-1].grey
+            # the first smaller level has 0.4 of the noise, each further level half of that
             noise = self._noise * (1.0 if number == 0 else 0.4 * 0.5 ** (len(self._levels) - 1))
-            self._levels.append(PyramidLevel(cv2.pyrDown(below), noise))
+            self._levels.append(PyramidLevel(cv2.pyrDown(larger), noise))
         return self._levels[number]
 
     def agreement(
         self, level: int, contrast: float, *, any_polarity: bool
     ) -> list[NDArray[np.uint8]]:
-        """Return a level's maps of agreement; models with one contrast share them."""
+        """Return a level's maps of agreement; models with the same contrast share these maps."""
         key = level, contrast, any_polarity
         if key not in self._agreement:
-            made = self.level(level).agreement(contrast, any_polarity=any_polarity)
-            self._agreement[key] = made
+            maps = self.level(level).agreement(contrast, any_polarity=any_polarity)
+            self._agreement[key] = maps
         return self._agreement[key]
 
-    def units(self, level: int, contrast: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    def unit_gradient(self, level: int, contrast: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return a level's gradient with a length of 1."""
         key = level, contrast
-        if key not in self._units:
-            self._units[key] = self.level(level).unit_gradient(contrast)
-        return self._units[key]
+        if key not in self._unit_gradients:
+            self._unit_gradients[key] = self.level(level).unit_gradient(contrast)
+        return self._unit_gradients[key]
 
 
 def find_candidates(
@@ -233,62 +238,64 @@ def find_candidates(
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the places where a part may be, the best first, and the best refused place.
 
-    The error of a place is about a pixel.
+    The places are exact to about a pixel.
     """
     top = model.top
-    candidates = list(_everywhere(pyramid, model, ranges))
+    candidates = list(_search_top_level(pyramid, model, ranges))
     refused: RoughPlace | None = None
-    candidates, refused = _best(
+    candidates, refused = _keep_best(
         candidates, TOP_SHARE * ranges.least_score, 2.0**top, MAX_CANDIDATES, None
     )
     for level in range(top - 1, 0, -1):
         if not candidates:
             break
-        candidates = _followed(pyramid, model, ranges, level, candidates)
+        candidates = _refine_places(pyramid, model, ranges, level, candidates)
         most_kept = max(2 * most + 8, MAX_CANDIDATES >> (2 * (top - level)))
-        least = LOWER_SHARE * ranges.least_score
-        candidates, refused = _best(candidates, least, 2.0**level, most_kept, refused)
+        min_score = LOWER_SHARE * ranges.least_score
+        candidates, refused = _keep_best(candidates, min_score, 2.0**level, most_kept, refused)
     return candidates, refused
 
 
-def _everywhere(
+def _search_top_level(
     pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges
 ) -> Iterator[RoughPlace]:
-    """Yield places at the smallest level, of all angles and scales."""
+    """Search the smallest level, at all angles and scales; yield the places that agree."""
     top = model.top
     maps = pyramid.agreement(top, ranges.contrast, any_polarity=ranges.any_polarity)
     radius = model.radius(top)
-    points, normals = _thinned(model.points[top], model.normals[top], MAX_TOP_POINTS)
+    points, normals = _thin_out(model.points[top], model.normals[top], MAX_TOP_POINTS)
     points = points / 2**top
-    for scale in ranges.sizes(TOP_STEP_PX / radius).tolist():
-        angles, closed = ranges.turns(TOP_STEP_PX / (radius * scale))
+    for scale in ranges.list_scales(TOP_STEP_PX / radius).tolist():
+        angles, wraps = ranges.list_angles(TOP_STEP_PX / (radius * scale))
         table = _AgreementTable(maps, math.ceil(radius * scale) + 1)
-        for part in np.array_split(
+        for some_angles in np.array_split(
             angles, max(1, -(-table.bytes * len(angles) // MAX_STACK_BYTES))
         ):
-            stack = table.sums(scale * points, normals, part)
-            least = max(1, math.floor(TOP_SHARE * ranges.least_score * 4 * len(points)))
-            closes = closed and len(part) == len(angles)
-            for turn, y, x, total in table.peaks(stack, least, closes=closes):
+            stack = table.sum_agreement(scale * points, normals, some_angles)
+            min_sum = max(1, math.floor(TOP_SHARE * ranges.least_score * 4 * len(points)))
+            part_wraps = wraps and len(some_angles) == len(angles)
+            for angle_index, y, x, total in table.find_peaks(stack, min_sum, wraps=part_wraps):
                 score = total / (4 * len(points))
-                yield RoughPlace(x * 2**top, y * 2**top, float(part[turn]), scale, score)
+                yield RoughPlace(
+                    x * 2**top, y * 2**top, float(some_angles[angle_index]), scale, score
+                )
 
 
 class _AgreementTable:
-    """Maps of agreement, with a border of nothing, as flat rows."""
+    """Maps of agreement with a border of zeros, flattened."""
 
     def __init__(self, maps: list[NDArray[np.uint8]], border: int) -> None:
         self._height, self._width = maps[0].shape
-        self._row = self._width + 2 * border
-        self._start = border * self._row + border
+        self._row_length = self._width + 2 * border
+        self._start = border * self._row_length + border
         self._border = border
-        # a row more: the last sums reach beyond their line
+        # one row more, since the last sums read beyond the end of their row
         padded = [np.pad(map_, ((border, border + 1), (border, border))) for map_ in maps]
         self._flat = [map_.ravel() for map_ in padded]
-        self.bytes = self._row * self._height
+        self.bytes = self._row_length * self._height
 
-    def sums(self, points: Array, normals: Array, angles: Array) -> NDArray[np.uint8]:
-        """Return the agreement of all points (A, H, W) at all places, by angle."""
+    def sum_agreement(self, points: Array, normals: Array, angles: Array) -> NDArray[np.uint8]:
+        """Return the summed agreement of all points, (A, H, W), for each angle and place."""
         stack = np.zeros((len(angles), self.bytes), np.uint8)
         count, size = len(self._flat), self.bytes
         directions = np.arctan2(normals[:, 1], normals[:, 0])
@@ -296,52 +303,52 @@ class _AgreementTable:
         x, y = points.T
         columns = np.rint(cos * x - sin * y).astype(int)
         rows = np.rint(sin * x + cos * y).astype(int)
-        starts = (self._start + rows * self._row + columns).tolist()
+        starts = (self._start + rows * self._row_length + columns).tolist()
         turned = (directions + angles[:, None]) * (DIRECTIONS / (2 * math.pi))
-        numbers = (np.rint(turned).astype(int) % count).tolist()
+        indices_by_angle = (np.rint(turned).astype(int) % count).tolist()
         flat, add = self._flat, np.add
-        for total, line, which in zip(stack, starts, numbers, strict=True):
-            for start, number in zip(line, which, strict=True):
-                add(total, flat[number][start : start + size], total)
-        return stack.reshape(len(angles), self._height, self._row)
+        for total, offsets, direction_indices in zip(stack, starts, indices_by_angle, strict=True):
+            for start, direction_index in zip(offsets, direction_indices, strict=True):
+                add(total, flat[direction_index][start : start + size], total)
+        return stack.reshape(len(angles), self._height, self._row_length)
 
-    def peaks(
-        self, stack: NDArray[np.uint8], least: int, *, closes: bool
+    def find_peaks(
+        self, stack: NDArray[np.uint8], min_sum: int, *, wraps: bool
     ) -> list[tuple[int, int, int, int]]:
-        """Return the highest peaks: index of the angle, row, column, and sum."""
+        """Return the highest peaks as tuples: index of the angle, row, column, and sum."""
         cv2 = load("cv2", "inspection needs")
         flat = stack.reshape(len(stack), -1)
         peaks_found: list[tuple[int, int, int, int]] = []
-        around = np.ones((3, 3), np.uint8)
-        for turn in np.flatnonzero(flat.max(axis=1) >= least).tolist():
-            high = np.flatnonzero(flat[turn] >= least)
-            totals = flat[turn][high]
-            highest = totals >= cv2.dilate(stack[turn], around).ravel()[high]
-            for other in (turn - 1, turn + 1):
-                if closes or 0 <= other < len(stack):
-                    highest &= totals >= flat[other % len(stack)][high]
-            high, totals = high[highest], totals[highest]
-            rows, columns = np.divmod(high, self._row)
-            inner = columns < self._width
+        neighbourhood = np.ones((3, 3), np.uint8)
+        for angle_index in np.flatnonzero(flat.max(axis=1) >= min_sum).tolist():
+            high_indices = np.flatnonzero(flat[angle_index] >= min_sum)
+            totals = flat[angle_index][high_indices]
+            highest = totals >= cv2.dilate(stack[angle_index], neighbourhood).ravel()[high_indices]
+            for other in (angle_index - 1, angle_index + 1):
+                if wraps or 0 <= other < len(stack):
+                    highest &= totals >= flat[other % len(stack)][high_indices]
+            high_indices, totals = high_indices[highest], totals[highest]
+            rows, columns = np.divmod(high_indices, self._row_length)
+            is_in_picture = columns < self._width
             peaks_found += zip(
-                [turn] * int(np.count_nonzero(inner)),
-                rows[inner].tolist(),
-                columns[inner].tolist(),
-                totals[inner].tolist(),
+                [angle_index] * int(np.count_nonzero(is_in_picture)),
+                rows[is_in_picture].tolist(),
+                columns[is_in_picture].tolist(),
+                totals[is_in_picture].tolist(),
                 strict=True,
             )
         return sorted(peaks_found, key=lambda peak: -peak[3])[: 4 * MAX_CANDIDATES]
 
 
-def _thinned(points: Array, normals: Array, most: int) -> tuple[Array, Array]:
-    """Return at most a number of the points, evenly spread."""
+def _thin_out(points: Array, normals: Array, most: int) -> tuple[Array, Array]:
+    """Return ``most`` of the points, evenly spread, or all if they are fewer."""
     if len(points) <= most:
         return points, normals
     chosen = np.linspace(0, len(points) - 1, most).round().astype(int)
     return points[chosen], normals[chosen]
 
 
-def _followed(
+def _refine_places(
     pyramid: PicturePyramid,
     model: CoarseModel,
     ranges: Ranges,
@@ -349,26 +356,26 @@ def _followed(
     places: list[RoughPlace],
 ) -> list[RoughPlace]:
     """Return the best pose at a level near each place that was found at the next smaller level."""
-    nx, ny = pyramid.units(level, ranges.contrast)
-    points, normals = _thinned(model.points[level], model.normals[level], MAX_POINTS)
+    nx, ny = pyramid.unit_gradient(level, ranges.contrast)
+    points, normals = _thin_out(model.points[level], model.normals[level], MAX_POINTS)
     points = points / 2**level
     radius = model.radius(level)
     step = LOWER_STEP_PX / radius
     turns = np.array([-1.0, 0.0, 1.0]) * step
     sizes = np.array([1 - step, 1.0, 1 + step]) if ranges.scales[1] > ranges.scales[0] else [1.0]
-    ways = np.array([(turn, size) for turn in turns for size in sizes])
+    trials = np.array([(turn, size) for turn in turns for size in sizes])
     start = np.array([(place.x, place.y, place.angle, place.scale) for place in places])
-    angles = (start[:, 2, None] + ways[:, 0]).ravel()
-    scales = (start[:, 3, None] * ways[:, 1]).ravel()
-    at = np.rint(start[:, :2] / 2**level).astype(int).repeat(len(ways), axis=0)
-    scores = _scores((nx, ny), points, normals, (angles, scales), at, ranges.any_polarity)
+    angles = (start[:, 2, None] + trials[:, 0]).ravel()
+    scales = (start[:, 3, None] * trials[:, 1]).ravel()
+    pixels = np.rint(start[:, :2] / 2**level).astype(int).repeat(len(trials), axis=0)
+    scores = _score_places((nx, ny), points, normals, (angles, scales), pixels, ranges.any_polarity)
     best = scores.reshape(len(places), -1).argmax(axis=1)
-    followed = []
-    for number, which in enumerate(best.tolist()):
-        trial, offset = divmod(which, scores.shape[1])
-        row = number * len(ways) + trial
-        x, y = at[row] + OFFSETS[offset]
-        followed.append(
+    refined = []
+    for index, best_trial in enumerate(best.tolist()):
+        trial, offset = divmod(best_trial, scores.shape[1])
+        row = index * len(trials) + trial
+        x, y = pixels[row] + OFFSETS[offset]
+        refined.append(
             RoughPlace(
                 float(x) * 2**level,
                 float(y) * 2**level,
@@ -377,19 +384,19 @@ def _followed(
                 float(scores[row, offset]),
             )
         )
-    return followed
+    return refined
 
 
 OFFSETS: Final = np.array([(x, y) for y in range(-2, 3) for x in range(-2, 3)])
 """Offsets, pixels, of the search around a place that was found at the next smaller level."""
 
 
-def _scores(
+def _score_places(
     units: tuple[NDArray[Any], NDArray[Any]],
     points: Array,
     normals: Array,
     poses: tuple[Array, Array],
-    at: NDArray[Any],
+    pixels: NDArray[Any],
     any_polarity: bool,
 ) -> Array:
     """Return the mean agreement of the directions (M, 25) at poses (M,) around places (M, 2)."""
@@ -397,45 +404,46 @@ def _scores(
     cos, sin = np.cos(poses[0])[:, None], np.sin(poses[0])[:, None]
     x, y = points.T
     u, v = normals.T
-    columns = np.rint(poses[1][:, None] * (cos * x - sin * y)).astype(np.int32) + at[:, :1]
-    rows = np.rint(poses[1][:, None] * (sin * x + cos * y)).astype(np.int32) + at[:, 1:]
-    ahead = (cos * u - sin * v).astype(np.float32)
+    columns = np.rint(poses[1][:, None] * (cos * x - sin * y)).astype(np.int32) + pixels[:, :1]
+    rows = np.rint(poses[1][:, None] * (sin * x + cos * y)).astype(np.int32) + pixels[:, 1:]
+    right = (cos * u - sin * v).astype(np.float32)
     down = (sin * u + cos * v).astype(np.float32)
-    scores = np.empty((len(at), len(OFFSETS)), np.float32)
-    flat = [np.pad(unit, ((0, 1), (0, 0))).ravel() for unit in units]  # nothing behind the last row
-    nothing = height * width
-    for number, (dx, dy) in enumerate(OFFSETS.tolist()):
+    scores = np.empty((len(pixels), len(OFFSETS)), np.float32)
+    # a row of zeros follows the last row
+    flat = [np.pad(unit, ((0, 1), (0, 0))).ravel() for unit in units]
+    zero_index = height * width
+    for trial, (dx, dy) in enumerate(OFFSETS.tolist()):
         column, row = columns + dx, rows + dy
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        index = np.where(inside, row * width + column, nothing)
-        agreed = flat[0].take(index) * ahead + flat[1].take(index) * down
-        agreed = np.abs(agreed) if any_polarity else np.maximum(agreed, 0)
-        scores[:, number] = agreed.mean(axis=1)
+        index = np.where(inside, row * width + column, zero_index)
+        agreement = flat[0].take(index) * right + flat[1].take(index) * down
+        agreement = np.abs(agreement) if any_polarity else np.maximum(agreement, 0)
+        scores[:, trial] = agreement.mean(axis=1)
     return scores.astype(np.float64)
 
 
-def _best(
+def _keep_best(
     places: list[RoughPlace],
-    least: float,
-    pixel: float,
+    min_score: float,
+    pixel_size: float,
     most: int,
     refused: RoughPlace | None,
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the best places without duplicates, and the best place with too low a score."""
     best: list[RoughPlace] = []
     for place in sorted(places, key=lambda place: -place.score):
-        if place.score < least:
+        if place.score < min_score:
             if refused is None or place.score > refused.score:
                 refused = place
             break
         if len(best) == most:
             break
-        if not any(_alike(place, other, pixel) for other in best):
+        if not any(_is_same_place(place, other, pixel_size) for other in best):
             best.append(place)
     return best, refused
 
 
-def _alike(one: RoughPlace, other: RoughPlace, pixel: float) -> bool:
-    is_near = math.hypot(one.x - other.x, one.y - other.y) <= 2 * pixel
-    turned = abs(math.remainder(one.angle - other.angle, 2 * math.pi))
-    return is_near and turned < 0.12 and abs(math.log(one.scale / other.scale)) < 0.1
+def _is_same_place(one: RoughPlace, other: RoughPlace, pixel_size: float) -> bool:
+    is_near = math.hypot(one.x - other.x, one.y - other.y) <= 2 * pixel_size
+    angle_difference = abs(math.remainder(one.angle - other.angle, 2 * math.pi))
+    return is_near and angle_difference < 0.12 and abs(math.log(one.scale / other.scale)) < 0.1

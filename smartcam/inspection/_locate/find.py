@@ -37,8 +37,8 @@ MAX_FITS: Final = 12
 """Largest number of places that are fitted, in addition to four for each wanted part."""
 
 SCORE_MARGIN: Final = 0.1
-"""Score by which a fit may raise the coarse score: once enough parts are found, a place is not
-fitted if its coarse score is lower than theirs by more."""
+"""Score by which a fit may raise the coarse score. Once enough parts are found, a place whose
+coarse score is lower than theirs by more than this is not fitted."""
 
 EQUAL_SCORE_DIFFERENCE: Final = 0.02
 """Largest difference of two scores that count as equal."""
@@ -86,7 +86,7 @@ class LocatedPart:
         pose: place of the model's reference in the picture, and rotation and scale relative to the
             taught part.
         covariance: (4, 4), of x and y (pixels), the angle (radians) and the scale.
-        score: share of its edges that is visible, 0 to 1.
+        score: share of the part's edges that is visible, 0 to 1.
         edges: places of the edges that determine the pose, (N, 2), pixels.
         missing: places of edges that are not visible, (M, 2), pixels.
         noise: standard deviation of the picture's noise, grey levels.
@@ -126,11 +126,11 @@ class Located:
 
     Attributes:
         parts: found parts, the best first.
-        nearest: best refused part; None: there was no candidate.
+        best_refused: best refused part; None: there was no candidate.
     """
 
     parts: tuple[LocatedPart, ...]
-    nearest: LocatedPart | None
+    best_refused: LocatedPart | None
 
 
 def locate(
@@ -146,23 +146,23 @@ def locate(
     ``box`` (left, top, right, below): area of their references; ``allowed``: function that returns
     whether a reference may be at a place in the area.
     """
-    end = time.monotonic() + search.seconds
+    deadline = time.monotonic() + search.seconds
     searched: dict[tuple[int, int, int, int], _SearchedPicture] = {}
     parts: list[LocatedPart] = []
     refused: list[LocatedPart] = []
     for model in models:
-        area = _area(picture, box, model.radius * search.scales[1])
+        area = _search_area(picture, box, model.radius * search.scales[1])
         if area not in searched:
             searched[area] = _SearchedPicture(picture, area)
-        parts_found, bad = searched[area].find(model, search, end, allowed)
+        parts_found, refused_parts = searched[area].find(model, search, deadline, allowed)
         parts += parts_found
-        refused += bad
-    best = _apart(parts, search.overlap)
+        refused += refused_parts
+    best = _drop_overlapping(parts, search.overlap)
     refused.sort(key=lambda part: -part.score)
     return Located(tuple(best), refused[0] if refused else None)
 
 
-def _area(
+def _search_area(
     picture: Picture, box: tuple[int, int, int, int] | None, radius: float
 ) -> tuple[int, int, int, int]:
     """Return the area of the picture that parts with references in a box may cover."""
@@ -186,7 +186,7 @@ class _SearchedPicture:
         left, top, right, below = area
         self._corner = left, top
         self._levels = picture.levels
-        self._unit = float(2**picture.depth - 1) / 255
+        self._level_scale = float(2**picture.depth - 1) / 255
         grey = np.ascontiguousarray(picture.grey[top:below, left:right])
         self._noise = noise_of(grey)
         self._pyramid = PicturePyramid(grey, self._noise)
@@ -195,61 +195,71 @@ class _SearchedPicture:
         self,
         model: PartModel,
         search: PartSearch,
-        end: float,
+        deadline: float,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> tuple[list[LocatedPart], list[LocatedPart]]:
         """Return the found parts of one model, and the refused ones."""
-        ranges = ranges_of(model, search)
-        candidates, refused = find_candidates(self._pyramid, model.coarse, ranges, search.most)
-        bad = [] if refused is None else [_unfitted(model, self._moved(refused), search, "")]
+        ranges = search_ranges(model, search)
+        candidates, refused_place = find_candidates(
+            self._pyramid, model.coarse, ranges, search.most
+        )
+        refused_parts = (
+            []
+            if refused_place is None
+            else [_make_refused_part(model, self._in_picture(refused_place), search, "")]
+        )
         parts: list[LocatedPart] = []
-        for number, candidate in enumerate(candidates[: MAX_FITS + 4 * search.most]):
-            place = self._moved(candidate)
-            if time.monotonic() > end and number:
-                bad.append(_unfitted(model, place, search, "there was no time left to look at it"))
+        for index, candidate in enumerate(candidates[: MAX_FITS + 4 * search.most]):
+            place = self._in_picture(candidate)
+            if time.monotonic() > deadline and index:
+                refused_parts.append(
+                    _make_refused_part(model, place, search, "there was no time left to look at it")
+                )
                 break
-            if _is_enough(parts, place, search) or any(_is_near(place, other) for other in parts):
+            if _cannot_improve(parts, place, search) or any(
+                _is_near(place, other) for other in parts
+            ):
                 continue
-            part = self._fitted(model, place, search, allowed)
+            part = self._judge_candidate(model, place, search, allowed)
             if part.refusal:
-                bad.append(part)
+                refused_parts.append(part)
             else:
                 parts.append(part)
-        best = _apart(parts, search.overlap)[: search.most]
-        return [self._without_doubt(model, part, search) for part in best], bad
+        best = _drop_overlapping(parts, search.overlap)[: search.most]
+        return [self._add_doubt(model, part, search) for part in best], refused_parts
 
-    def _moved(self, place: RoughPlace) -> RoughPlace:
-        """Return a candidate in the whole picture's pixels."""
+    def _in_picture(self, place: RoughPlace) -> RoughPlace:
+        """Convert a candidate's place to pixels of the whole picture."""
         return place._replace(x=place.x + self._corner[0], y=place.y + self._corner[1])
 
     def _fit(self, model: PartModel, start: PixelPose, search: PartSearch) -> FinePose | None:
-        use = FineSettings(
-            contrasts_of(model, search) * self._unit,
-            self._noise * self._unit,
+        settings = FineSettings(
+            least_contrasts(model, search) * self._level_scale,
+            self._noise * self._level_scale,
             search.any_polarity,
             search.scales[1] > search.scales[0],
             search.least_score,
             model.symmetry.fold != 0,
         )
-        return fit_pose(self._levels, model.segments, model.bands_at(start.scale), start, use)
+        return fit_pose(self._levels, model.segments, model.bands_at(start.scale), start, settings)
 
-    def _fitted(
+    def _judge_candidate(
         self,
         model: PartModel,
         place: RoughPlace,
         search: PartSearch,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> LocatedPart:
-        """Return the part at a place, with a refusal if it does not count as found."""
+        """Fit the part at a place; the part has a refusal if it does not count as found."""
         start = PixelPose(place.x, place.y, place.angle, place.scale)
         fine = self._fit(model, start, search)
         if fine is None:
-            return _unfitted(model, place, search, "too few of its edges agree on a pose")
-        part = _part(model, fine)
+            return _make_refused_part(model, place, search, "too few of its edges agree on a pose")
+        part = _make_located_part(model, fine)
         pose = part.pose
         refusal = ""
         if part.score < search.least_score:
-            refusal = _too_little(part.score, fine, search)
+            refusal = _low_score_text(part.score, fine, search)
         elif not _is_in_angles(pose, model, search):
             low, high = np.degrees(search.angles).tolist()
             refusal = (
@@ -264,15 +274,13 @@ class _SearchedPicture:
             refusal = "its reference is outside of the region"
         return dataclasses.replace(part, refusal=refusal)
 
-    def _without_doubt(
-        self, model: PartModel, part: LocatedPart, search: PartSearch
-    ) -> LocatedPart:
-        """Return a part, with a doubt if another rotation fits as well."""
+    def _add_doubt(self, model: PartModel, part: LocatedPart, search: PartSearch) -> LocatedPart:
+        """Return a part, to which a doubt is added if another rotation fits as well."""
         for angle, share in model.symmetry.alike:
             if part.score >= share + EQUAL_SCORE_DIFFERENCE:
                 continue
-            turned = _turned(part.pose, model.symmetry.about, angle)
-            other = self._fit(model, turned, search)
+            start = _rotate_pose(part.pose, model.symmetry.about, angle)
+            other = self._fit(model, start, search)
             if other is not None and other.score >= part.score - EQUAL_SCORE_DIFFERENCE:
                 doubt = (
                     f"as much of it is seen if it is turned by {math.degrees(angle):.0f} degrees"
@@ -281,9 +289,9 @@ class _SearchedPicture:
         return part
 
 
-def ranges_of(model: PartModel, search: PartSearch) -> Ranges:
+def search_ranges(model: PartModel, search: PartSearch) -> Ranges:
     """Return the ranges of the coarse search for a model."""
-    contrast = float(np.median(contrasts_of(model, search)))
+    contrast = float(np.median(least_contrasts(model, search)))
     return Ranges(
         angles=(0.0, 0.0) if model.symmetry.fold == 0 else search.angles,
         scales=search.scales,
@@ -294,7 +302,7 @@ def ranges_of(model: PartModel, search: PartSearch) -> Ranges:
     )
 
 
-def contrasts_of(model: PartModel, search: PartSearch) -> Array:
+def least_contrasts(model: PartModel, search: PartSearch) -> Array:
     """Return the least contrast of each edge of a part, (N,), grey levels of 255."""
     heights = model.segments.heights
     if search.contrast is not None:
@@ -302,7 +310,7 @@ def contrasts_of(model: PartModel, search: PartSearch) -> Array:
     return np.maximum(MIN_CONTRAST, CONTRAST_SHARE * heights)
 
 
-def _part(model: PartModel, fine: FinePose) -> LocatedPart:
+def _make_located_part(model: PartModel, fine: FinePose) -> LocatedPart:
     pose = fine.pose
     if model.symmetry.fold == 0:
         pose = pose._replace(angle=0.0)
@@ -314,8 +322,8 @@ def _part(model: PartModel, fine: FinePose) -> LocatedPart:
         pose=pose,
         covariance=fine.covariance,
         score=fine.score,
-        edges=middles[fine.kept],
-        missing=middles[~fine.seen],
+        edges=middles[fine.inliers],
+        missing=middles[~fine.visible],
         noise=fine.noise,
         blur=fine.blur,
         chi_square=fine.chi_square,
@@ -324,22 +332,24 @@ def _part(model: PartModel, fine: FinePose) -> LocatedPart:
     )
 
 
-def _turned(pose: PixelPose, about: tuple[float, float], angle: float) -> PixelPose:
+def _rotate_pose(pose: PixelPose, centre: tuple[float, float], angle: float) -> PixelPose:
     """Return the pose of a part after a rotation about one of its points."""
     cos, sin = math.cos(angle), math.sin(angle)
-    x, y = about
+    x, y = centre
     place = pose.to_picture((x - cos * x + sin * y, y - sin * x - cos * y))
     return PixelPose(float(place[0]), float(place[1]), pose.angle + angle, pose.scale)
 
 
-def _too_little(score: float, fine: FinePose, search: PartSearch) -> str:
+def _low_score_text(score: float, fine: FinePose, search: PartSearch) -> str:
     text = f"{100 * score:.0f} % of its edges are seen, expected {100 * search.least_score:.0f} %"
-    if fine.reversed > 0.1:
-        text += f"; {100 * fine.reversed:.0f} % are there with dark and bright exchanged"
+    if fine.reversed_share > 0.1:
+        text += f"; {100 * fine.reversed_share:.0f} % are there with dark and bright exchanged"
     return text
 
 
-def _unfitted(model: PartModel, place: RoughPlace, search: PartSearch, why: str) -> LocatedPart:
+def _make_refused_part(
+    model: PartModel, place: RoughPlace, search: PartSearch, reason: str
+) -> LocatedPart:
     pose = PixelPose(
         place.x, place.y, math.remainder(place.angle, model.symmetry.period), place.scale
     )
@@ -348,7 +358,7 @@ def _unfitted(model: PartModel, place: RoughPlace, search: PartSearch, why: str)
         pose=pose,
         covariance=np.full((4, 4), np.nan),
         score=place.score,
-        refusal=why
+        refusal=reason
         or f"about {100 * place.score:.0f} % of its edges agree, expected "
         f"{100 * search.least_score:.0f} %",
         hull=pose.to_picture(model.hull),
@@ -356,7 +366,7 @@ def _unfitted(model: PartModel, place: RoughPlace, search: PartSearch, why: str)
 
 
 def _is_in_angles(pose: PixelPose, model: PartModel, search: PartSearch) -> bool:
-    """Return True if a pose's angle is in the wanted range."""
+    """Return True if a pose's angle is in the searched range, with a margin."""
     low, high = search.angles
     if not model.symmetry.fold or high - low >= model.symmetry.period - 1e-9:
         return True
@@ -365,37 +375,37 @@ def _is_in_angles(pose: PixelPose, model: PartModel, search: PartSearch) -> bool
 
 
 def _is_in_scales(pose: PixelPose, search: PartSearch) -> bool:
-    """Return True if a pose's scale is in the wanted range."""
+    """Return True if a pose's scale is in the searched range, with a margin."""
     least, most = search.scales
     margin = SIZE_MARGIN if least == most else RANGE_MARGIN
     return least * (1 - margin) <= pose.scale <= most * (1 + margin)
 
 
-def _is_enough(parts: Sequence[LocatedPart], place: RoughPlace, search: PartSearch) -> bool:
-    """Return True if a place cannot be better than the parts found so far."""
+def _cannot_improve(parts: Sequence[LocatedPart], place: RoughPlace, search: PartSearch) -> bool:
+    """Return True if enough parts were found, and a place cannot be better than they are."""
     best = sorted(part.score for part in parts)[-search.most :]
     return len(best) == search.most and place.score < best[0] - SCORE_MARGIN
 
 
 def _is_near(place: RoughPlace, other: LocatedPart) -> bool:
     """Return True if a candidate is the place of a part that was already found."""
-    turned = abs(math.remainder(place.angle - other.pose.angle, 2 * math.pi))
-    return math.hypot(place.x - other.pose.x, place.y - other.pose.y) < 4 and turned < 0.1
+    angle = abs(math.remainder(place.angle - other.pose.angle, 2 * math.pi))
+    return math.hypot(place.x - other.pose.x, place.y - other.pose.y) < 4 and angle < 0.1
 
 
-def _apart(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
-    """Return the best parts whose overlaps are at most as large as allowed."""
+def _drop_overlapping(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
+    """Drop each part that overlaps a better one by more than is allowed."""
     best: list[LocatedPart] = []
     for part in sorted(parts, key=lambda part: (-part.score, part.chi_square)):
-        if all(_covered(part.hull, other.hull) <= overlap for other in best):
+        if all(_overlap_share(part.hull, other.hull) <= overlap for other in best):
             best.append(part)
     return best
 
 
-def _covered(one: NDArray[Any], other: NDArray[Any]) -> float:
+def _overlap_share(one: NDArray[Any], other: NDArray[Any]) -> float:
     """Return the common area of two convex hulls, as a share of the smaller one."""
     cv2 = load("cv2", "inspection needs")
     hulls = [np.asarray(hull - one[0], np.float32) for hull in (one, other)]
     common, _ = cv2.intersectConvexConvex(*hulls)
-    least = min(float(cv2.contourArea(hull)) for hull in hulls)
-    return float(common) / max(least, 1e-6)
+    smaller_area = min(float(cv2.contourArea(hull)) for hull in hulls)
+    return float(common) / max(smaller_area, 1e-6)

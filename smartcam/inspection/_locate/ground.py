@@ -1,8 +1,8 @@
-"""Fit steps whose sides are not of one level, such as edges of a part on a textured ground.
+"""Fit steps whose sides have no constant level, such as edges of a part on a textured background.
 
-What the light beside an edge does *along* the edge moves no step, so it can be measured alone.
-A texture does the same across the edge, where it does move the step: each side then has a slope
-that is unknown, but no larger than those along the edges around it.
+Changes of the level *along* an edge do not move the step, so they can be measured by themselves. A
+texture changes the level across the edge by as much, and there it does move the step. So each side
+gets an unknown slope, which is not larger than the slopes along neighbouring edges.
 """
 
 from __future__ import annotations
@@ -28,87 +28,90 @@ if TYPE_CHECKING:
     from smartcam.inspection._locate.segments import BandPixels, Segments
 
 GROUND_SQUARE: Final = 4.0
-"""Square of the slope along an edge, in parts of its variance by noise, that a quarter of the edges
-have at least where the ground is not of one level; by noise alone it is 1.3."""
+"""Squared slope along an edge, as a multiple of its variance by noise: a quarter of the edges has
+at least this much if the background has no constant level. By noise alone it is 1.3."""
 
 MIN_BANDS: Final = 12
-"""Least number of bands from which the light on the ground is computed."""
+"""Least number of bands from which the background's slopes are computed."""
 
 GROUND_DISTANCE_PX: Final = 10.0
-"""Standard deviation of the distance of the bands from which the ground beside a band is measured,
-in pixels of the taught picture."""
+"""Standard deviation of the Gaussian that weights other bands by their distance, pixels of the
+taught picture, where the background's slopes near a band are measured."""
 
 COMMON_PX, COMMON_DIRECTION = 24.0, 0.5
 """Distance in pixels, and cosine of the angle between the normals, of edges that may have errors in
 common."""
 
-CHANCES: Final = 3.0
-"""Standard deviations by which neighbours agree in their errors that have one in common."""
+COMMON_ERROR_SIGMAS: Final = 3.0
+"""Agreement of neighbours' errors, in standard deviations, above which they have a common error."""
 
-LEAST_PART: Final = 1e-4
+MIN_SLOPE_SHARE: Final = 1e-4
 """Least standard deviation of a slope, as a share of the noise."""
 
 
 class Ground(NamedTuple):
-    """Light beside N edges that is not of one level: (N,), grey levels for a band's half width."""
+    """Slopes of the grey level beside N edges, (N,), grey levels per half width of a band."""
 
     dark: Array  # standard deviation of the slope on the darker side
     bright: Array
 
 
-def ground_beside(
-    places: tuple[Array, Array],
+def measure_ground(
+    coordinates: tuple[Array, Array],
     blurs: Array,
     pixels: BandPixels,
     segments: Segments,
     used: NDArray[np.bool_],
 ) -> Ground | None:
-    """Return the slopes of the light along edges; None: each side has one level.
+    """Return the slopes of the grey level beside edges; None: each side has a constant level.
 
-    ``places``: across and along, (P,) each; ``used`` (N,): the bands that have an edge.
+    ``coordinates``: of the pixels across and along their edges, (P,) each. ``used`` (N,): mask of
+    the bands that have an edge.
     """
-    rise, slope = _step(places[0], blurs)
-    along, ones = places[1] / BAND_PX, np.ones_like(rise)
+    rise, slope = _step_model(coordinates[0], blurs)
+    along, ones = coordinates[1] / BAND_PX, np.ones_like(rise)
     columns = np.stack([ones, rise, slope, (1 - rise) * along, rise * along])
-    values, inverse, variances, _ = _solved(columns, pixels, np.zeros((len(used), 5)))
-    measured = used & (variances > 0)
-    if np.count_nonzero(measured) < MIN_BANDS:
+    values, inverse, variances, _ = _solve_bands(columns, pixels, np.zeros((len(used), 5)))
+    is_measured = used & (variances > 0)
+    if np.count_nonzero(is_measured) < MIN_BANDS:
         return None
-    by_noise = float(np.median(variances[measured])) * np.diagonal(inverse, axis1=1, axis2=2)
+    noise_variances = float(np.median(variances[is_measured])) * np.diagonal(
+        inverse, axis1=1, axis2=2
+    )
     grounds = []
     for side, shift in ((3, -0.5), (4, 0.5)):
-        squares, noise = values[measured, side] ** 2, by_noise[measured, side]
+        squares, noise = values[is_measured, side] ** 2, noise_variances[is_measured, side]
         if float(np.percentile(squares / noise, 75)) < GROUND_SQUARE:
             grounds.append(np.zeros(len(used)))
             continue
-        at = segments.middles + shift * BAND_PX * segments.normals
-        distances = np.linalg.norm(at[:, None] - at[measured], axis=2)
+        side_points = segments.middles + shift * BAND_PX * segments.normals
+        distances = np.linalg.norm(side_points[:, None] - side_points[is_measured], axis=2)
         closeness = np.exp(-0.5 * (distances / GROUND_DISTANCE_PX) ** 2) / noise
-        beyond = (closeness @ (squares - noise)) / np.maximum(closeness.sum(axis=1), 1e-9)
-        grounds.append(np.sqrt(np.maximum(beyond, 0.0)))
+        slope_variances = (closeness @ (squares - noise)) / np.maximum(closeness.sum(axis=1), 1e-9)
+        grounds.append(np.sqrt(np.maximum(slope_variances, 0.0)))
     return Ground(*grounds) if any(ground.any() for ground in grounds) else None
 
 
 def fit_on_ground(
-    places: tuple[Array, Array], blurs: Array, pixels: BandPixels, ground: Ground, noise: float
+    coordinates: tuple[Array, Array], blurs: Array, pixels: BandPixels, ground: Ground, noise: float
 ) -> StepFit:
-    """Return the steps of all bands beside a ground, for a picture of some noise."""
-    rise, slope = _step(places[0], blurs)
-    columns, known = [np.ones_like(rise), rise, slope], [np.zeros_like(ground.dark)] * 3
-    for side, steep in ((1 - rise, ground.dark), (rise, ground.bright)):
-        if steep.any():
-            columns += [side * place / BAND_PX for place in places]
-            known += [1 / np.maximum(steep / noise, LEAST_PART) ** 2] * 2
-    values, inverse, variances, freedoms = _solved(
-        np.stack(columns), pixels, np.column_stack(known)
+    """Return the steps of all bands if their sides have slopes; ``noise``: grey levels."""
+    rise, slope = _step_model(coordinates[0], blurs)
+    columns, priors = [np.ones_like(rise), rise, slope], [np.zeros_like(ground.dark)] * 3
+    for side, slope_sigmas in ((1 - rise, ground.dark), (rise, ground.bright)):
+        if slope_sigmas.any():
+            columns += [side * coordinate / BAND_PX for coordinate in coordinates]
+            priors += [1 / np.maximum(slope_sigmas / noise, MIN_SLOPE_SHARE) ** 2] * 2
+    values, inverse, variances, freedoms = _solve_bands(
+        np.stack(columns), pixels, np.column_stack(priors)
     )
-    good = variances > 0
-    heights = np.where(good, values[:, 1], 0.0)
-    tall = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
-    infinite = np.where(good, 0.0, np.inf)
+    is_usable = variances > 0
+    heights = np.where(is_usable, values[:, 1], 0.0)
+    safe_heights = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
+    infinite = np.where(is_usable, 0.0, np.inf)
     return StepFit(
-        np.where(good, -values[:, 2] / tall, 0.0),
-        np.sqrt(np.maximum(inverse[:, 2, 2], 0.0)) / np.abs(tall) + infinite,
+        np.where(is_usable, -values[:, 2] / safe_heights, 0.0),
+        np.sqrt(np.maximum(inverse[:, 2, 2], 0.0)) / np.abs(safe_heights) + infinite,
         heights,
         np.sqrt(np.maximum(inverse[:, 1, 1], 0.0)) + infinite,
         np.maximum(variances, ROUNDING**2),
@@ -117,48 +120,52 @@ def fit_on_ground(
     )
 
 
-def common_error(
-    segments: Segments, shifts: Array, used: NDArray[np.bool_], *, sure: bool
+def common_error_factor(
+    segments: Segments, shifts: Array, used: NDArray[np.bool_], *, is_expected: bool
 ) -> float:
     """Return the factor of a pose's variance for errors that neighbours have in common.
 
-    ``shifts`` (N,): in parts of their standard deviations. ``sure``: there are such errors; else
-    there are where they are more than chance.
+    ``shifts`` (N,): as multiples of their standard deviations. ``is_expected``: whether common
+    errors are expected; else they count only if they exceed chance.
     """
     middles, normals, z = segments.middles[used], segments.normals[used], shifts[used]
     is_near = np.linalg.norm(middles[:, None] - middles, axis=2) <= COMMON_PX
     is_near &= normals @ normals.T >= COMMON_DIRECTION
     np.fill_diagonal(is_near, val=False)
     common = float(z @ is_near @ z) / max(float(z @ z), 1e-9)
-    chance = math.sqrt(2 * int(is_near.sum())) / max(len(z), 1)
-    return 1 + max(common, 0.0) if sure or common > CHANCES * chance else 1.0
+    chance_sigma = math.sqrt(2 * int(is_near.sum())) / max(len(z), 1)
+    return (
+        1 + max(common, 0.0) if is_expected or common > COMMON_ERROR_SIGMAS * chance_sigma else 1.0
+    )
 
 
-def _step(across: Array, blurs: Array) -> tuple[Array, Array]:
-    part = across / blurs
-    slope = np.exp(-0.5 * part * part) / (blurs * math.sqrt(2 * math.pi))
-    return load("scipy.special").ndtr(part), slope
+def _step_model(across: Array, blurs: Array) -> tuple[Array, Array]:
+    scaled = across / blurs
+    slope = np.exp(-0.5 * scaled * scaled) / (blurs * math.sqrt(2 * math.pi))
+    return load("scipy.special").ndtr(scaled), slope
 
 
-def _solved(columns: Array, pixels: BandPixels, known: Array) -> tuple[Array, Array, Array, Array]:
+def _solve_bands(
+    columns: Array, pixels: BandPixels, priors: Array
+) -> tuple[Array, Array, Array, Array]:
     """Return the values (N, K) of bands, and their covariance for noise of one grey level.
 
-    Besides, the pixels' variance about them, 0 where a band has too few, and degrees of freedom.
-    ``known`` (N, K): the variance of the noise relative to the variance of each value; 0: it is
-    unknown.
+    Also return the variance of each band's pixels about the fit, 0 if a band has too few pixels,
+    and the degrees of freedom. ``priors`` (N, K): ratio of the noise's variance to the expected
+    variance of each value; 0: that variance is not known.
     """
-    owners, (count, size) = pixels.owners, known.shape
-    number = np.bincount(owners, minlength=count).astype(np.float64)
-    means = np.bincount(owners, pixels.levels, count) / np.maximum(number, 1.0)
+    owners, (count, size) = pixels.owners, priors.shape
+    pixel_counts = np.bincount(owners, minlength=count).astype(np.float64)
+    means = np.bincount(owners, pixels.levels, count) / np.maximum(pixel_counts, 1.0)
     levels = pixels.levels - means[owners]
     square, right = normal_equations(columns, levels, owners, count)
-    regular = square + (known[:, :, None] + 1e-7) * np.eye(size)
+    regular = square + (priors[:, :, None] + 1e-7) * np.eye(size)
     inverse = np.asarray(np.linalg.inv(regular), np.float64)
     values = (inverse @ right[:, :, None])[:, :, 0]
     fitted = (columns * values[owners].T).sum(axis=0)
-    left = np.bincount(owners, (levels - fitted) ** 2, count)
-    taken: Array = size - (np.diagonal(inverse, axis1=1, axis2=2) * known).sum(axis=1)
-    freedoms = number - taken
-    good = (number >= MIN_BAND_PIXELS) & (freedoms >= 2)
-    variances: Array = np.where(good, left / np.maximum(freedoms, 1.0), 0.0)
+    residual_squares = np.bincount(owners, (levels - fitted) ** 2, count)
+    fitted_count: Array = size - (np.diagonal(inverse, axis1=1, axis2=2) * priors).sum(axis=1)
+    freedoms = pixel_counts - fitted_count
+    is_usable = (pixel_counts >= MIN_BAND_PIXELS) & (freedoms >= 2)
+    variances: Array = np.where(is_usable, residual_squares / np.maximum(freedoms, 1.0), 0.0)
     return values, inverse, variances, np.maximum(freedoms, 1.0)

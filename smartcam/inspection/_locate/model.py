@@ -1,4 +1,4 @@
-"""Models of taught parts: made of a picture and a region or of an outline, kept in small files."""
+"""Models of taught parts: made from a region of a picture, or from an outline; kept in files."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from smartcam._whole_files import replace_file
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection._locate.coarse import MAX_LEVELS, MIN_RADIUS_PX, CoarseModel
 from smartcam.inspection._locate.edges import (
-    blurred_moves,
-    edge_points,
+    divide_into_segments,
+    find_edge_points,
     fit_segments,
-    segments_of,
+    measure_blur_shifts,
 )
 from smartcam.inspection._locate.fine import FineSettings, fit_pose
-from smartcam.inspection._locate.outlines import MM, drawn_outline, read_outline
+from smartcam.inspection._locate.outlines import MM_PER_UNIT, draw_outline, read_outline
 from smartcam.inspection._locate.segments import (
     BAND_PX,
     BLURS_PX2,
@@ -43,7 +43,7 @@ from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
 from smartcam.inspection._measure.edges import noise_of
 from smartcam.inspection._picture import Picture
-from smartcam.inspection._places import PixelPose, Region, place
+from smartcam.inspection._places import PixelPose, Region, place_region
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,7 +79,7 @@ MAX_BORDER_SHARE: Final = 0.1
 """Largest share of the edges that may lie at the region's border."""
 
 MIN_ACROSS: Final = 0.02
-"""Least share of the edges across the main direction: they determine the place along it."""
+"""Least share of the edges across the main direction, which determine the place along it."""
 
 LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
 """Cosine of the largest angle between a level's gradient and a visible segment's normal."""
@@ -123,10 +123,10 @@ class PartModel:
 
     Attributes:
         name: name of the part, the ``feature_id`` of its localizations.
-        segments: pieces of its edges that determine poses; places relative to the reference.
-        outline: places of all its edges, (M, 2), pixels relative to the reference.
+        segments: pieces of the part's edges that determine poses; places relative to the reference.
+        outline: places of all edges of the part, (M, 2), pixels relative to the reference.
         levels: indices of the segments that are visible at each level of the pyramid.
-        symmetry: rotations after which it looks like itself.
+        symmetry: rotations after which the part looks like itself.
         reference: place of the reference in the taught picture, pixels.
         border: share of the edges that was left out at the region's border.
         noise: standard deviation of the noise of the taught picture, grey levels of 255.
@@ -168,7 +168,7 @@ class PartModel:
         name = check_text(name, "name", "PartModel.teach", least=1)
         if contrast is not None:
             contrast = check_number(contrast, "contrast", 0, MAX_LEVEL, "PartModel.teach")
-        return _taught(Picture.of(picture), region, name, contrast)
+        return _teach(Picture.of(picture), region, name, contrast)
 
     @classmethod
     def from_outline(
@@ -207,12 +207,12 @@ class PartModel:
         name = check_text(name, "name", caller, least=1)
         bright = check_flag(bright, "bright", caller)
         if unit is not None:
-            check_choice(unit, "unit", tuple(MM), caller)
+            check_choice(unit, "unit", tuple(MM_PER_UNIT), caller)
         if isinstance(layers, str | bytes) or not isinstance(layers, Sequence):
             raise wrong_argument("layers", "a sequence of names", layers, caller)
         layers = [check_text(layer, "layers", caller, least=1) for layer in layers]
-        picture, (x, y) = drawn_outline(read_outline(path, scale, unit, layers), bright=bright)
-        model = _taught(Picture.of(picture), None, name, None)
+        picture, (x, y) = draw_outline(read_outline(path, scale, unit, layers), bright=bright)
+        model = _teach(Picture.of(picture), None, name, None)
         return replace(model, reference=(model.reference[0] + x, model.reference[1] + y))
 
     @classmethod
@@ -271,15 +271,15 @@ class PartModel:
         """
         if noise is not None:
             noise = check_number(noise, "noise", 0, MAX_LEVEL, "PartModel.predicted_sigma")
-        part = 1.0 if noise is None else math.hypot(1.0, noise / max(self.noise, 0.01))
-        sigmas = self.segments.sigmas * (math.sqrt(2) if noise is None else part)
+        noise_factor = 1.0 if noise is None else math.hypot(1.0, noise / max(self.noise, 0.01))
+        sigmas = self.segments.sigmas * (math.sqrt(2) if noise is None else noise_factor)
         arms, normals = self.segments.middles, self.segments.normals
-        turned = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
-        rows = np.column_stack([normals, turned]) / sigmas[:, None]
-        used = 2 if self.symmetry.fold == 0 else 3
-        covariance = np.linalg.inv(rows[:, :used].T @ rows[:, :used])
+        torques = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
+        rows = np.column_stack([normals, torques]) / sigmas[:, None]
+        parameter_count = 2 if self.symmetry.fold == 0 else 3
+        covariance = np.linalg.inv(rows[:, :parameter_count].T @ rows[:, :parameter_count])
         worst = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-        return worst, math.sqrt(float(covariance[2, 2])) if used == 3 else math.nan
+        return worst, math.sqrt(float(covariance[2, 2])) if parameter_count == 3 else math.nan
 
     @cached_property
     def coarse(self) -> CoarseModel:
@@ -290,7 +290,7 @@ class PartModel:
         )
 
     def bands_at(self, scale: float) -> Bands:
-        """Return the bands of the segments, wider for a smaller part, so that pixels suffice."""
+        """Return the bands of the segments; wider for a smaller part: pixels must suffice."""
         step = min(max(round(-2 * math.log2(scale)), 0), MAX_BAND_STEP)
         if step not in self._bands:
             self._bands[step] = make_bands(self.segments, self.outline, BAND_PX * 2 ** (step / 2))
@@ -311,12 +311,12 @@ class PartModel:
 
     @cached_property
     def contours(self) -> tuple[Array, ...]:
-        """Polygons (K, 2) along the edges, the longest first, to be drawn; a pixel off at most."""
+        """Polygons (K, 2) to be drawn, within a pixel of the edges, the longest first."""
         cv2 = load("cv2", "inspection needs")
         low = np.floor(self.outline.min(axis=0)).astype(int) - 3
-        at = np.rint(self.outline - low).astype(int)
-        mask = np.zeros(at.max(axis=0)[::-1] + 4, np.uint8)
-        mask[at[:, 1], at[:, 0]] = 1
+        pixels = np.rint(self.outline - low).astype(int)
+        mask = np.zeros(pixels.max(axis=0)[::-1] + 4, np.uint8)
+        mask[pixels[:, 1], pixels[:, 0]] = 1
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         contours, (tree,) = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         outer = [
@@ -324,12 +324,12 @@ class PartModel:
         ]
         outer.sort(key=len, reverse=True)
         polygons = [
-            _simpler(outline) for outline in outer[:MAX_CONTOURS] if len(outline) >= MIN_CONTOUR_PX
+            _simplify(outline) for outline in outer[:MAX_CONTOURS] if len(outline) >= MIN_CONTOUR_PX
         ]
         return tuple(polygon.astype(np.float64) + low for polygon in polygons)
 
 
-def _simpler(contour: NDArray[Any]) -> NDArray[Any]:
+def _simplify(contour: NDArray[Any]) -> NDArray[Any]:
     """Return a polygon (K, 2) of few corners along a contour (N, 1, 2)."""
     cv2 = load("cv2", "inspection needs")
     tolerance = 0.7
@@ -342,13 +342,13 @@ def _simpler(contour: NDArray[Any]) -> NDArray[Any]:
 # ---------------------------------------------------------------------- teaching
 
 
-def _taught(
+def _teach(
     picture: Picture,
     region: Region | NDArray[np.bool_] | None,
     name: str,
     contrast: float | None,
 ) -> PartModel:
-    mask, corner = _mask(region, picture)
+    mask, corner = _region_mask(region, picture)
     rows, columns = (
         slice(at, at + size) for at, size in zip(corner[::-1], mask.shape, strict=True)
     )
@@ -356,8 +356,8 @@ def _taught(
     top = float(2**picture.depth - 1)
     noise = noise_of(levels) * 255 / top
     least = max(DEFAULT_CONTRAST, MIN_CONTRAST_NOISES * noise) if contrast is None else contrast
-    image_edges = edge_points(grey, least)
-    inside_mask, border = _inside(image_edges.points, mask)
+    image_edges = find_edge_points(grey, least)
+    inside_mask, border = _select_inside(image_edges.points, mask)
     image_edges = type(image_edges)(*(array[inside_mask] for array in image_edges))
     if border > MAX_BORDER_SHARE:
         raise TeachingError(
@@ -365,7 +365,7 @@ def _taught(
             f"{100 * border:.0f} % of the edges lie at the border of the region: expected a region "
             "that goes around the part, some pixels away from it",
         )
-    rough = segments_of(image_edges)
+    rough = divide_into_segments(image_edges)
     edges = fit_segments(levels, rough, image_edges.points, top) if len(rough.halves) else None
     exact = np.zeros(0, int) if edges is None else np.flatnonzero(edges.exact)
     if edges is None or len(exact) < MIN_SEGMENTS:
@@ -375,14 +375,14 @@ def _taught(
             f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
         )
     segments = edges.segments.selected(exact)
-    moves = blurred_moves(levels, segments, image_edges.points)
-    segments = segments._replace(moves=moves)
+    blur_shifts = measure_blur_shifts(levels, segments, image_edges.points)
+    segments = segments._replace(blur_shifts=blur_shifts)
     _check_directions(segments)
     centre = image_edges.points.mean(axis=0)
-    segments = _ordered(segments._replace(middles=segments.middles - centre))
+    segments = _order_segments(segments._replace(middles=segments.middles - centre))
     symmetry, shift = find_symmetry(segments, image_edges.points - centre, image_edges.normals)
     segments, centre = segments._replace(middles=segments.middles - shift), centre + shift
-    shift = _off_middle(
+    shift = _find_centre_shift(
         segments, image_edges.points - centre, symmetry.fold, (levels, centre, noise)
     )
     segments, centre = segments._replace(middles=segments.middles - shift), centre + shift
@@ -390,7 +390,7 @@ def _taught(
         name=name,
         segments=segments,
         outline=image_edges.points - centre,
-        levels=_levels(segments, grey, centre),
+        levels=_visible_by_level(segments, grey, centre),
         symmetry=symmetry,
         reference=(float(centre[0]) + corner[0], float(centre[1]) + corner[1]),
         border=border,
@@ -398,28 +398,30 @@ def _taught(
     )
 
 
-def _off_middle(
-    segments: Segments, outline: Array, fold: int, taught: tuple[NDArray[Any], Array, float]
+def _find_centre_shift(
+    segments: Segments, outline: Array, fold: int, own_picture: tuple[NDArray[Any], Array, float]
 ) -> Array:
     """Return the centre of a part's symmetry, (2,), relative to the reference.
 
-    ``taught``: the picture, the reference in it, and its noise. The part is located in its own
-    picture at each of the rotations; the mean of the found places is the centre.
+    ``own_picture``: the taught picture, the reference in it, and the picture's noise. The part is
+    located in this picture at each of the rotations; the mean of the found places is the centre.
     """
-    levels, (x, y), noise = taught
-    turns, bands = fold or ROUND_TURNS, make_bands(segments, outline)
-    use = FineSettings(np.full(len(segments.halves), MIN_SELF_CONTRAST), noise, turned=fold != 0)
+    levels, (x, y), noise = own_picture
+    turn_count, bands = fold or ROUND_TURNS, make_bands(segments, outline)
+    settings = FineSettings(
+        np.full(len(segments.halves), MIN_SELF_CONTRAST), noise, fits_angle=fold != 0
+    )
     offsets = []
-    for number in range(turns if fold != 1 else 0):
-        start = PixelPose(float(x), float(y), 2 * math.pi * number / turns)
-        fine = fit_pose(levels, segments, bands, start, use)
+    for turn_index in range(turn_count if fold != 1 else 0):
+        start = PixelPose(float(x), float(y), 2 * math.pi * turn_index / turn_count)
+        fine = fit_pose(levels, segments, bands, start, settings)
         if fine is None:
             return np.zeros(2)
         offsets.append((fine.pose.x - x, fine.pose.y - y))
     return np.mean(offsets, axis=0) if offsets else np.zeros(2)
 
 
-def _mask(
+def _region_mask(
     region: Region | NDArray[np.bool_] | None, picture: Picture
 ) -> tuple[NDArray[np.bool_], tuple[int, int]]:
     """Return the mask (H, W) of the taught pixels, and the mask's corner in the picture."""
@@ -432,7 +434,7 @@ def _mask(
     else:
         if region is not None:
             check_kind(region, Region, "region", "a Region, a mask or None", "PartModel.teach")
-        placed = place(region, None, picture.size)
+        placed = place_region(region, None, picture.size)
         if placed.is_empty:
             raise TeachingError(
                 TeachingTrouble.EMPTY,
@@ -449,20 +451,20 @@ def _mask(
     return mask, corner
 
 
-def _inside(points: Array, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
-    """Return a mask of the taught edges, and the share of edges at the region's border."""
+def _select_inside(points: Array, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
+    """Return the mask of edges inside the region, and the share of edges at the region's border."""
     cv2 = load("cv2", "inspection needs")
     padded = np.pad(mask, 1).astype(np.uint8)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     at = np.rint(points).astype(int)
     at = at.clip(0, np.array(mask.shape[::-1]) - 1)
-    inside = depth[at[:, 1], at[:, 0]]
-    inside_border = inside > BORDER_PX
-    touching = int(np.count_nonzero((inside > 0) & ~inside_border))
-    return inside_border, touching / max(touching + int(np.count_nonzero(inside_border)), 1)
+    depths = depth[at[:, 1], at[:, 0]]
+    is_inside = depths > BORDER_PX
+    border_count = int(np.count_nonzero((depths > 0) & ~is_inside))
+    return is_inside, border_count / max(border_count + int(np.count_nonzero(is_inside)), 1)
 
 
-def _ordered(segments: Segments) -> Segments:
+def _order_segments(segments: Segments) -> Segments:
     """Return segments in their order around the reference, evenly thinned if they are too many."""
     order = np.argsort(np.arctan2(segments.middles[:, 1], segments.middles[:, 0]), kind="stable")
     if len(order) > MAX_SEGMENTS:
@@ -482,7 +484,7 @@ def _check_directions(segments: Segments) -> None:
         )
 
 
-def _levels(
+def _visible_by_level(
     segments: Segments, grey: NDArray[np.uint8], centre: Array
 ) -> tuple[NDArray[np.intp], ...]:
     """Return the segments that are visible at each level of the pyramid, from level 0."""
@@ -491,14 +493,14 @@ def _levels(
     radius = float(np.linalg.norm(segments.middles, axis=1).max())
     for level in range(1, MAX_LEVELS):
         grey = cv2.pyrDown(grey)
-        seen = _seen_at(segments, grey, centre, level)
-        if len(seen) < MIN_TOP_POINTS or radius / 2**level < MIN_RADIUS_PX:
+        visible = _visible_at(segments, grey, centre, level)
+        if len(visible) < MIN_TOP_POINTS or radius / 2**level < MIN_RADIUS_PX:
             break
-        levels.append(seen)
+        levels.append(visible)
     return tuple(levels)
 
 
-def _seen_at(
+def _visible_at(
     segments: Segments, grey: NDArray[np.uint8], centre: Array, level: int
 ) -> NDArray[np.intp]:
     """Return the segments whose direction is visible at a level, at most one for each pixel."""
@@ -506,17 +508,17 @@ def _seen_at(
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *direction) for direction in ((1, 0), (0, 1)))
     exact = (segments.middles + centre) / 2**level
     limit = np.array(grey.shape[::-1]) - 1
-    agreed = np.zeros(len(exact), dtype=np.bool_)
-    for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):  # the search looks at neighbours, too
+    is_visible = np.zeros(len(exact), dtype=np.bool_)
+    for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):  # the search reads neighbouring pixels, too
         x, y = (np.floor(exact).astype(int) + corner).clip(0, limit).T
         gradient = np.column_stack([across[y, x], down[y, x]])
         size = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
         alike = (gradient * segments.normals).sum(axis=1) / size >= LEVEL_AGREEMENT
-        agreed |= alike & (size >= LEVEL_RESPONSE * segments.heights)
+        is_visible |= alike & (size >= LEVEL_RESPONSE * segments.heights)
     _, first = np.unique(np.rint(exact).astype(int) @ [1, 1 << 20], return_index=True)
-    once = np.zeros(len(exact), dtype=np.bool_)
-    once[first] = True
-    return np.flatnonzero(agreed & once)
+    is_first = np.zeros(len(exact), dtype=np.bool_)
+    is_first[first] = True
+    return np.flatnonzero(is_visible & is_first)
 
 
 # ---------------------------------------------------------------------- files
@@ -553,7 +555,7 @@ class _ModelFile(BaseModel):
     outline: Annotated[list[tuple[Place, Place]], Field(min_length=3, max_length=1_000_000)]
 
     @model_validator(mode="after")
-    def _goes_together(self) -> _ModelFile:
+    def _check_consistency(self) -> _ModelFile:
         for number, level in enumerate(self.levels):
             if not level or max(level) >= len(self.segments):
                 raise ValueError(f"levels.{number}: expected indices of segments")
@@ -590,7 +592,7 @@ class _ModelFile(BaseModel):
             alike=list(model.symmetry.alike),
             about=model.symmetry.about,
             segments=[tuple(row) for row in rows.round(6).tolist()],
-            moves=segments.moves.round(5).tolist(),
+            moves=segments.blur_shifts.round(5).tolist(),
             levels=[level.tolist() for level in model.levels],
             outline=[tuple(row) for row in model.outline.round(2).tolist()],
         )

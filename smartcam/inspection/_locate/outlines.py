@@ -1,7 +1,7 @@
 """Read outlines of parts from files of DXF and SVG, and draw a picture of such a part.
 
-The libraries ezdxf and fontTools read the curves; here lines whose ends meet are joined to loops. A
-loop inside a loop is a hole.
+The libraries ezdxf and fontTools read the curves. This module joins lines whose ends meet to loops.
+A loop inside a loop is a hole.
 """
 
 from __future__ import annotations
@@ -26,8 +26,14 @@ if TYPE_CHECKING:
 
 Unit = Literal["mm", "cm", "m", "inch", "px"]
 
-MM: Final[dict[str, float]] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4, "px": 25.4 / 96}
-"""Millimetres of each unit; px is the one of CSS, which SVG takes for a length without a unit."""
+MM_PER_UNIT: Final[dict[str, float]] = {
+    "mm": 1.0,
+    "cm": 10.0,
+    "m": 1000.0,
+    "inch": 25.4,
+    "px": 25.4 / 96,
+}
+"""Millimetres of each unit; px is the pixel of CSS, the unit of a length without a unit in SVG."""
 
 DXF_UNITS: Final = {1: "inch", 4: "mm", 5: "cm", 6: "m"}
 """Units by the numbers that a DXF file has for them in its header, as $INSUNITS."""
@@ -35,8 +41,8 @@ DXF_UNITS: Final = {1: "inch", 4: "mm", 5: "cm", 6: "m"}
 SVG_UNITS: Final = {"mm": "mm", "cm": "cm", "in": "inch", "px": "px"}
 """Units by the suffix of a number in SVG."""
 
-SVG_SILENT: Final = frozenset({"defs", "desc", "metadata", "namedview", "style", "title"})
-"""Elements of SVG that show nothing by themselves."""
+SVG_INVISIBLE: Final = frozenset({"defs", "desc", "metadata", "namedview", "style", "title"})
+"""Elements of SVG that draw nothing."""
 
 MAX_FILE_BYTES: Final = 1 << 24
 """Largest number of bytes of an outline's file."""
@@ -114,10 +120,10 @@ def read_outline(
             )
         if len(line) > 1:
             outline_lines.append(line)
-    return Outline(_closed(path, outline_lines, pixels_per_mm))
+    return Outline(_join_lines(path, outline_lines, pixels_per_mm))
 
 
-def _closed(path: Path, lines: list[Array], pixels_per_mm: float) -> list[Array]:
+def _join_lines(path: Path, lines: list[Array], pixels_per_mm: float) -> list[Array]:
     """Join lines (K, 2) to loops."""
     loops: list[Array] = []
     open_lines = list(lines)
@@ -160,9 +166,10 @@ def _dxf_lines(
         if unit_name is None:
             raise TeachingError(
                 TeachingTrouble.UNIT,
-                f"{path}: its header names no known unit: set unit to one of {', '.join(MM)}",
+                f"{path}: its header names no known unit: set unit to one of "
+                f"{', '.join(MM_PER_UNIT)}",
             )
-        scale = MM[unit_name] * pixels_per_mm
+        scale = MM_PER_UNIT[unit_name] * pixels_per_mm
         for entity in disassemble.recursive_decompose(drawing.modelspace()):
             if layers and entity.dxf.layer not in layers:
                 continue
@@ -220,7 +227,7 @@ def _tag(element: ElementTree.Element) -> str:
 def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> float:
     """Return the millimetres of a user unit, by the drawing's width and ``viewBox``."""
     if unit is not None:
-        return MM[unit]
+        return MM_PER_UNIT[unit]
     sizes = [_length(root.get(name, "")) for name in ("width", "height")]
     box = [
         float(number) for number in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if number
@@ -229,11 +236,11 @@ def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> floa
         raise TeachingError(
             TeachingTrouble.UNIT,
             f'{path}: its width and height have no unit, such as width="50mm": set unit to one of '
-            f"{', '.join(MM)}",
+            f"{', '.join(MM_PER_UNIT)}",
         )
-    millimetres = [(size[0] * MM[size[1]], size[1]) for size in sizes if size is not None]
+    millimetres = [(size[0] * MM_PER_UNIT[size[1]], size[1]) for size in sizes if size is not None]
     if not box:
-        return MM["px"]
+        return MM_PER_UNIT["px"]
     across, down = (length[0] / side for length, side in zip(millimetres, box[2:], strict=True))
     if not (across > 0 and abs(down / across - 1) < 1e-3):
         raise TeachingError(
@@ -258,12 +265,12 @@ class _SvgReader:
         self._layers = layers
 
     def read(
-        self, element: ElementTree.Element, matrix: Array, wanted: bool, depth: int
+        self, element: ElementTree.Element, matrix: Array, in_layer: bool, depth: int
     ) -> Iterator[Array]:
-        """Yield the lines (K, 2) of an element and those in it, in pixels.
+        """Yield the lines (K, 2) of an element and of its children, in pixels.
 
-        ``matrix``: from the element's coordinates to pixels; ``wanted``: whether it is in one of
-        the layers that were asked for.
+        ``matrix``: from the element's coordinates to pixels; ``in_layer``: whether
+        the element is in one of the layers.
         """
         if depth > MAX_NESTED:
             raise TeachingError(
@@ -272,7 +279,7 @@ class _SvgReader:
             )
         tag = _tag(element)
         style = _style(element)
-        if tag in SVG_SILENT or "none" in (element.get("display"), style.get("display")):
+        if tag in SVG_INVISIBLE or "none" in (element.get("display"), style.get("display")):
             return
         if "transform" in style:
             raise TeachingError(
@@ -281,12 +288,12 @@ class _SvgReader:
                 f"{tag!r:.40}",
             )
         label = element.get("{http://www.inkscape.org/namespaces/inkscape}label")
-        wanted = wanted or element.get("id") in self._layers or label in self._layers
+        in_layer = in_layer or element.get("id") in self._layers or label in self._layers
         matrix = matrix @ _matrix(element.get("transform", ""))
         if tag in {"svg", "g", "a"} and not (tag == "svg" and depth):
             for child in element:
-                yield from self.read(child, matrix, wanted, depth + 1)
-        elif wanted:
+                yield from self.read(child, matrix, in_layer, depth + 1)
+        elif in_layer:
             for line in self._shape(tag, element, self._flatness(matrix)):
                 with np.errstate(all="ignore"):
                     yield line @ matrix[:2, :2].T + matrix[:2, 2]
@@ -295,12 +302,12 @@ class _SvgReader:
         """Return the flatness in an element's coordinates."""
         return FLATNESS_PX / max(math.sqrt(abs(float(np.linalg.det(matrix[:2, :2])))), 1e-9)
 
-    def _shape(self, tag: str, element: ElementTree.Element, flat: float) -> Iterator[Array]:
+    def _shape(self, tag: str, element: ElementTree.Element, flatness: float) -> Iterator[Array]:
         def number(name: str, default: float = 0.0) -> float:
             return float(element.get(name, default))
 
         if tag == "path":
-            yield from _path_lines(element.get("d", ""), flat)
+            yield from _path_lines(element.get("d", ""), flatness)
         elif tag in {"polygon", "polyline"}:
             numbers = [
                 float(number) for number in re.split(r"[\s,]+", element.get("points", "")) if number
@@ -311,7 +318,7 @@ class _SvgReader:
             yield np.array([[number(f"x{end}"), number(f"y{end}")] for end in (1, 2)])
         elif tag in {"circle", "ellipse"}:
             radii = [number("r")] * 2 if tag == "circle" else [number("rx"), number("ry")]
-            turns = np.linspace(0, 2 * math.pi, 1 + _steps(max(radii), flat))
+            turns = np.linspace(0, 2 * math.pi, 1 + _corner_count(max(radii), flatness))
             around = np.column_stack([np.cos(turns), np.sin(turns)]) * radii
             yield around + np.array([number("cx"), number("cy")])
         elif tag == "rect":
@@ -319,7 +326,7 @@ class _SvgReader:
             across = number("rx", number("ry"))
             rounded = np.minimum([across, number("ry", across)], sides / 2)
             with np.errstate(all="ignore"):
-                box = np.array([number("x"), number("y")]) + _round_box(sides, rounded, flat)
+                box = np.array([number("x"), number("y")]) + _round_box(sides, rounded, flatness)
             yield box
         else:
             raise TeachingError(
@@ -335,12 +342,12 @@ def _style(element: ElementTree.Element) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs if name.strip()}
 
 
-def _round_box(sides: Array, radii: Array, flat: float) -> Array:
-    """Return the outline of a box at the origin with round corners; radii of 0: sharp ones."""
-    turns = np.linspace(0, math.pi / 2, 1 + _steps(float(radii.max()), flat))
+def _round_box(sides: Array, radii: Array, flatness: float) -> Array:
+    """Return the outline of a box at the origin with round corners; radii of 0: sharp corners."""
+    turns = np.linspace(0, math.pi / 2, 1 + _corner_count(float(radii.max()), flatness))
     quarter = np.column_stack([np.cos(turns), np.sin(turns)]) if radii.all() else np.zeros((1, 2))
     rounds = []
-    for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1)):  # each from where the last one ended
+    for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1)):  # each corner begins where the last one ended
         corner = quarter if x * y > 0 else quarter[::-1]
         middle = sides / 2 + [x, y] * (sides / 2 - (radii if radii.all() else 0))
         rounds.append(middle + corner * radii * [x, y])
@@ -351,12 +358,12 @@ def _loop(corners: Array) -> Array:
     return np.concatenate([corners, corners[:1]])
 
 
-def _steps(radius: float, flat: float) -> int:
-    """Return the number of corners of a polygon that is within ``flat`` of a circle."""
-    return max(16, math.ceil(math.pi / math.sqrt(2 * min(flat / max(radius, 1e-9), 0.5))))
+def _corner_count(radius: float, flatness: float) -> int:
+    """Return the number of corners of a polygon that is within ``flatness`` of a circle."""
+    return max(16, math.ceil(math.pi / math.sqrt(2 * min(flatness / max(radius, 1e-9), 0.5))))
 
 
-def _path_lines(text: str, flat: float) -> Iterator[Array]:
+def _path_lines(text: str, flatness: float) -> Iterator[Array]:
     """Yield the lines of a path's data; curves become polygons."""
     pen = load("fontTools.pens.recordingPen").RecordingPen()
     load("fontTools.svgLib.path").parse_path(text, pen)
@@ -367,18 +374,21 @@ def _path_lines(text: str, flat: float) -> Iterator[Array]:
         elif command == "lineTo":
             line += places
         elif command in {"curveTo", "qCurveTo"}:
-            line += _curve(np.array([line[-1], *places], np.float64), flat)
+            line += _flatten_curve(np.array([line[-1], *places], np.float64), flatness)
         else:
             yield _loop(np.array(line)) if command == "closePath" else np.array(line)
 
 
-def _curve(corners: Array, flat: float) -> list[Any]:
-    """Return corners along a Bezier curve after its first one."""
+def _flatten_curve(corners: Array, flatness: float) -> list[Any]:
+    """Return the corners of a polygon along a Bezier curve, without the first one."""
     reach = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
-    count = min(2 * _steps(reach, flat), 2000)
-    part = np.linspace(0, 1, count + 1)[1:, None]
+    count = min(2 * _corner_count(reach, flatness), 2000)
+    fractions = np.linspace(0, 1, count + 1)[1:, None]
     order = len(corners) - 1
-    weights = [math.comb(order, k) * part**k * (1 - part) ** (order - k) for k in range(order + 1)]
+    weights = [
+        math.comb(order, k) * fractions**k * (1 - fractions) ** (order - k)
+        for k in range(order + 1)
+    ]
     return [
         *np.sum([weight * corner for weight, corner in zip(weights, corners, strict=True)], axis=0)
     ]
@@ -396,13 +406,13 @@ def _matrix(text: str) -> Array:
         if match is None:
             raise ValueError(f"transform: expected functions, got {text[at:]!r:.60}")
         at = match.end()
-        matrix = matrix @ _one_matrix(
+        matrix = matrix @ _function_matrix(
             match[1], [float(x) for x in re.findall(r"[^\s,]+", match[2])]
         )
     return matrix
 
 
-def _one_matrix(name: str, values: list[float]) -> Array:
+def _function_matrix(name: str, values: list[float]) -> Array:
     match name, values:
         case "matrix", [a, b, c, d, e, f]:
             return np.array([[a, c, e], [b, d, f], [0, 0, 1]])
@@ -427,7 +437,7 @@ def _one_matrix(name: str, values: list[float]) -> Array:
 # ---------------------------------------------------------------------- picture
 
 
-def drawn_outline(
+def draw_outline(
     outline: Outline, *, bright: bool
 ) -> tuple[NDArray[np.uint8], tuple[float, float]]:
     """Return the picture (H, W) of a part, and its first pixel's place in the drawing, pixels."""
@@ -439,16 +449,16 @@ def drawn_outline(
             TeachingTrouble.TOO_LARGE,
             f"the part has {width} x {height} pixels at this scale, {MAX_OUTLINE_PX} can be taught",
         )
-    inside = _areas([loop - low + 0.5 for loop in outline.loops], (height, width))
-    smooth = load("cv2", "inspection needs").GaussianBlur(inside, (0, 0), BLUR_PX)
+    shares = _pixel_shares([loop - low + 0.5 for loop in outline.loops], (height, width))
+    smooth = load("cv2", "inspection needs").GaussianBlur(shares, (0, 0), BLUR_PX)
     levels = DARK + CONTRAST * (smooth if bright else 1.0 - smooth)
     noise = np.random.default_rng(1).normal(scale=NOISE, size=levels.shape)
     picture: NDArray[np.uint8] = np.rint(levels + noise).clip(0, 255).astype(np.uint8)
     return picture, (float(low[0]), float(low[1]))
 
 
-def _areas(loops: list[Array], shape: tuple[int, int]) -> Array:
-    """Return the part of each pixel that lies in an odd number of loops, (H, W)."""
+def _pixel_shares(loops: list[Array], shape: tuple[int, int]) -> Array:
+    """Return the share (H, W) of each pixel that lies in an odd number of loops."""
     rows: list[NDArray[np.int_]] = []
     crossings: list[Array] = []
     for loop in loops:

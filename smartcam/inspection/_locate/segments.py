@@ -1,8 +1,8 @@
 """Segments: short straight or bent pieces of a part's edges, and their fit to a picture's pixels.
 
 A segment has a middle, a normal that points to its brighter side, a bend, and a length. Its *band*
-consists of the pixels beside it: each pixel of a picture is in the band of one segment at most. So
-the errors of segments are independent, and the error of a pose follows from them.
+consists of the pixels on both sides of the segment. Each pixel of a picture is in the band of one
+segment at most, so the errors of segments are independent. The error of a pose follows from them.
 
 A blurred step is fitted to the pixels of each band: two levels, and the place across the edge.
 Pixels are used without interpolation.
@@ -31,8 +31,8 @@ MIN_BLUR_PX: Final = 0.35
 """Least standard deviation of an edge's blur, pixels, which includes the area of a pixel."""
 
 BLURS_PX2: Final = (0.5, 1.0, 2.0, 4.0, 6.0, 9.0)
-"""Variances of additional blur, pixels^2 of the taught picture, for which a model has the shifts of
-its edges."""
+"""Variances of additional blur, pixels^2 of the taught picture, for which a model knows the
+shifts of its edges."""
 
 MIN_BAND_PIXELS: Final = 12
 """Least number of pixels of a band; a fit to fewer does not determine their noise."""
@@ -48,10 +48,10 @@ class Segments(NamedTuple):
     heights: Array  # (N,), grey levels of 255 from the darker to the brighter side
     blurs: Array  # (N,), standard deviation of the step's blur
     sigmas: Array  # (N,), standard deviation of the place across the edge
-    moves: Array  # (N, K), shift of the fitted step across the edge by each of BLURS_PX2
+    blur_shifts: Array  # (N, K), shift of the fitted step across the edge by each of BLURS_PX2
 
     def selected(self, which: NDArray[Any]) -> Segments:
-        """Return some of the segments."""
+        """Return the segments that a mask or indices select."""
         return Segments(*(array[which] for array in self))
 
     @property
@@ -59,7 +59,7 @@ class Segments(NamedTuple):
         """Unit tangents (N, 2): the normals, rotated by 90 degrees from x to y."""
         return self.normals[:, ::-1] * [-1.0, 1.0]
 
-    def curve(self, step: float = 0.5) -> tuple[Array, NDArray[np.intp]]:
+    def sample_points(self, step: float = 0.5) -> tuple[Array, NDArray[np.intp]]:
         """Return points (M, 2) along all segments, and the segment of each."""
         counts = np.maximum(np.ceil(2 * self.halves / step).astype(int), 1) + 1
         owners = np.repeat(np.arange(len(counts)), counts)
@@ -70,21 +70,29 @@ class Segments(NamedTuple):
         points = self.middles[owners] + t[:, None] * self.tangents[owners]
         return points + bend[:, None] * self.normals[owners], owners
 
-    def moved_by(self, variance: float) -> Array:
-        """Return the shift (N,) across each edge that additional blur of a variance causes."""
-        if variance < 0:  # in a sharper picture edges move the other way
-            first: Array = self.moves[:, 0] * max(variance / BLURS_PX2[0], -1.0)
-            return first
-        at = min(variance, BLURS_PX2[-1])
-        above = int(np.searchsorted(BLURS_PX2, at))
-        known = np.column_stack([np.zeros(len(self.moves)), self.moves])
-        low, high = (0.0, *BLURS_PX2)[above : above + 2]
-        part = (at - low) / (high - low)
-        moved: Array = (1 - part) * known[:, above] + part * known[:, above + 1]
-        return moved
+    def blur_shift(self, variance: float) -> Array:
+        """Return the shift (N,) across each edge that an additional blur causes.
 
-    def places(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Return the coordinates of points (P, 2) in their segments: across and along the edge."""
+        ``variance``: variance of this blur; negative: the picture is sharper than the taught one.
+        """
+        if variance < 0:  # in a sharper picture edges move the other way
+            shift_if_sharper: Array = self.blur_shifts[:, 0] * max(variance / BLURS_PX2[0], -1.0)
+            return shift_if_sharper
+        extra = min(variance, BLURS_PX2[-1])
+        index = int(np.searchsorted(BLURS_PX2, extra))
+        known_shifts = np.column_stack([np.zeros(len(self.blur_shifts)), self.blur_shifts])
+        low, high = (0.0, *BLURS_PX2)[index : index + 2]
+        fraction = (extra - low) / (high - low)
+        shift: Array = (1 - fraction) * known_shifts[:, index] + fraction * known_shifts[
+            :, index + 1
+        ]
+        return shift
+
+    def coordinates_of(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Return the coordinates across and along the edge, (P,) each, of points (P, 2).
+
+        ``owners`` (P,): index of the segment of each point.
+        """
         x, y = (points - self.middles[owners]).T
         nx, ny = self.normals[owners].T
         along = nx * y - ny * x
@@ -99,35 +107,37 @@ class Bands(NamedTuple):
 
 
 def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Bands:
-    """Return the bands of segments; ``others`` (M, 2) are edges beside them, at which bands end.
+    """Return the bands of segments; ``others`` (M, 2) are other edge pixels, at which bands end.
 
     ``reach``: width of a band to each side of its segment, pixels.
     """
     cv2 = load("cv2", "inspection needs")
-    points, owners = segments.curve()
+    points, owners = segments.sample_points()
     low = np.floor(points.min(axis=0) - reach - 2).astype(int)
     size = np.ceil(points.max(axis=0) + reach + 2).astype(int) - low + 1
     seeds = np.full((int(size[1]), int(size[0])), -2, np.int32)
-    at = np.rint(points - low).astype(int)
-    seeds[at[:, 1], at[:, 0]] = owners
+    curve_pixels = np.rint(points - low).astype(int)
+    seeds[curve_pixels[:, 1], curve_pixels[:, 0]] = owners
     own_area = cv2.dilate((seeds >= 0).astype(np.uint8), np.ones((3, 3), np.uint8))
-    beside = np.rint(others - low).astype(int)
-    beside = beside[((beside >= 0) & (beside < size)).all(axis=1)]
-    beside = beside[own_area[beside[:, 1], beside[:, 0]] == 0]
-    seeds[beside[:, 1], beside[:, 0]] = -1
-    free = (seeds == -2).astype(np.uint8)
+    other_pixels = np.rint(others - low).astype(int)
+    other_pixels = other_pixels[((other_pixels >= 0) & (other_pixels < size)).all(axis=1)]
+    other_pixels = other_pixels[own_area[other_pixels[:, 1], other_pixels[:, 0]] == 0]
+    seeds[other_pixels[:, 1], other_pixels[:, 0]] = -1
+    is_free = (seeds == -2).astype(np.uint8)
     distance, nearest = cv2.distanceTransformWithLabels(
-        free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        is_free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     owner_of = np.full(int(nearest.max()) + 1, -1, np.int32)
-    owner_of[nearest[free == 0]] = seeds[free == 0]
+    owner_of[nearest[is_free == 0]] = seeds[is_free == 0]
     labels = owner_of[nearest]
     rows, columns = np.nonzero((labels >= 0) & (distance <= reach + 1))
     owners_in_band = labels[rows, columns].astype(np.intp)
-    across, along = segments.places(np.column_stack([columns, rows]) + low, owners_in_band)
-    within = (np.abs(across) <= reach) & (np.abs(along) <= segments.halves[owners_in_band] + 0.5)
+    across, along = segments.coordinates_of(np.column_stack([columns, rows]) + low, owners_in_band)
+    is_in_band = (np.abs(across) <= reach) & (
+        np.abs(along) <= segments.halves[owners_in_band] + 0.5
+    )
     band_labels = np.full(labels.shape, -1, np.int16)
-    band_labels[rows[within], columns[within]] = owners_in_band[within]
+    band_labels[rows[is_in_band], columns[is_in_band]] = owners_in_band[is_in_band]
     return Bands(band_labels, (int(low[0]), int(low[1])))
 
 
@@ -139,7 +149,7 @@ class BandPixels(NamedTuple):
     owners: NDArray[np.intp]  # (P,), index of the segment
 
 
-def pixels_in(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
+def find_band_pixels(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
     """Return the pixels of a picture (H, W) that lie in bands.
 
     ``matrix`` (2, 3) maps the segments' places to pixels of the picture.
@@ -165,8 +175,8 @@ def pixels_in(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
     rows, columns = np.nonzero(labels >= 0)
     owners = labels[rows, columns].astype(np.intp)
     points = np.column_stack([columns, rows]).astype(np.float64) + low
-    part = levels[low[1] : high[1], low[0] : high[0]]
-    return BandPixels(points, part[rows, columns].astype(np.float64), owners)
+    crop = levels[low[1] : high[1], low[0] : high[0]]
+    return BandPixels(points, crop[rows, columns].astype(np.float64), owners)
 
 
 class StepFit(NamedTuple):
@@ -187,46 +197,52 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
     ``across`` (P,) and ``blurs`` (P,): distance of each pixel from its edge, and the step's blur,
     both in pixels of the picture.
     """
-    part = across / blurs
-    rise = load("scipy.special").ndtr(part)
-    slope = np.exp(-0.5 * part * part) / (blurs * math.sqrt(2 * math.pi))
+    scaled = across / blurs
+    rise = load("scipy.special").ndtr(scaled)
+    slope = np.exp(-0.5 * scaled * scaled) / (blurs * math.sqrt(2 * math.pi))
     owners = pixels.owners
-    number = np.bincount(owners, minlength=count).astype(np.float64)
-    safe = np.maximum(number, 1.0)
+    pixel_counts = np.bincount(owners, minlength=count).astype(np.float64)
+    divisors = np.maximum(pixel_counts, 1.0)
 
-    def centred(values: Array) -> Array:
+    def subtract_means(values: Array) -> Array:
         """Subtract the mean of each band, which eliminates the band's unknown level."""
-        about: Array = values - (np.bincount(owners, values, count) / safe)[owners]
-        return about
+        deviations: Array = values - (np.bincount(owners, values, count) / divisors)[owners]
+        return deviations
 
     def sums(one: Array, other: Array) -> Array:
         return np.bincount(owners, one * other, count).astype(np.float64, copy=False)
 
-    rise, slope, widen, levels = map(centred, (rise, slope, part * slope * blurs, pixels.levels))
+    rise, slope, widen, levels = map(
+        subtract_means, (rise, slope, scaled * slope * blurs, pixels.levels)
+    )
     rr, rs, ss = sums(rise, rise), sums(rise, slope), sums(slope, slope)
     ry, sy, yy = sums(rise, levels), sums(slope, levels), sums(levels, levels)
     determinant = rr * ss - rs * rs
-    good = (number >= MIN_BAND_PIXELS) & (determinant > 1e-9 * np.maximum(rr * ss, 1e-12))
-    det = np.where(good, determinant, 1.0)
-    heights = np.where(good, (ss * ry - rs * sy) / det, 0.0)
-    moved = np.where(good, (rr * sy - rs * ry) / det, 0.0)
-    left = np.maximum(yy - heights * ry - moved * sy, 0.0)
-    freedoms = np.maximum(number - 3.0, 1.0)
-    variances = np.maximum(left / freedoms, ROUNDING**2)
-    tall = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
-    infinite = np.where(good, 0.0, np.inf)
-    # the effect of a wider blur, and the pixels, after elimination of heights and shifts
+    is_usable = (pixel_counts >= MIN_BAND_PIXELS) & (
+        determinant > 1e-9 * np.maximum(rr * ss, 1e-12)
+    )
+    safe_determinant = np.where(is_usable, determinant, 1.0)
+    heights = np.where(is_usable, (ss * ry - rs * sy) / safe_determinant, 0.0)
+    slope_values = np.where(is_usable, (rr * sy - rs * ry) / safe_determinant, 0.0)
+    residual_squares = np.maximum(yy - heights * ry - slope_values * sy, 0.0)
+    freedoms = np.maximum(pixel_counts - 3.0, 1.0)
+    variances = np.maximum(residual_squares / freedoms, ROUNDING**2)
+    safe_heights = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
+    infinite = np.where(is_usable, 0.0, np.inf)
+    # eliminate heights and shifts from the effect of a wider blur and from the pixels
     wr, ws = sums(widen, rise), sums(widen, slope)
-    square = sums(widen, widen) - (ss * wr * wr - 2 * rs * wr * ws + rr * ws * ws) / det
-    grown = sums(widen, levels) - heights * wr - moved * ws
-    weights = np.where(good, 1 / variances, 0.0)
+    square = (
+        sums(widen, widen) - (ss * wr * wr - 2 * rs * wr * ws + rr * ws * ws) / safe_determinant
+    )
+    grown = sums(widen, levels) - heights * wr - slope_values * ws
+    weights = np.where(is_usable, 1 / variances, 0.0)
     weights[np.abs(heights) < np.median(np.abs(heights))] = 0.0
     total = float((weights * heights**2 * square).sum())
     return StepFit(
-        -moved / tall,
-        np.sqrt(np.maximum(rr / det, 0.0)) / np.abs(tall) + infinite,
+        -slope_values / safe_heights,
+        np.sqrt(np.maximum(rr / safe_determinant, 0.0)) / np.abs(safe_heights) + infinite,
         heights,
-        np.sqrt(np.maximum(ss / det, 0.0)) + infinite,
+        np.sqrt(np.maximum(ss / safe_determinant, 0.0)) + infinite,
         variances,
         freedoms,
         -float((weights * heights * grown).sum()) / total if total > 0 else 0.0,

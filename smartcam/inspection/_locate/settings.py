@@ -20,10 +20,10 @@ MAX_SECONDS: Final = 30.0
 """Largest time limit of a search, seconds."""
 
 
-def _rising(given: tuple[float, float]) -> tuple[float, float]:
-    if given[0] > given[1]:
-        raise ValueError(f"expected the smaller number first, got {list(given)}")
-    return given
+def _check_order(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] > limits[1]:
+        raise ValueError(f"expected the smaller number first, got {list(limits)}")
+    return limits
 
 
 Angle = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
@@ -64,17 +64,17 @@ class LocateSettings(ToolSettings):
     bright: bool = Field(
         True, description="with an outline: whether the part is brighter than its background"
     )
-    angle: Annotated[tuple[Angle, Angle], AfterValidator(_rising)] = Field(
+    angle: Annotated[tuple[Angle, Angle], AfterValidator(_check_order)] = Field(
         (-180.0, 180.0),
         description="smallest and largest rotation since the part was taught, degrees",
     )
-    scale: Annotated[tuple[Scale, Scale], AfterValidator(_rising)] = Field(
+    scale: Annotated[tuple[Scale, Scale], AfterValidator(_check_order)] = Field(
         (1.0, 1.0), description="smallest and largest size, as a ratio to the taught size"
     )
     most: int = Field(
         1, ge=1, le=MAX_PARTS, description="largest number of parts of each model in the result"
     )
-    count: Annotated[tuple[Number, Number], AfterValidator(_rising)] | Number | None = Field(
+    count: Annotated[tuple[Number, Number], AfterValidator(_check_order)] | Number | None = Field(
         None,
         description="expected number of parts, or its limits; default: one or more",
     )
@@ -106,7 +106,7 @@ class LocateSettings(ToolSettings):
     )
 
     @model_validator(mode="after")
-    def _goes_together(self) -> LocateSettings:
+    def _check_consistency(self) -> LocateSettings:
         given = [name for name in ("model", "taught", "outline") if getattr(self, name) is not None]
         if len(given) != 1:
             actual = " and ".join(given) or "none of them"

@@ -1,4 +1,4 @@
-"""Find the turns by which a part looks like itself."""
+"""Find the rotations after which a part looks like itself."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ OUTLINE_DISTANCE_PX: Final = 1.5
 """Largest distance of a turned point from the outline, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Largest angle between the direction of a turned edge and the direction of the edge below it."""
+"""Largest angle between the direction of a turned edge and the direction of the edge at its
+place."""
 
 CENTRE_STEPS: Final = 6
 """Number of iterations that find the centre of a part's turns."""
@@ -50,14 +51,14 @@ ANGLE_COUNT: Final = 720
 
 @dataclass(frozen=True, slots=True)
 class Symmetry:
-    """The turns at which a part looks like itself.
+    """The rotations (turns) after which a part looks like itself.
 
     Attributes:
-        fold: number of turns in the full circle at which it is the same: 1 of most parts, 4 of a
-            square, 0 of a round one, which has no angle.
-        alike: other turns at which it may be taken for itself: radians, and the part of the
-            outline that is the same, the most alike first.
-        about: place that these turns are about, pixels from the reference.
+        fold: number of turns in the full circle after which the part is the same: 1 for most parts,
+            4 for a square, 0 for a round part, which has no angle.
+        alike: other turns after which the part may be mistaken for the unturned part: radians, and
+            the share of the outline that is the same; the largest share first.
+        about: centre of these turns, pixels from the reference.
     """
 
     fold: int = 1
@@ -86,31 +87,32 @@ class Symmetry:
 
 
 def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Symmetry, Array]:
-    """Return the turns at which a part's edges lie on themselves, and the place they turn about.
+    """Return the turns that bring a part's edges onto themselves, and the centre (2,) of the turns.
 
-    ``points`` (M, 2) and ``normals`` (M, 2) are all of its edges, ``segments`` those whose place
-    is measured to a fraction of a pixel.
-
-    The place (2,) is the centre of a symmetric part; for other parts the reference, (0, 0).
+    ``points`` (M, 2) and ``normals`` (M, 2) are all edges of the part; ``segments`` are the edges
+    whose place is measured to a fraction of a pixel. For a part without symmetry, the centre is the
+    reference, (0, 0).
     """
-    shares = _shares(points, normals)
-    best, most = Symmetry(1, _alike(shares, 1)), MIN_ALIKE_SHARE
+    shares = _matching_shares(points, normals)
+    best, best_share = Symmetry(1, _find_alike_turns(shares, 1)), MIN_ALIKE_SHARE
     for count in (0, *range(MAX_FOLD, 1, -1)):
-        if count not in COMMON_FOLDS and _least(shares, count) < MIN_ALIKE_SHARE:
+        if count not in COMMON_FOLDS and _min_share(shares, count) < MIN_ALIKE_SHARE:
             continue
-        centre = _centre(segments, count or MAX_FOLD)
-        again = _shares(points - centre, normals)
-        least = _least(again, count)
+        centre = _find_centre(segments, count or MAX_FOLD)
+        centred_shares = _matching_shares(points - centre, normals)
+        least = _min_share(centred_shares, count)
         if least >= MIN_SAME_SHARE:
-            return Symmetry(count, _alike(again, count) if count else ()), centre
-        if least > most and count:
+            return Symmetry(
+                count, _find_alike_turns(centred_shares, count) if count else ()
+            ), centre
+        if least > best_share and count:
             x, y = centre.tolist()
-            best, most = Symmetry(1, _alike(again, 1), (x, y)), least
+            best, best_share = Symmetry(1, _find_alike_turns(centred_shares, 1), (x, y)), least
     return best, np.zeros(2)
 
 
-def _least(shares: Array, count: int) -> float:
-    """Return the part of the outline that each turn of a fold brings onto itself at least."""
+def _min_share(shares: Array, count: int) -> float:
+    """Return the least share of the outline that a turn of a fold brings onto itself."""
     if count == 0:
         return float(shares.min())
     turns = np.rint(ANGLE_COUNT * np.arange(1, count) / count).astype(np.intp)
@@ -118,10 +120,10 @@ def _least(shares: Array, count: int) -> float:
     return float(shares[around].max(axis=1).min())
 
 
-def _centre(segments: Segments, count: int) -> Array:
-    """Return the place about which turns of a fold bring segments nearest to themselves."""
+def _find_centre(segments: Segments, count: int) -> Array:
+    """Return the centre (2,) about which turns bring segments nearest to other segments."""
     centre = np.zeros(2)
-    index = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
+    tree = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
     for step in range(CENTRE_STEPS):
         reach = max(CENTRE_PX * (1 - step / 4), OUTLINE_DISTANCE_PX)
         rows, values = [], []
@@ -129,13 +131,13 @@ def _centre(segments: Segments, count: int) -> Array:
             angle = 2 * math.pi * number / count
             cos, sin = math.cos(angle), math.sin(angle)
             turn = np.array([[cos, -sin], [sin, cos]])
-            moved = (segments.middles - centre) @ turn.T + centre
-            met = index.query(moved)[1]
-            across, along = segments.places(moved, met)
-            agreed = (segments.normals @ turn.T * segments.normals[met]).sum(axis=1)
-            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(across) <= reach)
-            used &= np.abs(along) <= segments.halves[met] + 1
-            rows.append((segments.normals[met] @ (np.eye(2) - turn))[used])
+            turned_middles = (segments.middles - centre) @ turn.T + centre
+            nearest_segments = tree.query(turned_middles)[1]
+            across, along = segments.coordinates_of(turned_middles, nearest_segments)
+            cosines = (segments.normals @ turn.T * segments.normals[nearest_segments]).sum(axis=1)
+            used = (cosines >= math.cos(MAX_TURN)) & (np.abs(across) <= reach)
+            used &= np.abs(along) <= segments.halves[nearest_segments] + 1
+            rows.append((segments.normals[nearest_segments] @ (np.eye(2) - turn))[used])
             values.append(-across[used])
         if sum(map(len, values)) < MIN_PAIRED_SEGMENTS:
             return np.zeros(2)
@@ -143,8 +145,8 @@ def _centre(segments: Segments, count: int) -> Array:
     return centre
 
 
-def _shares(points: Array, normals: Array) -> Array:
-    """Return the part of the edges that each turn brings onto others, (ANGLE_COUNT,)."""
+def _matching_shares(points: Array, normals: Array) -> Array:
+    """Return the share of the edges that each turn brings onto other edges, (ANGLE_COUNT,)."""
     cv2 = load("cv2", "inspection needs")
     radius = math.ceil(float(np.linalg.norm(points, axis=1).max())) + 3
     image = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
@@ -157,24 +159,28 @@ def _shares(points: Array, normals: Array) -> Array:
     point_of[nearest[at[:, 1], at[:, 0]]] = np.arange(len(at))
     step = max(1, len(points) // MAX_POINTS)
     shares = np.empty(ANGLE_COUNT)
-    for number in range(ANGLE_COUNT):
-        angle = 2 * math.pi * number / ANGLE_COUNT
+    for index in range(ANGLE_COUNT):
+        angle = 2 * math.pi * index / ANGLE_COUNT
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
-        met = point_of[nearest[rows, columns]]
-        agreed = (normals[met] * (normals[::step] @ turn)).sum(axis=1) >= math.cos(MAX_TURN)
-        shares[number] = (agreed & (distance[rows, columns] <= OUTLINE_DISTANCE_PX)).mean()
+        nearest_points = point_of[nearest[rows, columns]]
+        is_aligned = (normals[nearest_points] * (normals[::step] @ turn)).sum(axis=1) >= math.cos(
+            MAX_TURN
+        )
+        shares[index] = (is_aligned & (distance[rows, columns] <= OUTLINE_DISTANCE_PX)).mean()
     return shares
 
 
-def _alike(shares: Array, fold: int) -> tuple[tuple[float, float], ...]:
-    """Return the turns within the period at which the part may be taken for itself."""
+def _find_alike_turns(shares: Array, fold: int) -> tuple[tuple[float, float], ...]:
+    """Return the turns within the period after which the part may be mistaken for itself."""
     period = ANGLE_COUNT // fold
-    inside = shares[:period]
-    before, after = np.roll(inside, 1), np.roll(inside, -1)
-    peaks = np.flatnonzero((inside >= before) & (inside > after) & (inside >= MIN_ALIKE_SHARE))
-    distant = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
-    order = distant[np.argsort(-inside[distant], kind="stable")][:8]
+    in_period = shares[:period]
+    before, after = np.roll(in_period, 1), np.roll(in_period, -1)
+    peaks = np.flatnonzero(
+        (in_period >= before) & (in_period > after) & (in_period >= MIN_ALIKE_SHARE)
+    )
+    clear_peaks = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
+    order = clear_peaks[np.argsort(-in_period[clear_peaks], kind="stable")][:8]
     return tuple(
-        (2 * math.pi * place / ANGLE_COUNT, float(shares[place])) for place in order.tolist()
+        (2 * math.pi * index / ANGLE_COUNT, float(shares[index])) for index in order.tolist()
     )

@@ -13,7 +13,7 @@ from smartcam.inspection._finding import Finding
 from smartcam.inspection._locate.find import Located, LocatedPart, PartSearch, locate
 from smartcam.inspection._locate.model import PartModel
 from smartcam.inspection._locate.settings import MAX_PARTS, LocateSettings
-from smartcam.inspection._measure.planes import PIXELS, robot_plane_of
+from smartcam.inspection._measure.planes import PIXELS, robot_plane
 from smartcam.inspection._measure.troubles import NotMeasuredError
 from smartcam.inspection._picture import Picture
 from smartcam.inspection._tool import Tool
@@ -42,8 +42,8 @@ class PlanePose(NamedTuple):
         units = np.array([si, si, 1.0])
         x, y, theta = (self.values * units).tolist()
         sigmas = np.sqrt(np.diag(self.covariance))
-        safe = np.maximum(sigmas, 1e-300)
-        correlation = self.covariance / np.outer(safe, safe)
+        divisors = np.maximum(sigmas, 1e-300)
+        correlation = self.covariance / np.outer(divisors, divisors)
         sigma_x, sigma_y, sigma_theta = (sigmas * units).tolist()
         return {
             "x": x,
@@ -66,7 +66,8 @@ class Locate(Tool[LocateSettings]):
 
     def __init__(self, settings: LocateSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
-        load("scipy.special", "locate needs")  # saves the first picture the import
+        # loaded now, since the first picture should not wait for it
+        load("scipy.special", "locate needs")
         self.models = [PartModel.read(setup.folder / model) for model in settings.models]
         if settings.taught is not None:
             file = setup.folder / settings.taught
@@ -86,8 +87,8 @@ class Locate(Tool[LocateSettings]):
         for model in self.models:  # computed here, so that the first picture takes no longer
             _ = model.bands_at(settings.scale[0]), model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
-        calibrated = kind in {"plane", "sheet"}
-        self._plane = robot_plane_of(setup.calibration) if calibrated else PIXELS
+        has_plane = kind in {"plane", "sheet"}
+        self._plane = robot_plane(setup.calibration) if has_plane else PIXELS
         self._search = PartSearch(
             angles=settings.angles,
             scales=settings.scale,
@@ -99,9 +100,9 @@ class Locate(Tool[LocateSettings]):
             seconds=settings.seconds,
         )
         count = settings.count
-        self._wanted = (1, MAX_PARTS * len(self.models))
+        self._count_limits = (1, MAX_PARTS * len(self.models))
         if count is not None:
-            self._wanted = count if isinstance(count, tuple) else (count, count)
+            self._count_limits = count if isinstance(count, tuple) else (count, count)
 
     @property
     def fields(self) -> str:
@@ -125,18 +126,18 @@ class Locate(Tool[LocateSettings]):
         return tuple(self._remark(model) for model in self.models)
 
     def _remark(self, model: PartModel) -> str:
-        place, angle = model.predicted_sigma()
+        sigma, angle = model.predicted_sigma()
         text = (
             f"{model.name}: {model.symmetry.text()}; {len(model.segments.halves)} pieces of edges; "
-            f"a pose is good to {place:.2g} px"
+            f"a pose is good to {sigma:.2g} px"
         )
         try:
-            slopes = self._plane.slopes(np.array([model.reference]))[0]
+            jacobian = self._plane.jacobians(np.array([model.reference]))[0]
         except NotMeasuredError:
             pass  # an outline's reference need not be in the picture
         else:
-            longest = float(np.linalg.norm(slopes, 2))
-            text += f", {longest * place:.2g} mm" if self._plane.unit == "mm" else ""
+            longest = float(np.linalg.norm(jacobian, 2))
+            text += f", {longest * sigma:.2g} mm" if self._plane.unit == "mm" else ""
         if not math.isnan(angle):
             text += f" and {math.degrees(angle):.2g} degrees"
         return f"{text} in a picture like the taught one"
@@ -145,48 +146,48 @@ class Locate(Tool[LocateSettings]):
         """Return the parts, the best first."""
         region = view.region
         box = (region.left, region.top, region.right, region.below)
-        everywhere = self.settings.region is None
+        whole_picture = self.settings.region is None
         located = locate(
             view.picture,
             self.models,
             self._search,
-            box=None if everywhere else box,
-            allowed=None if everywhere else region.contains,
+            box=None if whole_picture else box,
+            allowed=None if whole_picture else region.contains,
         )
         try:
-            poses = [in_plane(part, self._plane) for part in located.parts]
+            poses = [pose_in_plane(part, self._plane) for part in located.parts]
         except NotMeasuredError as trouble:
             return Finding(
                 ok=False,
                 reason=f"{trouble.why.value}: {trouble.text}",
-                values=_values(located),
-                drawings=self._drawn(view, located, wrong=True),
+                values=_result_values(located),
+                drawings=self._drawings(view, located, wrong=True),
                 details=located,
             )
         reason = self._complaint(located, poses)
         return Finding(
             ok=not reason,
             reason=reason,
-            values=_values(located),
+            values=_result_values(located),
             records=[
                 _record(part, pose, self._plane.unit)
                 for part, pose in zip(located.parts, poses, strict=True)
             ],
-            drawings=self._drawn(view, located, wrong=bool(reason)),
+            drawings=self._drawings(view, located, wrong=bool(reason)),
             reference=located.parts[0].pose if located.parts else None,
             details=located,
         )
 
     def _complaint(self, located: Located, poses: list[PlanePose]) -> str:
         """Return the reason why the found parts are not ok; "" if they are ok."""
-        least, most = self._wanted
-        count, nearest = len(located.parts), located.nearest
+        least, most = self._count_limits
+        count, best_refused = len(located.parts), located.best_refused
         if not least <= count <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
             wanted = f"{least} or more" if self.settings.count is None else wanted
             text = f"{count} found, expected {wanted}"
             if count < least:
-                text += _nearest_text(nearest, len(self.models) > 1)
+                text += _refusal_text(best_refused, len(self.models) > 1)
             return text
         for part, pose in zip(located.parts, poses, strict=True):
             if part.doubt:
@@ -198,41 +199,41 @@ class Locate(Tool[LocateSettings]):
                 return f"{part.name}: sigma is {sigma:.3g} {unit}, {limit:g} {unit} are allowed"
         return ""
 
-    def _drawn(self, view: View, located: Located, *, wrong: bool) -> list[Drawing]:
+    def _drawings(self, view: View, located: Located, *, wrong: bool) -> list[Drawing]:
         marks = [Drawing("polygon", _points(view.region.corners), "region")]
         for part in located.parts:
             marks += _marks(part, "wrong" if wrong else "found")
-        if not located.parts and located.nearest is not None:
-            nearest_part = located.nearest
-            text = f"{nearest_part.name}: {100 * nearest_part.score:.0f} %"
-            marks.append(Drawing("polygon", _points(nearest_part.hull), "hint", text))
+        if not located.parts and located.best_refused is not None:
+            refused = located.best_refused
+            text = f"{refused.name}: {100 * refused.score:.0f} %"
+            marks.append(Drawing("polygon", _points(refused.hull), "hint", text))
         return marks
 
 
-def in_plane(part: LocatedPart, plane: Plane) -> PlanePose:
-    """Return a part's pose in a plane, with the picture's and the plane's own errors."""
+def pose_in_plane(part: LocatedPart, plane: Plane) -> PlanePose:
+    """Return a part's pose in a plane; its covariance includes the plane's errors."""
     start = np.array([part.pose.x, part.pose.y, part.pose.angle])
-    values = _pose_in(start, plane)
+    values = _map_pose(start, plane)
     columns = []
     for step in np.diag(POSE_STEPS):
-        difference = _pose_in(start + step, plane) - _pose_in(start - step, plane)
+        difference = _map_pose(start + step, plane) - _map_pose(start - step, plane)
         difference[2] = math.remainder(difference[2], 2 * math.pi)
         columns.append(difference / (2 * step.max()))
-    slopes = np.column_stack(columns)
-    covariance = slopes @ part.covariance[:3, :3] @ slopes.T
+    jacobian = np.column_stack(columns)
+    covariance = jacobian @ part.covariance[:3, :3] @ jacobian.T
     for variant in plane.variants:
-        difference = _pose_in(start, plane._replace(map=variant, variants=())) - values
+        difference = _map_pose(start, plane._replace(map=variant, variants=())) - values
         difference[2] = math.remainder(difference[2], 2 * math.pi)
         covariance = covariance + np.outer(difference, difference)
     return PlanePose(values, covariance)
 
 
-def _pose_in(pose: Array, plane: Plane) -> Array:
+def _map_pose(pose: Array, plane: Plane) -> Array:
     if plane is PIXELS:
         return pose
-    at = pose[None, :2]
-    ahead = plane.slopes(at)[0] @ [math.cos(pose[2]), math.sin(pose[2])]
-    return np.array([*plane.points(at)[0], math.atan2(ahead[1], ahead[0])])
+    pixel = pose[None, :2]
+    direction = plane.jacobians(pixel)[0] @ [math.cos(pose[2]), math.sin(pose[2])]
+    return np.array([*plane.map_points(pixel)[0], math.atan2(direction[1], direction[0])])
 
 
 def _record(part: LocatedPart, pose: PlanePose, unit: str) -> dict[str, Any]:
@@ -244,22 +245,24 @@ def _record(part: LocatedPart, pose: PlanePose, unit: str) -> dict[str, Any]:
     }
 
 
-def _values(located: Located) -> dict[str, Any]:
+def _result_values(located: Located) -> dict[str, Any]:
     best = located.parts[0].score if located.parts else None
-    if best is None and located.nearest is not None:
-        best = located.nearest.score
+    if best is None and located.best_refused is not None:
+        best = located.best_refused.score
     return {"count": len(located.parts), "best_score": 0.0 if best is None else best}
 
 
-def _nearest_text(nearest: LocatedPart | None, named: bool) -> str:
-    if nearest is None:
+def _refusal_text(best_refused: LocatedPart | None, with_name: bool) -> str:
+    if best_refused is None:
         return "; nothing in the picture resembles it"
-    name = f"{nearest.name} " if named else ""
-    return f"; {name}at {nearest.pose.x:.0f}, {nearest.pose.y:.0f}: {nearest.refusal}"
+    name = f"{best_refused.name} " if with_name else ""
+    return (
+        f"; {name}at {best_refused.pose.x:.0f}, {best_refused.pose.y:.0f}: {best_refused.refusal}"
+    )
 
 
 def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
-    """Return the drawings of a part: its outline, its axes, its edges, and those not seen."""
+    """Return the drawings of a part: its outline, its axes, its visible and its missing edges."""
     pose = part.pose
     reach = 0.25 * float(np.linalg.norm(part.hull - (pose.x, pose.y), axis=1).max()) / pose.scale
     axes = pose.to_picture([(2 * reach, 0), (0, 0), (0, reach)])
@@ -269,13 +272,13 @@ def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
         for number, contour in enumerate(part.contours or (part.hull,))
     ]
     marks.append(Drawing("line", _points(axes), role))
-    shown: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
-    for places, which in shown:
+    groups: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
+    for places, role_of_places in groups:
         if len(places):
             chosen = (
                 np.linspace(0, len(places) - 1, min(len(places), MAX_DRAWN)).round().astype(int)
             )
-            marks.append(Drawing("points", _points(places[chosen]), which))
+            marks.append(Drawing("points", _points(places[chosen]), role_of_places))
     return marks
 
 

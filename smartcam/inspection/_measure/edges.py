@@ -20,10 +20,10 @@ from smartcam.inspection._measure.strips import (
     Sectors,
     StripPixels,
     Strips,
-    cut,
-    inside,
-    profiles,
-    steps_of,
+    count_samples,
+    cut_pixels,
+    find_strips_inside,
+    mean_profiles,
 )
 from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
 
@@ -125,8 +125,8 @@ class EdgeSettings:
         most_blur: largest blur of an edge, pixels.
         black: least possible grey level of the picture.
         white: largest possible grey level of the picture.
-        cut_off: whether edges beside saturated levels are measured.
-        clipped: mask (H, W) of other saturated pixels, as of one colour; None: no pixel.
+        cut_off: whether edges next to saturated pixels are measured.
+        clipped: mask (H, W) of other saturated pixels, such as those of one colour; None: no pixel.
     """
 
     polarity: Polarity = "any"
@@ -143,15 +143,15 @@ class Edge(NamedTuple):
     """One edge in a strip."""
 
     place: float  # place along the strip, from its middle, pixels
-    # covariance (K + 1, K + 1) for noise of one grey level: of the places of the K edges that were
-    # fitted together, and of their tilt; the K edges share one array
+    # (K + 1, K + 1), covariance for noise of one grey level of the places of K edges, which were
+    # fitted together, and of their tilt; the K edges share this array
     unit_covariance: Array
-    number: int  # index of the edge among the K edges
+    row: int  # row of the edge in the covariance
     noise: float  # standard deviation of the pixels about the fit, grey levels
     height: float  # grey levels after minus before the edge
     blur: float  # standard deviation of the lens' blur, pixels
     tilt: float  # tangent of the edge's rotation in the strip
-    misfit: float  # possible error of the place from a wrong model of the edge, pixels
+    model_error: float  # possible error of the place from a wrong model of the edge, pixels
 
     @property
     def sigma(self) -> float:
@@ -161,11 +161,11 @@ class Edge(NamedTuple):
     @property
     def unit_sigma(self) -> float:
         """Standard deviation of the place for noise of one grey level, pixels."""
-        return math.sqrt(float(self.unit_covariance[self.number, self.number]))
+        return math.sqrt(float(self.unit_covariance[self.row, self.row]))
 
 
 class JudgedEdge(NamedTuple):
-    """An edge, and the reason why its place is not usable, or None."""
+    """An edge, and the reason why its place is not usable; None: the place is usable."""
 
     edge: Edge
     trouble: NotMeasuredError | None
@@ -189,17 +189,21 @@ def noise_of(image: NDArray[np.generic]) -> float:
     if height < 3 or width < 3:
         return ROUNDING
     step = max(1, math.ceil(height * width / MAX_NOISE_SAMPLE))
-    rows = image if step == 1 else np.concatenate([image[i : i + 3] for i in _blocks(height, step)])
+    rows = (
+        image
+        if step == 1
+        else np.concatenate([image[i : i + 3] for i in _block_starts(height, step)])
+    )
     levels = rows.astype(np.float64)
-    twice = levels[:-2] - 2 * levels[1:-1] + levels[2:]
+    row_differences = levels[:-2] - 2 * levels[1:-1] + levels[2:]
     if step > 1:  # rows at the border of two blocks are no neighbours
-        twice = twice[::3]
-    cross = twice[:, :-2] - 2 * twice[:, 1:-1] + twice[:, 2:]
+        row_differences = row_differences[::3]
+    differences = row_differences[:, :-2] - 2 * row_differences[:, 1:-1] + row_differences[:, 2:]
     # the squares of the coefficients sum to 36; the median of a normal magnitude is 0.6745 sigma
-    return max(float(np.median(np.abs(cross))) / (6 * 0.6745), ROUNDING)
+    return max(float(np.median(np.abs(differences))) / (6 * 0.6745), ROUNDING)
 
 
-def _blocks(height: int, step: int) -> range:
+def _block_starts(height: int, step: int) -> range:
     return range(0, height - 2, 3 * step)
 
 
@@ -215,51 +219,69 @@ def find_edges(
     ``image`` (H, W), grey levels. ``tilted``: whether edges may cross their strips at other than
     right angles, which edges of lines and circles do not.
     """
-    number = len(strips.middles)
-    fits = inside(image, strips)
+    strip_count = len(strips.middles)
+    lies_inside = find_strips_inside(image, strips)
     edges_of_strips = [
         StripEdges(
             (), NotMeasuredError(NoValueReason.OUTSIDE, "a part of it is outside of the picture")
         )
-        for _ in range(number)
+        for _ in range(strip_count)
     ]
-    crossed = np.flatnonzero(fits)
-    if not len(crossed):
+    inside_indices = np.flatnonzero(lies_inside)
+    if not len(inside_indices):
         return edges_of_strips
-    part = strips.selected(crossed)
-    samples = len(crossed) * steps_of(strips.length) * steps_of(strips.width)
+    strips_inside = strips.selected(inside_indices)
+    samples = len(inside_indices) * count_samples(strips.length) * count_samples(strips.width)
     if samples > MAX_SAMPLES or strips.width > MAX_WIDTH_PX:
         text = (
             f"{samples} pixels in strips {strips.width:.0f} wide, {MAX_SAMPLES} and "
             f"{MAX_WIDTH_PX:g} can be measured"
         )
         return [
-            StripEdges((), NotMeasuredError(NoValueReason.TOO_LARGE, text)) for _ in range(number)
+            StripEdges((), NotMeasuredError(NoValueReason.TOO_LARGE, text))
+            for _ in range(strip_count)
         ]
-    noise = noise_of(_around(image, part))
-    candidates, counts = _candidates(profiles(image, part), part, settings, noise)
-    steps = _steps(image, part, candidates, settings, noise, tilted=tilted)
-    for index, owner in enumerate(crossed.tolist()):
+    noise = noise_of(_crop(image, strips_inside))
+    candidates, candidate_counts = _find_candidates(
+        mean_profiles(image, strips_inside), strips_inside, settings, noise
+    )
+    steps = _fit_twice(image, strips_inside, candidates, settings, noise, tilted=tilted)
+    for index, owner in enumerate(inside_indices.tolist()):
         own_steps = [step for step in steps if step.owner == index]
-        crowded = sum(map(len, candidates[index : index + 1])) > len(own_steps)
-        edges_of_strips[owner] = _of_strip(
-            own_steps, settings, noise, crowded=crowded, count=counts[index]
+        has_unfitted = sum(map(len, candidates[index : index + 1])) > len(own_steps)
+        edges_of_strips[owner] = _judge_steps(
+            own_steps,
+            settings,
+            noise,
+            has_unfitted=has_unfitted,
+            candidate_count=candidate_counts[index],
         )
     return edges_of_strips
 
 
-def _of_strip(
-    steps: list[_FittedStep], settings: EdgeSettings, noise: float, *, crowded: bool, count: int
+def _judge_steps(
+    steps: list[_FittedStep],
+    settings: EdgeSettings,
+    noise: float,
+    *,
+    has_unfitted: bool,
+    candidate_count: int,
 ) -> StripEdges:
-    """Return the edges of a strip; ``count``: possible edges, of which not all may be fitted."""
-    if crowded:
+    """Return the edges of a strip from its fitted steps.
+
+    ``has_unfitted``: whether edges are too near to each other to be fitted. ``candidate_count``:
+    number of possible edges, of which only the strongest were fitted.
+    """
+    if has_unfitted:
         text = f"more than {MAX_GROUP_EDGES} edges that are too near to each other to be separated"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_STEP, text))
-    judged = [step for step in steps if wanted(step.edge, settings) or not step.settled]
+    judged = [step for step in steps if is_wanted(step.edge, settings) or not step.converged]
     too_many = None
     # if a fitted edge has too little contrast, the weaker edges have, too
-    if count > MAX_EDGES and all(abs(step.edge.height) >= settings.contrast for step in steps):
-        text = f"{count} edges in one strip, {MAX_EDGES} at most can be separated"
+    if candidate_count > MAX_EDGES and all(
+        abs(step.edge.height) >= settings.contrast for step in steps
+    ):
+        text = f"{candidate_count} edges in one strip, {MAX_EDGES} at most can be separated"
         too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
     if not judged and too_many is not None:
         return StripEdges((), too_many)
@@ -267,77 +289,83 @@ def _of_strip(
         kind = {"any": "", "rising": " from dark to light", "falling": " from light to dark"}
         text = f"no edge{kind[settings.polarity]} of {settings.contrast:g} grey levels"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_EDGE, text))
-    edges = tuple(JudgedEdge(step.edge, _trouble(step, settings, noise)) for step in judged)
+    edges = tuple(JudgedEdge(step.edge, _find_trouble(step, settings, noise)) for step in judged)
     return StripEdges(edges, too_many=too_many)
 
 
-def _around(image: NDArray[np.generic], strips: Strips | Sectors) -> NDArray[np.generic]:
-    """Return the part of the picture that contains strips."""
+def _crop(image: NDArray[np.generic], strips: Strips | Sectors) -> NDArray[np.generic]:
+    """Return the part of the picture that contains the strips."""
     reach = math.hypot(strips.length, strips.width) / 2 + 1
     low = np.floor(strips.middles.min(axis=0) - reach).astype(int).clip(0)
     high = np.ceil(strips.middles.max(axis=0) + reach).astype(int)
     return image[low[1] : high[1] + 1, low[0] : high[0] + 1]
 
 
-def _candidates(
+def _find_candidates(
     levels: Array, strips: Strips | Sectors, settings: EdgeSettings, noise: float
 ) -> tuple[list[Array], list[int]]:
-    """Return the ascending places of possible edges in each strip, from profiles (N, T).
+    """Find possible edges in profiles (N, T).
 
-    Only the strongest are returned; the second list has the number of all possible edges.
+    Return the places of each strip's strongest edges, ascending, and the number of all its edges.
     """
-    smooth = settings.smoothing
-    slopes = _slopes(levels, smooth)
+    smoothing = settings.smoothing
+    slopes = _filter_slopes(levels, smoothing)
     # The noise of a mean over the width after a Gaussian's derivative, the integral of whose square
     # is 1 / (4 sqrt(pi) smooth^3).
-    of_mean = noise / math.sqrt(max(strips.width, 1.0))
-    floor = of_mean / math.sqrt(4 * math.sqrt(math.pi) * smooth**3)
+    profile_noise = noise / math.sqrt(max(strips.width, 1.0))
+    slope_noise = profile_noise / math.sqrt(4 * math.sqrt(math.pi) * smoothing**3)
     middle = (levels.shape[1] - 1) / 2
     candidates, counts = [], []
     for row in slopes:
-        least = max(MIN_EDGE_SIGMAS * floor, 0.5 * MIN_RELATIVE_HEIGHT * float(np.abs(row).max()))
-        peaks = [(at, side) for side in (row, -row) for at in _peaks(side, least)]
+        min_slope = max(
+            MIN_EDGE_SIGMAS * slope_noise, 0.5 * MIN_RELATIVE_HEIGHT * float(np.abs(row).max())
+        )
+        peaks = [(index, side) for side in (row, -row) for index in _find_peaks(side, min_slope)]
         strongest = sorted(peaks, key=lambda peak: -peak[1][peak[0]])[:MAX_EDGES]
-        candidates.append(np.array(sorted(_peak(side, at) - middle for at, side in strongest)))
+        candidates.append(
+            np.array(sorted(_refine_peak(side, index) - middle for index, side in strongest))
+        )
         counts.append(len(peaks))
     return candidates, counts
 
 
-def _slopes(levels: Array, smooth: float) -> Array:
+def _filter_slopes(levels: Array, smoothing: float) -> Array:
     """Return profiles (N, T) filtered by a Gaussian's derivative, with constant continuation."""
-    reach = math.ceil(4 * smooth)
-    at = np.arange(-reach, reach + 1, dtype=np.float64)
-    kernel: Array = at * np.exp(-(at**2) / (2 * smooth**2))
-    kernel = kernel / float((kernel * at).sum())  # so that a ramp of 1 has the slope 1
+    reach = math.ceil(4 * smoothing)
+    offsets = np.arange(-reach, reach + 1, dtype=np.float64)
+    kernel: Array = offsets * np.exp(-(offsets**2) / (2 * smoothing**2))
+    kernel = kernel / float((kernel * offsets).sum())  # so that a ramp of 1 has the slope 1
     padded = np.pad(levels, ((0, 0), (reach, reach)), mode="edge")
-    slopes: Array = np.lib.stride_tricks.sliding_window_view(padded, len(at), axis=1) @ kernel
+    slopes: Array = np.lib.stride_tricks.sliding_window_view(padded, len(offsets), axis=1) @ kernel
     return slopes
 
 
-def _peaks(slopes: Array, least: float) -> list[int]:
-    """Return the places of peaks of a least height, whose prominence is at least half of it."""
+def _find_peaks(slopes: Array, min_height: float) -> list[int]:
+    """Return the indices of peaks with a height of ``min_height`` and half of it as prominence."""
     after, before = np.append(slopes[1:], -np.inf), np.insert(slopes[:-1], 0, -np.inf)
     peaks = []
-    for at in np.flatnonzero((slopes > before) & (slopes >= after) & (slopes >= least)).tolist():
-        higher = np.flatnonzero(slopes > slopes[at])
-        left = higher[higher < at].max(initial=-1)
-        right = higher[higher > at].min(initial=len(slopes))
+    for index in np.flatnonzero(
+        (slopes > before) & (slopes >= after) & (slopes >= min_height)
+    ).tolist():
+        higher = np.flatnonzero(slopes > slopes[index])
+        left = higher[higher < index].max(initial=-1)
+        right = higher[higher > index].min(initial=len(slopes))
         # prominence: height above the higher one of the valleys between the peak and higher peaks
         # on both sides; the end of the strip is no valley
-        valleys = [slopes[left + 1 : at + 1].min()] if left >= 0 else []
-        valleys += [slopes[at:right].min()] if right < len(slopes) else []
-        if not valleys or slopes[at] - max(valleys) >= least / 2:
-            peaks.append(at)
+        valleys = [slopes[left + 1 : index + 1].min()] if left >= 0 else []
+        valleys += [slopes[index:right].min()] if right < len(slopes) else []
+        if not valleys or slopes[index] - max(valleys) >= min_height / 2:
+            peaks.append(index)
     return peaks
 
 
-def _peak(slopes: Array, at: int) -> float:
+def _refine_peak(slopes: Array, peak: int) -> float:
     """Return the place of the maximum of a parabola through a peak and its neighbours."""
-    if not 0 < at < len(slopes) - 1:
-        return float(at)
-    before, top, after = slopes[at - 1 : at + 2]
+    if not 0 < peak < len(slopes) - 1:
+        return float(peak)
+    before, top, after = slopes[peak - 1 : peak + 2]
     bend = before - 2 * top + after
-    return at if bend >= 0 else at + 0.5 * float(before - after) / float(bend)
+    return peak if bend >= 0 else peak + 0.5 * float(before - after) / float(bend)
 
 
 class _EdgeGroup(NamedTuple):
@@ -354,13 +382,15 @@ class _FittedStep(NamedTuple):
 
     owner: int  # index of the strip
     edge: Edge
-    beside: float  # visible length of the strip on the shorter side, pixels
-    misfit: float  # RMS residual, grey levels
-    cut_off: tuple[float, float]  # shares of pixels saturated at black and at white
-    settled: bool
+    side_length: float  # distance from the edge to the nearer end of its strip, pixels
+    rms_residual: float  # grey levels
+    saturated: tuple[float, float]  # shares of pixels saturated at black and at white
+    converged: bool
 
 
-def _groups(candidates: list[Array], half: float, gaps: Array, reach: Array) -> list[_EdgeGroup]:
+def _group_candidates(
+    candidates: list[Array], half: float, gaps: Array, reach: Array
+) -> list[_EdgeGroup]:
     """Return the groups of edges; ``gaps`` and ``reach`` (N,), pixels, of each strip."""
     groups = []
     for owner, places in enumerate(candidates):
@@ -375,7 +405,7 @@ def _groups(candidates: list[Array], half: float, gaps: Array, reach: Array) -> 
     return groups
 
 
-def _steps(
+def _fit_twice(
     image: NDArray[np.generic],
     strips: Strips | Sectors,
     candidates: list[Array],
@@ -384,23 +414,23 @@ def _steps(
     *,
     tilted: bool,
 ) -> list[_FittedStep]:
-    """Return steps fitted in two passes: the first finds the blur, which sets the reach."""
-    number, half = len(candidates), strips.length / 2
-    gaps, reach = np.full(number, MAX_GROUP_GAP_PX), np.full(number, FIRST_FIT_REACH_PX)
-    blurs = np.ones(number)
-    groups = _groups(candidates, half, gaps, reach)
+    """Fit steps twice: the first fit finds the blur, which sets the reach of the second fit."""
+    strip_count, half = len(candidates), strips.length / 2
+    gaps, reach = np.full(strip_count, MAX_GROUP_GAP_PX), np.full(strip_count, FIRST_FIT_REACH_PX)
+    blurs = np.ones(strip_count)
+    groups = _group_candidates(candidates, half, gaps, reach)
     for step in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
-        if step.settled:
-            seen = _seen_blur(min(step.edge.blur, settings.most_blur))
-            gaps[step.owner] = max(gaps[step.owner], MAX_GROUP_GAP_BLURS * seen)
-            reach[step.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
+        if step.converged:
+            visible_blur = _visible_blur(min(step.edge.blur, settings.most_blur))
+            gaps[step.owner] = max(gaps[step.owner], MAX_GROUP_GAP_BLURS * visible_blur)
+            reach[step.owner] = FIT_REACH_BLURS * visible_blur + FIT_REACH_PX
             blurs[step.owner] = step.edge.blur
-    groups = _groups(candidates, half, gaps, reach)
+    groups = _group_candidates(candidates, half, gaps, reach)
     return _fit_groups(image, strips, groups, settings, noise, tilted=tilted, blurs=blurs)
 
 
-def _seen_blur(blur: float) -> float:
-    """Return the standard deviation of an edge's slope from the lens' blur and the pixels' area."""
+def _visible_blur(blur: float) -> float:
+    """Return an edge's blur in the picture: the lens' blur widened by the pixels' area."""
     return math.sqrt(blur * blur + PIXEL_VARIANCE)
 
 
@@ -420,34 +450,36 @@ def _fit_groups(
         groups_of_count = [group for group in groups if len(group.places) == count]
         owners = np.array([group.owner for group in groups_of_count])
         low, high = (np.array([group[end] for group in groups_of_count]) for end in (2, 3))
-        pixels = cut(image, strips.selected(owners), low, high)
+        pixels = cut_pixels(image, strips.selected(owners), low, high)
         if count > MAX_GROUP_EDGES:
             continue
         places = np.array([group.places for group in groups_of_count])
-        known = None if blurs is None else blurs[owners]
-        fits = fit_steps(pixels, places, tilted=tilted, blurs=known)
-        cut_off = np.zeros((len(groups_of_count), 2))
+        known_blurs = None if blurs is None else blurs[owners]
+        fits = fit_steps(pixels, places, tilted=tilted, blurs=known_blurs)
+        saturated = np.zeros((len(groups_of_count), 2))
         if blurs is not None and not settings.cut_off:
-            cut_off = _cut_off(pixels, settings)
+            saturated = _saturated_shares(pixels, settings)
             if settings.clipped is not None:
-                masks = cut(settings.clipped, strips.selected(owners), low, high)
-                cut_off[:, 1] = np.maximum(cut_off[:, 1], _part(masks.levels > 0, pixels))
-            cut_off[:, 1] = np.maximum(cut_off[:, 1], _plateaus(pixels, fits))
-        steps += _steps_of(groups_of_count, fits, pixels, cut_off, strips.length / 2, noise)
+                masks = cut_pixels(settings.clipped, strips.selected(owners), low, high)
+                saturated[:, 1] = np.maximum(
+                    saturated[:, 1], _pixel_shares(masks.levels > 0, pixels)
+                )
+            saturated[:, 1] = np.maximum(saturated[:, 1], _plateau_shares(pixels, fits))
+        steps += _as_steps(groups_of_count, fits, pixels, saturated, strips.length / 2, noise)
     return sorted(steps, key=lambda step: (step.owner, step.edge.place))
 
 
-def _steps_of(
+def _as_steps(
     groups: list[_EdgeGroup],
     fits: StepFits,
     pixels: StripPixels,
-    cut_off: Array,
+    saturated: Array,
     half: float,
     noise: float,
 ) -> list[_FittedStep]:
     counts = np.maximum(pixels.counts, 1.0)
     noises = np.maximum(np.sqrt(fits.variance), ROUNDING)
-    covariance = fits.unit_covariance()[:, : fits.steps + 1, : fits.steps + 1]
+    covariance = fits.unit_covariance()[:, : fits.step_count + 1, : fits.step_count + 1]
     steps = []
     for i, group in enumerate(groups):
         shared = covariance[i]
@@ -462,131 +494,143 @@ def _steps_of(
                 float(fits.tilts[i]),
                 0.0,
             )
-            edge = edge._replace(misfit=_misfit(edge, noise))
+            edge = edge._replace(model_error=_model_error(edge, noise))
             steps.append(
                 _FittedStep(
                     group.owner,
                     edge,
                     half - abs(place),
                     math.sqrt(float(fits.cost[i] / counts[i])),
-                    (float(cut_off[i, 0]), float(cut_off[i, 1])),
-                    bool(fits.settled[i]) and group.low <= place <= group.high,
+                    (float(saturated[i, 0]), float(saturated[i, 1])),
+                    bool(fits.converged[i]) and group.low <= place <= group.high,
                 )
             )
     return steps
 
 
-def _part(mask: NDArray[np.bool_], pixels: StripPixels) -> Array:
+def _pixel_shares(mask: NDArray[np.bool_], pixels: StripPixels) -> Array:
     """Return the share (N,) of each strip's pixels in a mask (N, P)."""
-    part: Array = (mask * pixels.weights).sum(axis=1) / np.maximum(pixels.counts, 1.0)
-    return part
+    shares: Array = (mask * pixels.weights).sum(axis=1) / np.maximum(pixels.counts, 1.0)
+    return shares
 
 
-def _cut_off(pixels: StripPixels, settings: EdgeSettings) -> Array:
+def _saturated_shares(pixels: StripPixels, settings: EdgeSettings) -> Array:
     """Return the shares (N, 2) of the pixels saturated at black and at white."""
     black, white = pixels.levels <= settings.black, pixels.levels >= settings.white
-    return np.column_stack([_part(black, pixels), _part(white, pixels)])
+    return np.column_stack([_pixel_shares(black, pixels), _pixel_shares(white, pixels)])
 
 
-def _plateaus(pixels: StripPixels, fits: StepFits) -> Array:
-    """Return the share (N,) of the pixels at the largest level if it is a saturation level, else 0.
+def _plateau_shares(pixels: StripPixels, fits: StepFits) -> Array:
+    """Return the share (N,) of pixels at the largest level, 0 if this level is not saturation.
 
     White may be below the largest value of the pixels' type. Black is not tested in this way: dark
     pixels may be equal without saturation, since they have no photon noise.
     """
     levels = np.where(pixels.weights > 0, pixels.levels, -np.inf)
-    parts = _part(levels == levels.max(axis=1, keepdims=True), pixels)
-    for i in np.flatnonzero(parts > MAX_SATURATED_SHARE).tolist():
+    shares = _pixel_shares(levels == levels.max(axis=1, keepdims=True), pixels)
+    for i in np.flatnonzero(shares > MAX_SATURATED_SHARE).tolist():
         if not _is_plateau(pixels.selected(np.array([i])), fits, i):
-            parts[i] = 0.0
-    return np.where(parts > MAX_SATURATED_SHARE, parts, 0.0)
+            shares[i] = 0.0
+    return np.where(shares > MAX_SATURATED_SHARE, shares, 0.0)
 
 
 def _is_plateau(pixels: StripPixels, fits: StepFits, strip: int) -> bool:
-    """Return True if the dark side's noise does not explain so many pixels at the largest level."""
+    """Return True if so many pixels at the largest level cannot come from the dark side's noise."""
     used = pixels.weights[0] > 0
-    levels, beside = pixels.levels[0][used], pixels.beside[0][used]
-    along = pixels.along[0][used] - float(fits.tilts[strip]) * beside
+    levels, across = pixels.levels[0][used], pixels.across[0][used]
+    along = pixels.along[0][used] - float(fits.tilts[strip]) * across
     order = np.argsort(fits.places[strip])
     places = fits.places[strip][order]
     heights = np.cumsum([0.0, *fits.heights[strip][order]])
-    distance = 2 * _seen_blur(float(fits.blurs[strip])) + 0.5
-    flat = np.abs(along[:, None] - places).min(axis=1) > distance
+    distance = 2 * _visible_blur(float(fits.blurs[strip])) + 0.5
+    is_flat = np.abs(along[:, None] - places).min(axis=1) > distance
     level = np.searchsorted(places, along)
-    dark, bright = (flat & (level == extreme) for extreme in (heights.argmin(), heights.argmax()))
-    noise = MIN_BRIGHT_NOISE_SHARE * _noise_in_steps(levels[dark], along[dark], beside[dark])
+    dark, bright = (
+        is_flat & (level == extreme) for extreme in (heights.argmin(), heights.argmax())
+    )
+    noise = MIN_BRIGHT_NOISE_SHARE * _noise_in_steps(levels[dark], along[dark], across[dark])
     values, counts = np.unique(levels[bright], return_counts=True)
     if noise < MIN_BRIGHT_NOISE_SHARE * MIN_UNSATURATED_NOISE or not len(values):
         return False
-    most = int(counts[-1])
-    if values[-1] < levels.max() or most < counts.max():  # saturation has most pixels
+    top_count = int(counts[-1])
+    if values[-1] < levels.max() or top_count < counts.max():  # saturation has most pixels
         return False
     # With normal noise, the share of pixels at the largest value gives the mean of the level, which
     # is the middle of this value if the share is nearly 1.
     special = load("scipy.special")
-    part = min(most / len(levels[bright]), float(special.ndtr(0.5 / noise)))
-    above = float(special.ndtr(special.ndtri(part) - 1 / noise)) / part
-    return most * math.log1p(-above) < math.log(MAX_PLATEAU_CHANCE)
+    share = min(top_count / len(levels[bright]), float(special.ndtr(0.5 / noise)))
+    share_above = float(special.ndtr(special.ndtri(share) - 1 / noise)) / share
+    return top_count * math.log1p(-share_above) < math.log(MAX_PLATEAU_CHANCE)
 
 
-def _noise_in_steps(levels: Array, along: Array, beside: Array) -> float:
-    """Return the standard deviation of pixels about a plane, without rounding, in steps.
+def _noise_in_steps(levels: Array, along: Array, across: Array) -> float:
+    """Return the standard deviation of pixels from a fitted plane, in steps, less rounding.
 
     A step is the least difference of two levels: 16 for levels of 12 bits in 16.
     """
     values = np.unique(levels)
     if len(values) < 2 or len(levels) < 8:
         return 0.0
-    plane = np.column_stack([np.ones(len(levels)), along, beside])
-    residuals = levels - plane @ np.linalg.lstsq(plane, levels, rcond=None)[0]
-    twice = np.diff(residuals, 2)  # differences of neighbours, since JPEG's errors are correlated
+    design = np.column_stack([np.ones(len(levels)), along, across])
+    residuals = levels - design @ np.linalg.lstsq(design, levels, rcond=None)[0]
+    differences = np.diff(residuals, 2)  # of neighbours: JPEG's errors are correlated
     variance = min(
-        float(residuals @ residuals) / (len(levels) - 3), float(twice @ twice) / (6 * len(twice))
+        float(residuals @ residuals) / (len(levels) - 3),
+        float(differences @ differences) / (6 * len(differences)),
     )
     return math.sqrt(max(variance / float(np.diff(values).min()) ** 2 - ROUNDING**2, 0.0))
 
 
-def _misfit(edge: Edge, noise: float) -> float:
-    """Return the residuals beyond the noise, converted to pixels by the edge's largest slope."""
-    beyond = edge.noise**2 - noise**2
-    steepest = abs(edge.height) / (math.sqrt(2 * math.pi) * _seen_blur(edge.blur))
+def _model_error(edge: Edge, noise: float) -> float:
+    """Return the place error, pixels, that explains the residuals that exceed the noise."""
+    excess_variance = edge.noise**2 - noise**2
+    steepest = abs(edge.height) / (math.sqrt(2 * math.pi) * _visible_blur(edge.blur))
     if edge.noise < MIN_MISFIT_NOISES * noise or steepest == 0.0:
         return 0.0
-    return math.sqrt(beyond) / steepest
+    return math.sqrt(excess_variance) / steepest
 
 
-def _trouble(step: _FittedStep, settings: EdgeSettings, noise: float) -> NotMeasuredError | None:
-    """Return the reason why a step is no usable edge, or None."""
-    edge, (black, bright) = step.edge, step.cut_off
+def _find_trouble(
+    step: _FittedStep, settings: EdgeSettings, noise: float
+) -> NotMeasuredError | None:
+    """Return the reason why a step is not a usable edge; None if it is usable."""
+    edge, (black, white) = step.edge, step.saturated
     height = abs(edge.height)
-    if step.settled and edge.blur > settings.most_blur:
+    if step.converged and edge.blur > settings.most_blur:
         text = f"the edge is blurred by {edge.blur:.1f} px, {settings.most_blur:g} px are allowed"
         return NotMeasuredError(NoValueReason.BLURRED, text)
-    if step.beside < MIN_SIDE_BLURS * _seen_blur(min(edge.blur, settings.most_blur)) + 0.5:
-        text = f"the edge is {max(step.beside, 0.0):.1f} px from the end of its region"
+    if step.side_length < MIN_SIDE_BLURS * _visible_blur(min(edge.blur, settings.most_blur)) + 0.5:
+        text = f"the edge is {max(step.side_length, 0.0):.1f} px from the end of its region"
         return NotMeasuredError(NoValueReason.AT_BORDER, text)
-    if not step.settled:
-        return NotMeasuredError(NoValueReason.NO_STEP, "the grey levels are none of a blurred step")
-    if max(black, bright) > MAX_SATURATED_SHARE and not settings.cut_off:
-        end, part = ("black", black) if black > bright else ("white", bright)
-        text = f"{100 * part:.0f} % of the pixels beside the edge are {end} to the limit"
+    if not step.converged:
+        return NotMeasuredError(
+            NoValueReason.NO_STEP, "the grey levels are not those of a blurred step"
+        )
+    if max(black, white) > MAX_SATURATED_SHARE and not settings.cut_off:
+        limit, share = ("black", black) if black > white else ("white", white)
+        text = f"{100 * share:.0f} % of the pixels beside the edge are {limit} to the limit"
         return NotMeasuredError(NoValueReason.SATURATED, text)
-    if step.misfit > ALLOWED_MISFIT_NOISES * noise and step.misfit > MAX_RELATIVE_MISFIT * height:
-        text = f"the grey levels are {step.misfit:.1f} from a step of {height:.0f}"
+    if (
+        step.rms_residual > ALLOWED_MISFIT_NOISES * noise
+        and step.rms_residual > MAX_RELATIVE_MISFIT * height
+    ):
+        text = f"the grey levels are {step.rms_residual:.1f} from a step of {height:.0f}"
         return NotMeasuredError(NoValueReason.NO_STEP, text)
-    if edge.sigma > min(MAX_SIGMA_PX, 0.5 * _seen_blur(edge.blur)):
+    if edge.sigma > min(MAX_SIGMA_PX, 0.5 * _visible_blur(edge.blur)):
         text = f"noise leaves the edge open by {edge.sigma:.2f} px (one standard deviation)"
         return NotMeasuredError(NoValueReason.NOISY, text)
     return None
 
 
-def wanted(edge: Edge, settings: EdgeSettings) -> bool:
+def is_wanted(edge: Edge, settings: EdgeSettings) -> bool:
     """Return True if an edge has the wanted contrast and polarity."""
-    rises = settings.polarity == "any" or (edge.height > 0) == (settings.polarity == "rising")
-    return rises and abs(edge.height) >= settings.contrast
+    has_polarity = settings.polarity == "any" or (edge.height > 0) == (
+        settings.polarity == "rising"
+    )
+    return has_polarity and abs(edge.height) >= settings.contrast
 
 
-def choose(strip_edges: StripEdges, which: Choice) -> Edge:
+def choose_edge(strip_edges: StripEdges, which: Choice) -> Edge:
     """Return the chosen edge; raise NotMeasuredError if there is none, or no clear choice."""
     if strip_edges.trouble is not None:
         raise strip_edges.trouble
@@ -596,14 +640,14 @@ def choose(strip_edges: StripEdges, which: Choice) -> Edge:
     if which == "single" and len(edges) > 1:
         raise _several_edges_error(edges, "one was")
     if which == "strongest":
-        return sound(max(edges, key=lambda judged_edge: abs(judged_edge.edge.height)))
+        return require_usable(max(edges, key=lambda judged_edge: abs(judged_edge.edge.height)))
     if which == "nearest":
-        return sound(min(edges, key=lambda judged_edge: abs(judged_edge.edge.place)))
-    return sound(edges[-1 if which == "last" else 0])
+        return require_usable(min(edges, key=lambda judged_edge: abs(judged_edge.edge.place)))
+    return require_usable(edges[-1 if which == "last" else 0])
 
 
 def choose_pair(strip_edges: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
-    """Return the two edges of a bar; raise NotMeasuredError as :func:`choose`."""
+    """Return the two edges of a bar; raise NotMeasuredError as :func:`choose_edge` does."""
     if strip_edges.trouble is not None:
         raise strip_edges.trouble
     if strip_edges.too_many is not None:
@@ -614,7 +658,7 @@ def choose_pair(strip_edges: StripEdges, which: PairChoice) -> tuple[Edge, Edge]
         text = f"only one edge where two were expected, {place:.1f} px from the middle"
         raise NotMeasuredError(NoValueReason.NO_EDGE, text)
     if which == "outermost":
-        return sound(edges[0]), sound(edges[-1])
+        return require_usable(edges[0]), require_usable(edges[-1])
     if which == "single" and len(edges) > 2:
         raise _several_edges_error(edges, "two were")
     pairs = [
@@ -630,11 +674,11 @@ def choose_pair(strip_edges: StripEdges, which: PairChoice) -> tuple[Edge, Edge]
     pair = pairs[-1 if which == "last" else 0]
     if which == "strongest":
         pair = max(pairs, key=lambda two: min(abs(judged_edge.edge.height) for judged_edge in two))
-    return sound(pair[0]), sound(pair[1])
+    return require_usable(pair[0]), require_usable(pair[1])
 
 
-def sound(judged_edge: JudgedEdge) -> Edge:
-    """Return the edge if its place is usable; else raise NotMeasuredError."""
+def require_usable(judged_edge: JudgedEdge) -> Edge:
+    """Return the edge; raise NotMeasuredError if its place is not usable."""
     if judged_edge.trouble is not None:
         raise judged_edge.trouble
     return judged_edge.edge

@@ -1,6 +1,7 @@
 """Find edges, lines and circles in a picture's regions.
 
-Regions and edges are in pixels; a plane turns edges into points, lines and circles.
+Regions and edges are in pixels. ``values`` maps the edges to a plane, and fits points, lines and
+circles there.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from smartcam.inspection._measure.edges import (
     FIT_REACH_PX,
     PIXEL_VARIANCE,
     Edge,
-    choose,
+    choose_edge,
     choose_pair,
     find_edges,
 )
@@ -38,11 +39,11 @@ MIN_FOUND_SHARE = 0.5
 """Least share of the strips of a line or a circle that must have an edge."""
 
 OWN_NOISE_FACTOR = 2.0
-"""Ratio of an edge's noise to the median noise, above which its own noise is used."""
+"""Ratio of an edge's noise to the median noise, above which the edge's own noise is used."""
 
 
 class FoundPoint(NamedTuple):
-    """An edge where it crosses the middle of its strip."""
+    """An edge at the point where it crosses the middle line of its strip."""
 
     strip: Strips  # a single strip
     edge: Edge
@@ -50,32 +51,32 @@ class FoundPoint(NamedTuple):
     @property
     def pixel(self) -> Array:
         """Place in the picture, (2,)."""
-        at: Array = self.strip.points(np.array([self.edge.place]), np.zeros(1))[0]
-        return at
+        point: Array = self.strip.points(np.array([self.edge.place]), np.zeros(1))[0]
+        return point
 
 
-class FoundShape(NamedTuple):
+class CurveEdges(NamedTuple):
     """Edges of a line or a circle, in pixels."""
 
     edges: Edges
     troubles: tuple[NotMeasuredError, ...]  # errors of the strips without an edge
     blur: float  # median standard deviation of the edges' slopes, pixels
-    misfit: float  # possible common error of all edges, pixels
-    kept: NDArray[np.bool_] | None = None  # (N,), mask of inliers; None: not known yet
+    model_error: float  # possible common error of all edges from a wrong model, pixels
+    inliers: NDArray[np.bool_] | None = None  # (N,), mask of the edges; None: not known yet
 
 
 def strip_between(start: Array, end: Array, width: float) -> Strips:
     """Return the strip between two points."""
-    ahead = end - start
-    length = float(np.hypot(*ahead))
-    return Strips((start + end)[None] / 2, ahead[None] / length, length, width)
+    vector = end - start
+    length = float(np.hypot(*vector))
+    return Strips((start + end)[None] / 2, vector[None] / length, length, width)
 
 
 def find_point(image: Image, strip: Strips, settings: EdgeSettings, which: Choice) -> FoundPoint:
     """Return the edge that crosses a strip."""
     tilted = strip.width >= MIN_TILT_WIDTH_PX
     edges = find_edges(image, strip, settings, tilted=tilted)[0]
-    return FoundPoint(strip, choose(edges, which))
+    return FoundPoint(strip, choose_edge(edges, which))
 
 
 def find_pair(
@@ -97,29 +98,33 @@ def find_line(
     count: int,
     settings: EdgeSettings,
     which: Choice,
-) -> FoundShape:
+) -> CurveEdges:
     """Return the edges of a line near the line from ``start`` to ``end``.
 
     Strips of ``search`` pixels cross the line from its left to its right side.
     """
-    parts = (np.arange(count) + 0.5) / count
-    strips = _across(start, end - start, parts, search, width)
-    first = _collected(image, strips, settings, which)
-    ahead = end - start
-    line = fit_line(first.edges, ahead).shape
+    fractions = (np.arange(count) + 0.5) / count
+    strips = _strips_across(start, end - start, fractions, search, width)
+    first = _collect_edges(image, strips, settings, which)
+    direction = end - start
+    line = fit_line(first.edges, direction).curve
     # strips again, at right angles to the found line, so that edges are not tilted
     begin, stop = (
-        line.at + ((end_point - line.at) @ line.direction) * line.direction
+        line.middle + ((end_point - line.middle) @ line.direction) * line.direction
         for end_point in (start, end)
     )
-    strips = _across(begin, stop - begin, parts, min(search, _short(first)), width)
-    return _collected(image, strips, settings, "nearest")
+    strips = _strips_across(
+        begin, stop - begin, fractions, min(search, _fit_strip_length(first)), width
+    )
+    return _collect_edges(image, strips, settings, "nearest")
 
 
-def _across(start: Array, along: Array, parts: Array, search: float, width: float) -> Strips:
-    direction = np.array([-along[1], along[0]]) / np.hypot(*along)
-    middles = start + parts[:, None] * along
-    return Strips(middles, np.tile(direction, (len(parts), 1)), search, width)
+def _strips_across(
+    start: Array, vector: Array, fractions: Array, search: float, width: float
+) -> Strips:
+    direction = np.array([-vector[1], vector[0]]) / np.hypot(*vector)
+    middles = start + fractions[:, None] * vector
+    return Strips(middles, np.tile(direction, (len(fractions), 1)), search, width)
 
 
 def find_circle(
@@ -133,7 +138,7 @@ def find_circle(
     count: int,
     settings: EdgeSettings,
     which: Choice,
-) -> FoundShape:
+) -> CurveEdges:
     """Return the edges of a circle near the given circle.
 
     Strips of ``search`` pixels cross the circle from inside to outside; ``arc``: angles that limit
@@ -141,56 +146,60 @@ def find_circle(
     """
     angles = arc[0] + (np.arange(count) + 0.5) / count * (arc[1] - arc[0])
     strips = Sectors(centre, radius, angles, search, width)
-    first = _collected(image, strips, settings, which)
-    circle = fit_circle(first.edges).shape
+    first = _collect_edges(image, strips, settings, which)
+    circle = fit_circle(first.edges).curve
     radial = strips.middles - circle.centre  # places relative to the better centre
     angles = np.arctan2(radial[:, 1], radial[:, 0])
     width *= min(circle.radius / radius, 1.0)
-    strips = Sectors(circle.centre, circle.radius, angles, min(search, _short(first)), width)
-    return _collected(image, strips, settings, "nearest")
+    strips = Sectors(
+        circle.centre, circle.radius, angles, min(search, _fit_strip_length(first)), width
+    )
+    return _collect_edges(image, strips, settings, "nearest")
 
 
-def _collected(
+def _collect_edges(
     image: Image, strips: Strips | Sectors, settings: EdgeSettings, which: Choice
-) -> FoundShape:
+) -> CurveEdges:
     """Return the chosen edge of each strip; raise NotMeasuredError if too few strips have one."""
-    owners, edges, troubles = [], [], []
-    for owner, strip_edges in enumerate(find_edges(image, strips, settings)):
+    strip_indices, edges, troubles = [], [], []
+    for strip_index, strip_edges in enumerate(find_edges(image, strips, settings)):
         try:
-            edges.append(choose(strip_edges, which))
+            edges.append(choose_edge(strip_edges, which))
         except NotMeasuredError as trouble:
             troubles.append(trouble)
         else:
-            owners.append(owner)
-    number = len(edges) + len(troubles)
-    if len(edges) < MIN_FOUND_SHARE * number:
-        raise _too_few_error(troubles, number)
+            strip_indices.append(strip_index)
+    strip_count = len(edges) + len(troubles)
+    if len(edges) < MIN_FOUND_SHARE * strip_count:
+        raise _too_few_error(troubles, strip_count)
     places = np.array([edge.place for edge in edges])
     noises = np.array([edge.noise for edge in edges])
     noise = float(np.median(noises))
     noises = np.where(noises > OWN_NOISE_FACTOR * noise, noises, noise)
     blur = math.sqrt(float(np.median([edge.blur for edge in edges])) ** 2 + PIXEL_VARIANCE)
-    strips_used, middle = strips.selected(np.array(owners)), np.zeros(len(owners))
+    strips_used, middle = strips.selected(np.array(strip_indices)), np.zeros(len(strip_indices))
     if isinstance(strips, Sectors):
         # blur moves the rim of a disc inwards by s^2 / (2 r)
         places = places + blur**2 / (2 * (strips.radius + places))
-    unit = np.array([edge.unit_sigma for edge in edges])
-    seen = Edges(
-        strips_used.points(places, middle), np.array(strips_used.ahead(middle)), unit * noises
+    unit_sigmas = np.array([edge.unit_sigma for edge in edges])
+    curve_edges = Edges(
+        strips_used.points(places, middle),
+        np.array(strips_used.directions_at(middle)),
+        unit_sigmas * noises,
     )
-    misfit = float(np.median([edge.misfit for edge in edges]))
-    return FoundShape(seen, tuple(troubles), blur, misfit)
+    model_error = float(np.median([edge.model_error for edge in edges]))
+    return CurveEdges(curve_edges, tuple(troubles), blur, model_error)
 
 
-def _too_few_error(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
-    """Return the error for a line or a circle with too few strips with an edge."""
-    kinds = [trouble.why for trouble in troubles]
-    most = max(kinds, key=kinds.count)
-    example = next(trouble for trouble in troubles if trouble.why is most)
-    text = f"{len(troubles)} of {number} strips have no edge: {example.text}"
-    return NotMeasuredError(most, text)
+def _too_few_error(troubles: list[NotMeasuredError], strip_count: int) -> NotMeasuredError:
+    """Return the error for a line or a circle of which too few strips have an edge."""
+    reasons = [trouble.why for trouble in troubles]
+    commonest = max(reasons, key=reasons.count)
+    example = next(trouble for trouble in troubles if trouble.why is commonest)
+    text = f"{len(troubles)} of {strip_count} strips have no edge: {example.text}"
+    return NotMeasuredError(commonest, text)
 
 
-def _short(shape: FoundShape) -> float:
-    """Return the length of a strip that contains an edge and both sides, pixels."""
-    return 2 * (FIT_REACH_BLURS * shape.blur + FIT_REACH_PX)
+def _fit_strip_length(found: CurveEdges) -> float:
+    """Return the length of a strip that is just long enough to fit an edge, pixels."""
+    return 2 * (FIT_REACH_BLURS * found.blur + FIT_REACH_PX)

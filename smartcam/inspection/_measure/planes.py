@@ -1,12 +1,12 @@
 """Define the planes in which lengths are measured: the picture, in pixels, or a calibrated plane.
 
 Edges are mapped to the plane, and lengths are measured in it, in millimetres for a calibrated
-plane. So the camera's tilt and, with a lens in the calibration, its distortion do not change lines
-or lengths.
+plane. So the camera's tilt does not change lines or lengths. Nor does the lens' distortion if the
+calibration has a lens.
 
-A calibration has errors that are common to all edges of a picture. They are independent components,
-each of one standard deviation; the effect of a component on a result is the difference between maps
-with and without it.
+A calibration has errors that are common to all edges of a picture. They are described by
+independent components, each with the size of one standard deviation. A component's effect on a
+result is the difference between the result with and without this component in the map.
 """
 
 from __future__ import annotations
@@ -39,63 +39,63 @@ class Plane(NamedTuple):
     unit: str  # "px" or "mm"
     # function from pixels (N, 2) to points of the plane (N, 2)
     map: Callable[[Array], Array]
-    # maps with one component of the calibration's error each
+    # maps, each of which includes one component of the calibration's error
     variants: tuple[Callable[[Array], Array], ...] = ()
     # description of errors that are unknown
     remark: str = ""
 
-    def points(self, pixels: Array) -> Array:
+    def map_points(self, pixels: Array) -> Array:
         """Map pixels (N, 2) to the plane; raise NotMeasuredError outside of the calibration."""
         try:
             return self.map(pixels)
         except CalibrationError as exc:
             raise NotMeasuredError(NoValueReason.OFF_CALIBRATION, str(exc)) from exc
 
-    def slopes(self, pixels: Array) -> Array:
-        """Return the derivatives (N, 2, 2) of points by pixels."""
+    def jacobians(self, pixels: Array) -> Array:
+        """Return the derivatives (N, 2, 2) of the plane's points by the pixels."""
         ends = [
-            (self.points(pixels + step) - self.points(pixels - step)) / (2 * STEP_PX)
+            (self.map_points(pixels + step) - self.map_points(pixels - step)) / (2 * STEP_PX)
             for step in STEP_PX * np.eye(2)
         ]
         return np.stack(ends, axis=2)
 
-    def edges(self, edges: Edges) -> Edges:
+    def map_edges(self, edges: Edges) -> Edges:
         """Map edges of the picture to the plane."""
-        slopes = self.slopes(edges.points)
+        jacobians = self.jacobians(edges.points)
         # an edge has the direction t; a shift by s along its normal n moves the mapped edge by s
         # |det J| / |J t| along the mapped normal
-        turned = edges.normals[:, ::-1] * [-1.0, 1.0]
-        lines = np.einsum("nij,nj->ni", slopes, turned)
-        lengths = np.linalg.norm(lines, axis=1)
-        normals = lines[:, ::-1] * [1.0, -1.0] / lengths[:, None]
-        ahead = np.einsum("nij,nj->ni", slopes, edges.normals)
-        normals *= np.sign((normals * ahead).sum(axis=1))[:, None]
-        sigmas = edges.sigmas * np.abs(np.linalg.det(slopes)) / lengths
-        return Edges(self.points(edges.points), normals, sigmas)
+        tangents = edges.normals[:, ::-1] * [-1.0, 1.0]
+        mapped_tangents = np.einsum("nij,nj->ni", jacobians, tangents)
+        lengths = np.linalg.norm(mapped_tangents, axis=1)
+        normals = mapped_tangents[:, ::-1] * [1.0, -1.0] / lengths[:, None]
+        mapped_normals = np.einsum("nij,nj->ni", jacobians, edges.normals)
+        normals *= np.sign((normals * mapped_normals).sum(axis=1))[:, None]
+        sigmas = edges.sigmas * np.abs(np.linalg.det(jacobians)) / lengths
+        return Edges(self.map_points(edges.points), normals, sigmas)
 
 
 PIXELS = Plane("px", lambda points: points)
 """The plane of the picture's pixels."""
 
 
-def picture_of(calibration: Any) -> Plane:
+def picture_plane(calibration: Any) -> Plane:
     """Return the picture as the plane, without distortion if the lens is known."""
     camera = getattr(calibration, "camera", None)
     return PIXELS if camera is None else Plane("px", camera.undistort)
 
 
-def robot_plane_of(calibration: Any) -> Plane:
+def robot_plane(calibration: Any) -> Plane:
     """Return the plane of a calibration in the robot's x and y, in millimetres.
 
     The plane must be nearly level, so that the robot's z follows from x and y.
     """
-    return plane_of(calibration, robot=True)
+    return measuring_plane(calibration, in_robot_axes=True)
 
 
-def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
+def measuring_plane(calibration: Any, *, in_robot_axes: bool = False) -> Plane:
     """Return the plane of a calibration, in millimetres.
 
-    ``robot``: whether the axes are the robot's x and y; else they lie in the plane.
+    ``in_robot_axes``: whether the axes are the robot's x and y; else they lie in the plane.
 
     ``calibration``: a :class:`~smartcam.calibration.PlaneCalibration` of pixels or a
     :class:`~smartcam.calibration.SheetCalibration`; a lens alone has no scale.
@@ -105,7 +105,9 @@ def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
     """
     kind = getattr(calibration, "kind", None)
     if kind == "plane":
-        return _with_variants(calibration, calibration, _plane_variants(calibration), robot=robot)
+        return _with_variants(
+            calibration, calibration, _plane_variants(calibration), in_robot_axes=in_robot_axes
+        )
     if kind == "sheet":
         variants = [
             dataclasses.replace(calibration, plane=variant)
@@ -114,7 +116,7 @@ def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
             dataclasses.replace(calibration, sheet=sheet)
             for sheet in (*_view_variants(calibration.sheet), *calibration.lens_planes)
         ]
-        return _with_variants(calibration, calibration.plane, variants, robot=robot)
+        return _with_variants(calibration, calibration.plane, variants, in_robot_axes=in_robot_axes)
     raise ConfigurationError(
         "measure: calibration: expected one of a plane, with or without a lens, as fit_plane and "
         f"calibrate_sheet make it, got {kind or type(calibration).__name__}: it does not say how "
@@ -122,24 +124,26 @@ def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
     )
 
 
-def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: bool) -> Plane:
-    axes = np.eye(3)[:, :2] if robot else plane.rotation[:, :2]
+def _with_variants(
+    calibration: Any, plane: Any, variants: list[Any], *, in_robot_axes: bool
+) -> Plane:
+    axes = np.eye(3)[:, :2] if in_robot_axes else plane.rotation[:, :2]
     middle = np.asarray(plane.robot_points, dtype=np.float64).mean(axis=0)
-    origin = np.zeros(3) if robot else middle
+    origin = np.zeros(3) if in_robot_axes else middle
     flips_v = calibration.kind == "plane" and calibration.y_down
 
-    def mapped(variant: Any) -> Callable[[Array], Array]:
+    def mapping(variant: Any) -> Callable[[Array], Array]:
         def points(pixels: Array) -> Array:
-            seen = pixels * [1.0, -1.0] if flips_v else pixels
-            flat: Array = MM * (variant.transform(seen) - origin) @ axes
-            return flat
+            camera_points = pixels * [1.0, -1.0] if flips_v else pixels
+            plane_points: Array = MM * (variant.transform(camera_points) - origin) @ axes
+            return plane_points
 
         return points
 
     return Plane(
         "mm",
-        mapped(calibration),
-        tuple(mapped(variant) for variant in variants),
+        mapping(calibration),
+        tuple(mapping(variant) for variant in variants),
         _remark(calibration, plane),
     )
 
@@ -155,9 +159,9 @@ def _remark(calibration: Any, plane: Any) -> str:
 def _plane_variants(plane: Any) -> list[Any]:
     if plane.touch_sigma is None:
         return []
-    matrix = plane.place.inward(plane.matrix)
+    matrix = plane.place.to_normalized(plane.matrix)
     return [
-        dataclasses.replace(plane, matrix=plane.place.outward(matrix + part.reshape(4, 3)))
+        dataclasses.replace(plane, matrix=plane.place.to_original(matrix + part.reshape(4, 3)))
         for part in independent_parts(plane.unit_covariance * plane.touch_sigma**2)
     ]
 

@@ -13,15 +13,15 @@ from smartcam.frames._inside import Drawing
 from smartcam.inspection._finding import Finding
 from smartcam.inspection._measure.edges import MAX_WIDTH_PX, EdgeSettings
 from smartcam.inspection._measure.features import (
+    CurveEdges,
     FoundPoint,
-    FoundShape,
     find_circle,
     find_line,
     find_pair,
     find_point,
     strip_between,
 )
-from smartcam.inspection._measure.planes import PIXELS, Plane, picture_of, plane_of
+from smartcam.inspection._measure.planes import PIXELS, Plane, measuring_plane, picture_plane
 from smartcam.inspection._measure.settings import (
     MAX_LENGTH_PX,
     Across,
@@ -40,13 +40,13 @@ from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReaso
 from smartcam.inspection._measure.values import (
     Value,
     angle,
-    circle_of,
     direction,
     distance,
-    line_of,
-    point_of,
+    fit_circle_in_plane,
+    fit_line_in_plane,
+    measure_with_calibration,
+    point_in_plane,
     width,
-    with_calibration,
 )
 from smartcam.inspection._places import PixelPose
 from smartcam.inspection._tool import Tool
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames._inside import Role
     from smartcam.geometry._inside import Array
-    from smartcam.inspection._measure.fits import Circle, Line, ShapeFit
+    from smartcam.inspection._measure.fits import Circle, CurveFit, Line
     from smartcam.inspection._measure.strips import Strips
     from smartcam.inspection._measure.values import Feature
     from smartcam.inspection._tool import ToolSetup, View
@@ -103,14 +103,15 @@ class Measure(Tool[MeasureSettings]):
 
     def __init__(self, settings: MeasureSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
-        load("scipy.special", "measure needs")  # spares the first picture the wait
+        # loaded now, since the first picture should not wait for it
+        load("scipy.special", "measure needs")
         calibration, tolerance = setup.calibration, settings.tolerance
         unit = settings.unit
         if unit is None and tolerance is not None and tolerance.unit != "deg":
             unit = "mm" if tolerance.unit == "mm" else "px"
         if unit is None:
             unit = "mm" if getattr(calibration, "kind", None) in {"plane", "sheet"} else "px"
-        self._plane = plane_of(calibration) if unit == "mm" else picture_of(calibration)
+        self._plane = measuring_plane(calibration) if unit == "mm" else picture_plane(calibration)
         self._unit = "deg" if settings.kind in {"line", "angle"} else self._plane.unit
 
     @property
@@ -127,20 +128,20 @@ class Measure(Tool[MeasureSettings]):
 
     def inspect(self, view: View) -> Finding:
         """Return the measured value with its verdict."""
-        look = _EdgeFinder(view, self._plane)
+        finder = _EdgeFinder(view, self._plane)
         search = getattr(self.settings, self.settings.kind)
         try:
-            measured = _MEASURES[self.settings.kind](look, search)
+            measured = _MEASURES[self.settings.kind](finder, search)
         except NotMeasuredError as trouble:
             return Finding(
                 ok=False,
                 reason=f"{trouble.why.value}: {trouble.text}",
-                drawings=look.drawn("", wrong=True),
-                details=look.details(None, self._unit, trouble.why),
+                drawings=finder.drawings("", wrong=True),
+                details=finder.details(None, self._unit, trouble.why),
             )
-        return self._judged(look, measured)
+        return self._judge(finder, measured)
 
-    def _judged(self, look: _EdgeFinder, measured: _MeasuredValue) -> Finding:
+    def _judge(self, finder: _EdgeFinder, measured: _MeasuredValue) -> Finding:
         settings, si = self.settings, SI_PER_UNIT[self._unit]
         value = (
             Value(*(number / si for number in measured.value))
@@ -156,9 +157,9 @@ class Measure(Tool[MeasureSettings]):
             ok=not reason,
             reason=reason,
             values={name: value.value * si, "sigma": value.sigma * si, **measured.values},
-            drawings=look.drawn(text, wrong=bool(reason)),
+            drawings=finder.drawings(text, wrong=bool(reason)),
             reference=measured.reference,
-            details=look.details(value, self._unit, None),
+            details=finder.details(value, self._unit, None),
         )
 
 
@@ -178,16 +179,16 @@ class _EdgeFinder:
         self.reference = view.reference
         self._image = view.picture.levels
         self._top = 2**view.picture.depth - 1
-        self._ends = view.picture.ends
+        self._saturation_levels = view.picture.ends
         self._clipped = view.picture.clipped
         self._regions: list[Array] = []  # corners of each region
         self._edges: list[Array] = []
         self._left_out: list[Array] = []
         self._missed: list[str] = []
-        self._shapes: list[Array] = []
+        self._curves: list[Array] = []
 
-    def at(self, places: object) -> Array:
-        """Return coordinates of the settings in the picture's pixels."""
+    def to_picture(self, places: object) -> Array:
+        """Convert coordinates of the settings to the picture's pixels."""
         return self.reference.to_picture(np.asarray(places, dtype=np.float64))
 
     def _settings(self, search: EdgeSearch) -> EdgeSettings:
@@ -196,14 +197,14 @@ class _EdgeFinder:
             smoothing=search.smoothing,
             contrast=search.contrast * self._top / 255,
             most_blur=search.blur,
-            black=float(self._ends[0]),
-            white=float(self._ends[1]),
+            black=float(self._saturation_levels[0]),
+            white=float(self._saturation_levels[1]),
             cut_off=search.cut_off,
             clipped=self._clipped,
         )
 
     def _strip(self, search: Across | AcrossPair) -> Strips:
-        start, end = self.at(search.across)
+        start, end = self.to_picture(search.across)
         strip = strip_between(start, end, search.strip * self.reference.scale)
         if not 2 <= strip.length <= MAX_LENGTH_PX:
             text = f"a strip of {strip.length:.0f} px, 2 to {MAX_LENGTH_PX:.0f} px can be measured"
@@ -224,9 +225,9 @@ class _EdgeFinder:
         self._edges += [point.pixel[None] for point in pair]
         return pair
 
-    def line(self, search: LineSearch) -> tuple[FoundShape, ShapeFit[Line]]:
+    def line(self, search: LineSearch) -> tuple[CurveEdges, CurveFit[Line]]:
         """Return the edges of a line, and the line in the picture's pixels."""
-        ends, scale = self.at(search.along), self.reference.scale
+        ends, scale = self.to_picture(search.along), self.reference.scale
         length = math.dist(*ends)
         across = (ends[1] - ends[0])[::-1] * [-1.0, 1.0] / length * search.search / 2 * scale
         self._regions.append(np.array([*(ends - across), *(ends[::-1] + across)]))
@@ -239,16 +240,18 @@ class _EdgeFinder:
             settings=self._settings(search),
             which=search.which,
         )
-        found_line = found_line._replace(kept=line_of(found_line, ends, self.plane).kept)
-        fit = line_of(found_line, ends, PIXELS)
-        line = fit.shape
-        self._shapes.append(line.at + np.outer([-line.reach, line.reach], line.direction))
-        self._keep(found_line, fit)
+        found_line = found_line._replace(
+            inliers=fit_line_in_plane(found_line, ends, self.plane).inliers
+        )
+        fit = fit_line_in_plane(found_line, ends, PIXELS)
+        line = fit.curve
+        self._curves.append(line.middle + np.outer([-line.reach, line.reach], line.direction))
+        self._add_details(found_line, fit)
         return found_line, fit
 
-    def circle(self, search: CircleSearch) -> tuple[FoundShape, ShapeFit[Circle]]:
+    def circle(self, search: CircleSearch) -> tuple[CurveEdges, CurveFit[Circle]]:
         """Return the edges of a circle, and the circle in the picture's pixels."""
-        centre, scale = self.at(search.centre), self.reference.scale
+        centre, scale = self.to_picture(search.centre), self.reference.scale
         begin, end = (math.radians(degrees) + self.reference.angle for degrees in search.arc)
         radius, reach = search.radius * scale, search.search / 2 * scale
         turn = np.linspace(begin, end, CIRCLE_CORNERS + 1)
@@ -265,35 +268,35 @@ class _EdgeFinder:
             settings=self._settings(search),
             which=search.which,
         )
-        circle = circle._replace(kept=circle_of(circle, self.plane).kept)
-        fit = circle_of(circle, PIXELS)
-        self._shapes.append(fit.shape.centre + fit.shape.radius * rim)
-        self._keep(circle, fit)
+        circle = circle._replace(inliers=fit_circle_in_plane(circle, self.plane).inliers)
+        fit = fit_circle_in_plane(circle, PIXELS)
+        self._curves.append(fit.curve.centre + fit.curve.radius * rim)
+        self._add_details(circle, fit)
         return circle, fit
 
-    def _keep(self, shape: FoundShape, fit: ShapeFit[Any]) -> None:
-        self._edges.append(shape.edges.points[fit.kept])
-        self._left_out.append(shape.edges.points[~fit.kept])
-        self._missed += map(str, shape.troubles)
+    def _add_details(self, curve_edges: CurveEdges, fit: CurveFit[Any]) -> None:
+        self._edges.append(curve_edges.edges.points[fit.inliers])
+        self._left_out.append(curve_edges.edges.points[~fit.inliers])
+        self._missed += map(str, curve_edges.troubles)
 
     def details(
-        self, found_value: Value | None, unit: str, why: NoValueReason | None
+        self, found_value: Value | None, unit: str, reason: NoValueReason | None
     ) -> Measurement:
         """Return the details of the measurement."""
-        none = [np.zeros((0, 2))]
+        no_places = [np.zeros((0, 2))]
         value, sigma = (math.nan, math.nan) if found_value is None else found_value
         return Measurement(
-            trouble=why,
+            trouble=reason,
             value=value,
             sigma=sigma,
             unit=unit,
-            edges=np.concatenate(self._edges or none),
-            left_out=np.concatenate(self._left_out or none),
+            edges=np.concatenate(self._edges or no_places),
+            left_out=np.concatenate(self._left_out or no_places),
             missed=tuple(self._missed),
             remark=self.plane.remark,
         )
 
-    def drawn(self, text: str, *, wrong: bool) -> list[Drawing]:
+    def drawings(self, text: str, *, wrong: bool) -> list[Drawing]:
         """Return the marks to draw."""
         role: Role = "wrong" if wrong else "found"
         marks = [Drawing("polygon", _corners(region), "region") for region in self._regions]
@@ -301,108 +304,118 @@ class _EdgeFinder:
         marks += [
             Drawing("points", _corners(edges), "hint") for edges in self._left_out if len(edges)
         ]
-        marks += [Drawing("line", _corners(shape), role) for shape in self._shapes]
+        marks += [Drawing("line", _corners(curve), role) for curve in self._curves]
         if text and self._edges:
             marks.append(Drawing("text", _corners(self._edges[0][:1]), role, text))
         return marks
 
 
 def _width_of(search: StripSearch, length: float, scale: float) -> float:
-    """Return the width of strips along a length without overlap, so that each pixel counts once."""
+    """Return the width of strips that do not overlap along a length: each pixel counts once."""
     spacing = length / search.strips
-    wanted = MAX_WIDTH_PX if search.strip is None else search.strip * scale
-    return max(min(wanted, spacing), 1.0)
+    max_width = MAX_WIDTH_PX if search.strip is None else search.strip * scale
+    return max(min(max_width, spacing), 1.0)
 
 
 def _corners(points: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
     return tuple((float(x), float(y)) for x, y in points)
 
 
-def _pose(at: Array, ahead: Array) -> PixelPose:
-    return PixelPose(float(at[0]), float(at[1]), math.atan2(ahead[1], ahead[0]))
+def _pose(point: Array, direction: Array) -> PixelPose:
+    return PixelPose(float(point[0]), float(point[1]), math.atan2(direction[1], direction[0]))
 
 
-def _fields(at: Array, fit: ShapeFit[Any]) -> Mapping[str, Any]:
-    used = int(np.count_nonzero(fit.kept))
-    x, y = at.tolist()
-    return {"x": x, "y": y, "edges": used, "left_out": len(fit.kept) - used}
+def _position_fields(point: Array, fit: CurveFit[Any]) -> Mapping[str, Any]:
+    used = int(np.count_nonzero(fit.inliers))
+    x, y = point.tolist()
+    return {"x": x, "y": y, "edges": used, "left_out": len(fit.inliers) - used}
 
 
-def _width(look: _EdgeFinder, search: AcrossPair) -> _MeasuredValue:
-    first, second = look.pair(search)
-    value = with_calibration(lambda plane: width(first, second, plane), look.plane)
+def _width(finder: _EdgeFinder, search: AcrossPair) -> _MeasuredValue:
+    first, second = finder.pair(search)
+    value = measure_with_calibration(lambda plane: width(first, second, plane), finder.plane)
     middle = (first.pixel + second.pixel) / 2
     return _MeasuredValue(value, {}, _pose(middle, first.strip.directions[0]))
 
 
-def _edge(look: _EdgeFinder, search: Across) -> _MeasuredValue:
-    edge = look.edge(search)
-    start = look.at(search.across[0])
+def _edge(finder: _EdgeFinder, search: Across) -> _MeasuredValue:
+    edge = finder.edge(search)
+    start = finder.to_picture(search.across[0])
 
-    def place(plane: Plane) -> Value:
-        point = point_of(edge, plane)
-        offset = point.at - plane.points(start[None])[0]
+    def edge_place(plane: Plane) -> Value:
+        point = point_in_plane(edge, plane)
+        offset = point.position - plane.map_points(start[None])[0]
         length = max(math.hypot(*offset), 1e-12)
         return Value(length, math.sqrt(float(offset @ point.covariance @ offset)) / length)
 
     x, y = edge.pixel.tolist()
     pose = _pose(edge.pixel, edge.strip.directions[0])
-    return _MeasuredValue(with_calibration(place, look.plane), {"x": x, "y": y}, pose)
-
-
-def _line(look: _EdgeFinder, search: LineSearch) -> _MeasuredValue:
-    found_line, fit = look.line(search)
-    ends, line = look.at(search.along), fit.shape
-    axis = np.array([math.cos(look.reference.angle), math.sin(look.reference.angle)])
-
-    def turned(plane: Plane) -> Value:
-        return direction(line_of(found_line, ends, plane).shape, line.at, axis, plane)
-
-    value = with_calibration(turned, look.plane)
-    return _MeasuredValue(value, _fields(line.at, fit), _pose(line.at, line.direction))
-
-
-def _circle(look: _EdgeFinder, search: CircleSearch) -> _MeasuredValue:
-    found_circle, fit = look.circle(search)
-
-    def diameter(plane: Plane) -> Value:
-        circle = circle_of(found_circle, plane).shape
-        return Value(2 * circle.radius, 2 * math.sqrt(float(circle.covariance[2, 2])))
-
-    x, y = fit.shape.centre.tolist()
-    pose = PixelPose(x, y, look.reference.angle)
     return _MeasuredValue(
-        with_calibration(diameter, look.plane), _fields(fit.shape.centre, fit), pose
+        measure_with_calibration(edge_place, finder.plane), {"x": x, "y": y}, pose
     )
 
 
-def _distance(look: _EdgeFinder, search: Between) -> _MeasuredValue:
-    first, second = _feature(look, search.first), _feature(look, search.second)
-    value = with_calibration(lambda plane: distance(first(plane), second(plane)), look.plane)
+def _line(finder: _EdgeFinder, search: LineSearch) -> _MeasuredValue:
+    found_line, fit = finder.line(search)
+    ends, line = finder.to_picture(search.along), fit.curve
+    axis = np.array([math.cos(finder.reference.angle), math.sin(finder.reference.angle)])
+
+    def line_angle(plane: Plane) -> Value:
+        return direction(fit_line_in_plane(found_line, ends, plane).curve, line.middle, axis, plane)
+
+    value = measure_with_calibration(line_angle, finder.plane)
+    return _MeasuredValue(
+        value, _position_fields(line.middle, fit), _pose(line.middle, line.direction)
+    )
+
+
+def _circle(finder: _EdgeFinder, search: CircleSearch) -> _MeasuredValue:
+    found_circle, fit = finder.circle(search)
+
+    def diameter(plane: Plane) -> Value:
+        circle = fit_circle_in_plane(found_circle, plane).curve
+        return Value(2 * circle.radius, 2 * math.sqrt(float(circle.covariance[2, 2])))
+
+    x, y = fit.curve.centre.tolist()
+    pose = PixelPose(x, y, finder.reference.angle)
+    return _MeasuredValue(
+        measure_with_calibration(diameter, finder.plane),
+        _position_fields(fit.curve.centre, fit),
+        pose,
+    )
+
+
+def _distance(finder: _EdgeFinder, search: Between) -> _MeasuredValue:
+    first, second = _feature_measure(finder, search.first), _feature_measure(finder, search.second)
+    value = measure_with_calibration(
+        lambda plane: distance(first(plane), second(plane)), finder.plane
+    )
     return _MeasuredValue(value, {}, None)
 
 
-def _angle(look: _EdgeFinder, search: BetweenLines) -> _MeasuredValue:
-    first, second = (_line_in(look, feature.line) for feature in (search.first, search.second))
-    value = with_calibration(lambda plane: angle(first(plane), second(plane)), look.plane)
+def _angle(finder: _EdgeFinder, search: BetweenLines) -> _MeasuredValue:
+    first, second = (
+        _line_measure(finder, feature.line) for feature in (search.first, search.second)
+    )
+    value = measure_with_calibration(lambda plane: angle(first(plane), second(plane)), finder.plane)
     return _MeasuredValue(value, {}, None)
 
 
-def _line_in(look: _EdgeFinder, search: LineSearch) -> Callable[[Plane], Line]:
-    line, _ = look.line(search)
-    ends = look.at(search.along)
-    return lambda plane: line_of(line, ends, plane).shape
+def _line_measure(finder: _EdgeFinder, search: LineSearch) -> Callable[[Plane], Line]:
+    line, _ = finder.line(search)
+    ends = finder.to_picture(search.along)
+    return lambda plane: fit_line_in_plane(line, ends, plane).curve
 
 
-def _feature(look: _EdgeFinder, search: FeatureSearch) -> Callable[[Plane], Feature]:
+def _feature_measure(finder: _EdgeFinder, search: FeatureSearch) -> Callable[[Plane], Feature]:
     if search.line is not None:
-        return _line_in(look, search.line)
+        return _line_measure(finder, search.line)
     if search.circle is not None:
-        circle, _ = look.circle(search.circle)
-        return lambda plane: circle_of(circle, plane).shape
+        circle, _ = finder.circle(search.circle)
+        return lambda plane: fit_circle_in_plane(circle, plane).curve
     assert search.edge is not None  # noqa: S101 - one of the three is given
-    edge = look.edge(search.edge)
-    return lambda plane: point_of(edge, plane)
+    edge = finder.edge(search.edge)
+    return lambda plane: point_in_plane(edge, plane)
 
 
 _MEASURES: Final[Mapping[str, Callable[[_EdgeFinder, Any], _MeasuredValue]]] = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
-from smartcam.inspection._read.gs1 import elements
+from smartcam.inspection._read.gs1 import split_elements
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,7 +40,7 @@ class ReadCode:
             None: none.
         level: error correction level, such as ``H``; "" if the kind has none.
         version: size of the symbol, such as ``12x26``; "" if the kind has none.
-        prepared: preparation of the picture that reading needed; "": none.
+        prepared: name of the preparation with which the picture was read; "": none.
     """
 
     kind: str
@@ -62,7 +62,7 @@ class ReadCode:
 
 
 @functools.cache
-def kinds() -> dict[str, Any]:
+def readable_kinds() -> dict[str, Any]:
     """Return the kinds of codes that can be read, by name.
 
     Raises:
@@ -83,7 +83,7 @@ def formats_of(names: Sequence[str]) -> Any:
         MissingExtraError: zxing-cpp is not installed.
     """
     zxing = load("zxingcpp", PURPOSE)
-    known = kinds()
+    known = readable_kinds()
     for name in names:
         if name not in known:
             raise ValueError(
@@ -97,7 +97,7 @@ def formats_of(names: Sequence[str]) -> Any:
 def read_codes(
     grey: NDArray[np.uint8],
     formats: Any,
-    back: NDArray[np.float64],
+    to_picture: NDArray[np.float64],
     binarizer: str = "LocalAverage",
     prepared: str = "",
 ) -> list[ReadCode]:
@@ -106,9 +106,9 @@ def read_codes(
     Args:
         grey: picture, (H, W), contiguous.
         formats: kinds from :func:`formats_of`.
-        back: affine map (2, 3) from ``grey`` to the picture of the corners.
+        to_picture: affine map (2, 3) from pixels of ``grey`` to the coordinates of the corners.
         binarizer: zxing-cpp's name of the binarizer.
-        prepared: name of the picture's preparation.
+        prepared: name of the preparation that ``grey`` has; "": none.
     """
     zxing = load("zxingcpp", PURPOSE)
     barcodes = zxing.read_barcodes(
@@ -119,17 +119,25 @@ def read_codes(
     )
     is_gs1 = zxing.ContentType.GS1
     return [
-        _code(barcode, back, prepared, gs1=barcode.content_type == is_gs1) for barcode in barcodes
+        _make_code(barcode, to_picture, prepared, gs1=barcode.content_type == is_gs1)
+        for barcode in barcodes
     ]
 
 
-def _code(barcode: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> ReadCode:
-    place = barcode.position  # indices of pixels
+def _make_code(
+    barcode: Any, to_picture: NDArray[np.float64], prepared: str, *, gs1: bool
+) -> ReadCode:
+    position = barcode.position  # indices of pixels
     corners = [
         (float(x), float(y))
         for x, y in (
-            back[:, :2] @ (at.x, at.y) + back[:, 2]
-            for at in (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
+            to_picture[:, :2] @ (corner.x, corner.y) + to_picture[:, 2]
+            for corner in (
+                position.top_left,
+                position.top_right,
+                position.bottom_right,
+                position.bottom_left,
+            )
         )
     ]
     (x1, y1), (x2, y2) = corners[:2]
@@ -140,7 +148,7 @@ def _code(barcode: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) 
         kind=barcode.format.name,
         data=barcode.bytes,
         text=text,
-        gs1=elements(text) if gs1 else (),
+        gs1=split_elements(text) if gs1 else (),
         symbology=barcode.symbology_identifier,
         corners=(corners[0], corners[1], corners[2], corners[3]),
         angle=math.atan2(y2 - y1, x2 - x1),

@@ -31,25 +31,25 @@ _IDENTIFIER_DIGITS: Final = {
 """Number of digits of an application identifier by its first two; 2 for all others."""
 
 
-def elements(text: str) -> tuple[tuple[str, str], ...]:
+def split_elements(text: str) -> tuple[tuple[str, str], ...]:
     """Return application identifier and value of each element.
 
-    At an element that is cut, or whose identifier is no number, the list ends: the rest of the text
-    is the last value, with the identifier "".
+    At an element that is too short, or whose identifier is no number, splitting ends: the rest of
+    the text is the last value, with the identifier "".
     """
     elements: list[tuple[str, str]] = []
-    at = 1 if text.startswith(GS) else 0
-    while at < len(text):
-        digits = _IDENTIFIER_DIGITS.get(text[at : at + 2], 2)
-        identifier = text[at : at + digits]
-        length = _PREDEFINED.get(text[at : at + 2])
-        reach = len(text) if length is None else min(at + length, len(text))
-        end = text.find(GS, at, reach)
-        end = reach if end < 0 else end
-        stop = end if length is None else at + length
-        if not (identifier.isascii() and identifier.isdigit()) or not at + digits < stop <= end:
-            elements.append(("", text[at:]))
+    start = 1 if text.startswith(GS) else 0
+    while start < len(text):
+        digits = _IDENTIFIER_DIGITS.get(text[start : start + 2], 2)
+        identifier = text[start : start + digits]
+        length = _PREDEFINED.get(text[start : start + 2])
+        longest_end = len(text) if length is None else min(start + length, len(text))
+        end = text.find(GS, start, longest_end)
+        end = longest_end if end < 0 else end
+        stop = end if length is None else start + length
+        if not (identifier.isascii() and identifier.isdigit()) or not start + digits < stop <= end:
+            elements.append(("", text[start:]))
             break
-        elements.append((identifier, text[at + digits : stop]))
-        at = stop + 1 if text[stop : stop + 1] == GS else stop
+        elements.append((identifier, text[start + digits : stop]))
+        start = stop + 1 if text[stop : stop + 1] == GS else stop
     return tuple(elements)

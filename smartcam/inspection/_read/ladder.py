@@ -1,7 +1,8 @@
 """Retry after a miss with the same reader on differently prepared pictures.
 
-Each rung reads codes of the measured sets that the rungs before it miss; the rungs are ordered by
-gain per time. ``tests.inspection.proofs.codes`` measures them.
+A *rung* is one way to prepare the picture. Each rung reads codes of the measured sets that the
+earlier rungs miss; the rungs are ordered by the codes that they gain per time.
+``tests.inspection.proofs.codes`` measures them.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ CONFIRMED_KINDS: Final = frozenset(
     }
 )
 """Kinds with a weak or missing checksum, and kinds of stacked rows, each of which may be misread.
-In prepared pictures they need a second, equal reading: of another rung, or of the same rung on a
+In prepared pictures they need a second, equal reading: by another rung, or by the same rung on a
 smaller picture."""
 
 CONFIRMING_SCALE: Final = 0.9
@@ -52,8 +53,9 @@ class Rung(NamedTuple):
 
     Attributes:
         name: description of the preparation.
-        prepare: function that returns the prepared picture, and the affine map back to the picture.
-        scale: ratio of the prepared picture's width to the picture's.
+        prepare: function that returns the prepared picture, and the affine map from its pixels to
+            pixels of the given picture.
+        scale: ratio of the prepared picture's width to the width of the given picture.
         binarizer: zxing-cpp's name of the binarizer.
     """
 
@@ -70,7 +72,7 @@ class CodeSearch(NamedTuple):
         grey: picture, (H, W).
         formats: wanted kinds.
         origin: place of the first pixel in the picture of the corners.
-        counts: function that returns whether a code lies in the region.
+        is_in_region: function that returns whether a code lies in the region.
     """
 
     grey: NDArray[np.uint8]
@@ -82,70 +84,77 @@ class CodeSearch(NamedTuple):
 def read_again(
     search: CodeSearch, codes_read: Sequence[ReadCode], least: int, deadline: float, expected: float
 ) -> list[ReadCode]:
-    """Return the codes found before and by the rungs, until there are enough.
+    """Try rungs until enough codes are read; return the codes, with those found before.
 
     Args:
         search: the picture and the wanted codes.
         codes_read: codes found before.
         least: number of codes that is enough.
-        deadline: ``time.monotonic()`` at which no further rung begins; slower rungs are left out.
+        deadline: ``time.monotonic()`` after which no rung may end; rungs that take longer are left
+            out.
         expected: duration of reading without preparation, seconds.
     """
     grey, counts = search.grey, search.counts
     codes = list(codes_read)
-    waiting: list[ReadCode] = []
+    unconfirmed: list[ReadCode] = []
     for rung in RUNGS:
         if len(codes) >= least:
             break
         cost = max(rung.scale**2, 1.0)
         if cost * grey.size > MAX_RUNG_PIXELS or time.monotonic() + cost * expected > deadline:
             continue
-        smaller: list[ReadCode] | None = None
-        for code in _by_rung(rung, search):
-            if not counts(code) or any(_is_same(code, other) for other in codes):
+        codes_in_smaller: list[ReadCode] | None = None
+        for code in _read_with_rung(rung, search):
+            if not counts(code) or any(_is_same_code(code, other) for other in codes):
                 continue
-            if code.kind in CONFIRMED_KINDS and not any(_is_same(code, other) for other in waiting):
-                if smaller is None:
-                    smaller = _by_rung(rung, search, CONFIRMING_SCALE)
-                if not any(_is_same(code, other) for other in smaller):
-                    waiting.append(code)
+            if code.kind in CONFIRMED_KINDS and not any(
+                _is_same_code(code, other) for other in unconfirmed
+            ):
+                if codes_in_smaller is None:
+                    codes_in_smaller = _read_with_rung(rung, search, CONFIRMING_SCALE)
+                if not any(_is_same_code(code, other) for other in codes_in_smaller):
+                    unconfirmed.append(code)
                     continue
             codes.append(code)
     return codes
 
 
-def _by_rung(rung: Rung, search: CodeSearch, scale: float = 1.0) -> list[ReadCode]:
+def _read_with_rung(rung: Rung, search: CodeSearch, scale: float = 1.0) -> list[ReadCode]:
     """Return the codes that one rung finds, in the picture or in a scaled copy."""
     grey = search.grey if scale == 1.0 else _resize(search.grey, scale)
-    prepared, back = rung.prepare(grey)
-    places = _scaled_by(scale)
-    back = places[:, :2] @ back + np.column_stack([np.zeros((2, 2)), places[:, 2]])
-    back[:, 2] += search.origin
-    ready = np.ascontiguousarray(prepared)
-    return read_codes(ready, search.formats, back, rung.binarizer, rung.name)
+    prepared, to_picture = rung.prepare(grey)
+    scale_map = _scale_map(scale)
+    to_picture = scale_map[:, :2] @ to_picture + np.column_stack(
+        [np.zeros((2, 2)), scale_map[:, 2]]
+    )
+    to_picture[:, 2] += search.origin
+    contiguous = np.ascontiguousarray(prepared)
+    return read_codes(contiguous, search.formats, to_picture, rung.binarizer, rung.name)
 
 
-def _is_same(one: ReadCode, other: ReadCode) -> bool:
+def _is_same_code(one: ReadCode, other: ReadCode) -> bool:
     if one.data != other.data or one.kind != other.kind:
         return False
-    reach = max(math.dist(a, b) for a, b in zip(other.corners, other.corners[1:], strict=False))
-    return math.dist(one.centre, other.centre) <= MAX_SAME_PLACE * max(reach, 1.0)
+    longest_edge = max(
+        math.dist(a, b) for a, b in zip(other.corners, other.corners[1:], strict=False)
+    )
+    return math.dist(one.centre, other.centre) <= MAX_SAME_PLACE * max(longest_edge, 1.0)
 
 
 # ---------------------------------------------------------------------- preparations
 
 
-def _scaled_by(scale: float) -> Affine:
-    """Return the affine map from a scaled picture's pixels to the picture's."""
+def _scale_map(scale: float) -> Affine:
+    """Return the affine map from a scaled picture's pixels to the unscaled picture's pixels."""
     shift = 0.5 / scale - 0.5
     return np.array([[1 / scale, 0, shift], [0, 1 / scale, shift]])
 
 
 def _resize(grey: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
     cv2 = load("cv2", "inspection needs")
-    how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+    flags = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
     size = [max(round(side * scale), 1) for side in (grey.shape[1], grey.shape[0])]
-    resized: NDArray[np.uint8] = cv2.resize(grey, size, interpolation=how)
+    resized: NDArray[np.uint8] = cv2.resize(grey, size, interpolation=flags)
     return resized
 
 
@@ -162,8 +171,8 @@ def _sharpen(grey: NDArray[np.uint8], sigma: float, amount: float) -> NDArray[np
 
 def _local_contrast(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     cv2 = load("cv2", "inspection needs")
-    level: NDArray[np.uint8] = cv2.createCLAHE(3.0, (8, 8)).apply(grey)
-    return level
+    equalized: NDArray[np.uint8] = cv2.createCLAHE(3.0, (8, 8)).apply(grey)
+    return equalized
 
 
 def _median(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -174,20 +183,20 @@ def _median(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _threshold(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a binary picture by Otsu's threshold."""
     cv2 = load("cv2", "inspection needs")
-    black: NDArray[np.uint8] = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)[1]
-    return black
+    binary: NDArray[np.uint8] = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)[1]
+    return binary
 
 
 def _local_threshold(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a binary picture with the neighbourhood's mean as the threshold."""
     cv2 = load("cv2", "inspection needs")
-    how = cv2.ADAPTIVE_THRESH_GAUSSIAN_C
-    black: NDArray[np.uint8] = cv2.adaptiveThreshold(grey, 255, how, cv2.THRESH_BINARY, 51, 4)
-    return black
+    flags = cv2.ADAPTIVE_THRESH_GAUSSIAN_C
+    binary: NDArray[np.uint8] = cv2.adaptiveThreshold(grey, 255, flags, cv2.THRESH_BINARY, 51, 4)
+    return binary
 
 
-def _turned(grey: NDArray[np.uint8], degrees: float) -> Prepared:
-    """Return the picture turned clockwise, on white."""
+def _rotate(grey: NDArray[np.uint8], degrees: float) -> Prepared:
+    """Return the picture, rotated clockwise on a white background."""
     cv2 = load("cv2", "inspection needs")
     height, width = grey.shape
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
@@ -195,17 +204,17 @@ def _turned(grey: NDArray[np.uint8], degrees: float) -> Prepared:
         math.ceil(width * abs(cos) + height * abs(sin)),
         math.ceil(width * abs(sin) + height * abs(cos)),
     )
-    back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0]])
+    to_picture = np.array([[cos, sin, 0.0], [-sin, cos, 0.0]])
     middle = (np.array(size) - 1) / 2
-    back[:, 2] = ((width - 1) / 2, (height - 1) / 2) - back[:, :2] @ middle
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    turned: NDArray[np.uint8] = cv2.warpAffine(
-        grey, back, size, flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=255
+    to_picture[:, 2] = ((width - 1) / 2, (height - 1) / 2) - to_picture[:, :2] @ middle
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    rotated: NDArray[np.uint8] = cv2.warpAffine(
+        grey, to_picture, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=255
     )
-    return turned, back
+    return rotated, to_picture
 
 
-def _rung(
+def _make_rung(
     name: str,
     *steps: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
     scale: float = 1.0,
@@ -214,41 +223,41 @@ def _rung(
     """Return the rung that scales the picture, then applies the steps."""
 
     def prepare(grey: NDArray[np.uint8]) -> Prepared:
-        made = grey if scale == 1.0 else _resize(grey, scale)
+        result = grey if scale == 1.0 else _resize(grey, scale)
         for step in steps:
-            made = step(made)
-        return made, _scaled_by(scale)
+            result = step(result)
+        return result, _scale_map(scale)
 
     return Rung(name, prepare, scale, binarizer)
 
 
-def _turning(degrees: float) -> Rung:
-    return Rung(f"turned by {degrees:g} degrees", lambda grey: _turned(grey, degrees), 1.3)
+def _make_rotation_rung(degrees: float) -> Rung:
+    return Rung(f"turned by {degrees:g} degrees", lambda grey: _rotate(grey, degrees), 1.3)
 
 
 _FIXED: Final = "FixedThreshold"
 
 RUNGS: Final[tuple[Rung, ...]] = (
-    _rung(
+    _make_rung(
         "half as large, blurred, threshold",
         partial(_blur, sigma=1.0),
         _threshold,
         scale=0.5,
         binarizer=_FIXED,
     ),
-    _rung("local contrast", _local_contrast),
-    _rung("median, threshold", _median, _threshold, binarizer=_FIXED),
-    _rung("a quarter as large, blurred", partial(_blur, sigma=1.0), scale=0.25),
-    _rung("inverted, threshold", np.invert, _threshold, binarizer=_FIXED),
-    _rung("half again as large", scale=1.5),
-    _turning(-22),
-    _rung("local threshold", _local_threshold, binarizer=_FIXED),
-    _rung("twice as large, sharpened", partial(_sharpen, sigma=3.0, amount=3.0), scale=2),
-    _rung("twice as large, local contrast", _local_contrast, scale=2),
-    _turning(22),
-    _turning(45),
-    _rung("twice as large, one threshold", scale=2, binarizer="GlobalHistogram"),
-    _rung(
+    _make_rung("local contrast", _local_contrast),
+    _make_rung("median, threshold", _median, _threshold, binarizer=_FIXED),
+    _make_rung("a quarter as large, blurred", partial(_blur, sigma=1.0), scale=0.25),
+    _make_rung("inverted, threshold", np.invert, _threshold, binarizer=_FIXED),
+    _make_rung("half again as large", scale=1.5),
+    _make_rotation_rung(-22),
+    _make_rung("local threshold", _local_threshold, binarizer=_FIXED),
+    _make_rung("twice as large, sharpened", partial(_sharpen, sigma=3.0, amount=3.0), scale=2),
+    _make_rung("twice as large, local contrast", _local_contrast, scale=2),
+    _make_rotation_rung(22),
+    _make_rotation_rung(45),
+    _make_rung("twice as large, one threshold", scale=2, binarizer="GlobalHistogram"),
+    _make_rung(
         "twice as large, sharpened, local contrast",
         partial(_sharpen, sigma=3.0, amount=2.0),
         _local_contrast,

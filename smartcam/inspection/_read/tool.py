@@ -34,7 +34,7 @@ INPUT_SETTING: Final = "input"
 """Value of the setting ``expect`` for codes that must equal the trigger's input."""
 
 
-def _pattern(given: str | None) -> str | None:
+def _check_pattern(given: str | None) -> str | None:
     if given is not None and given != INPUT_SETTING:
         TextPattern(given)  # raises a ValueError
     return given
@@ -47,7 +47,7 @@ class ReadSettings(ToolSettings):
         tuple[str, ...],
         BeforeValidator(lambda given: (given,) if isinstance(given, str) else given),
     ] = Field((), description="kinds such as DataMatrix, Code128, QRCode, EAN13; default: all")
-    expect: Annotated[str | None, AfterValidator(_pattern)] = Field(
+    expect: Annotated[str | None, AfterValidator(_check_pattern)] = Field(
         None,
         max_length=1000,
         description="expected text: a regular expression, or input: the value of the input",
@@ -87,15 +87,15 @@ class ReadTool(Tool[ReadSettings]):
     @property
     def fields(self) -> str:
         """Fields of the number of codes and of the first code."""
-        return f"count: uint8, {self._of_code}" if self.settings.most == 1 else "count: uint8"
+        return f"count: uint8, {self._code_fields}" if self.settings.most == 1 else "count: uint8"
 
     @property
     def records(self) -> str:
         """Fields of each code."""
-        return "" if self.settings.most == 1 else self._of_code
+        return "" if self.settings.most == 1 else self._code_fields
 
     @property
-    def _of_code(self) -> str:
+    def _code_fields(self) -> str:
         text = f"text: string[{self.settings.length}], kind: string[20], "
         text += "x: real32 px, y: real32 px, angle: real32 deg, unused_correction: real32"
         if self.settings.corners:
@@ -109,13 +109,13 @@ class ReadTool(Tool[ReadSettings]):
         region = view.region
         codes = self.read(grey, view.origin, lambda code: region.contains(code.centre))
         reason = self._reason(codes, view.input)
-        fits = [code for code in codes if self._fits_layout(code)][: settings.most]
-        values = [self._values(code) for code in fits]
-        alone = values[0] if values and settings.most == 1 else {}
+        codes_in_layout = [code for code in codes if self._fits_layout(code)][: settings.most]
+        values = [self._values(code) for code in codes_in_layout]
+        single_values = values[0] if values and settings.most == 1 else {}
         return Finding(
             ok=not reason,
             reason=reason,
-            values={"count": len(codes), **alone},
+            values={"count": len(codes), **single_values},
             records=values if settings.most > 1 else [],
             drawings=[
                 Drawing(
@@ -136,38 +136,38 @@ class ReadTool(Tool[ReadSettings]):
         self,
         grey: NDArray[np.uint8],
         origin: tuple[int, int] = (0, 0),
-        counts: Callable[[ReadCode], bool] = lambda _: True,
+        is_in_region: Callable[[ReadCode], bool] = lambda _: True,
     ) -> list[ReadCode]:
         """Return the codes, from top to bottom.
 
         Args:
             grey: the picture, (H, W), contiguous.
             origin: place of the first pixel in the coordinates of the corners.
-            counts: function that returns whether a code lies in the region.
+            is_in_region: function that returns whether a code lies in the region.
         """
         started = time.monotonic()
-        back = np.array([[1.0, 0, origin[0]], [0, 1, origin[1]]])
-        codes = [code for code in read_codes(grey, self._formats, back) if counts(code)]
+        to_picture = np.array([[1.0, 0, origin[0]], [0, 1, origin[1]]])
+        codes = [code for code in read_codes(grey, self._formats, to_picture) if is_in_region(code)]
         if len(codes) < self.settings.least and self.settings.seconds:
-            took = time.monotonic() - started
+            duration = time.monotonic() - started
             deadline = started + self.settings.seconds
             codes = read_again(
-                CodeSearch(grey, self._formats, origin, counts),
+                CodeSearch(grey, self._formats, origin, is_in_region),
                 codes,
                 self.settings.least,
                 deadline,
-                took,
+                duration,
             )
         return sorted(codes, key=lambda code: (code.centre[1], code.centre[0]))
 
-    def _reason(self, codes: list[ReadCode], given: bytes) -> str:
+    def _reason(self, codes: list[ReadCode], input_data: bytes) -> str:
         """Return the reason why the codes are not ok; "" if they are ok."""
         settings = self.settings
         if len(codes) < settings.least:
             return f"{len(codes)} codes, expected {settings.least}"
         for code in codes:
-            if settings.expect == INPUT_SETTING and code.data != given:
-                return f"read {code.data[:40]!r}, expected the input {given[:40]!r}"
+            if settings.expect == INPUT_SETTING and code.data != input_data:
+                return f"read {code.data[:40]!r}, expected the input {input_data[:40]!r}"
             if not self._fits_layout(code):
                 size = len(code.text.encode())
                 return f"the text has {size} bytes or a zero, expected up to {settings.length}"

@@ -217,7 +217,7 @@ def test_read_cameras_of_a_spoiled_file_raises(
     tmp_path: Path, form: CameraForm, old: str, new: str, code: Code, text: str
 ) -> None:
     chain = ONE if form == "camera_info" else TWO
-    whole = FORMS[form].text(chain)
+    whole = FORMS[form].to_text(chain)
     assert old in whole
     (tmp_path / "file").write_text(whole.replace(old, new, 1))
     with pytest.raises(CalibrationError, match=text) as caught:

@@ -38,7 +38,7 @@ from smartcam.calibration.formats import (
 from smartcam.calibration.formats._opencv import PlaneMatrix, compose_matrix
 from smartcam.calibration.wizards import CalibrationService
 from tests import ROOT
-from tests.calibration.inside import PlaneModel, real, write
+from tests.calibration.inside import PlaneModel, format_real, write
 from tests.geometry.rigid import (
     FEW,
     NOON,
@@ -266,7 +266,7 @@ def test_rotation_printed_with_few_decimals_is_made_one(tmp_path: Path, decimals
 
 @given(value=st.floats(allow_nan=False, allow_infinity=False))
 def test_real_is_a_number_to_yaml(value: float) -> None:
-    read_back = yaml.safe_load(real(value))
+    read_back = yaml.safe_load(format_real(value))
     assert type(read_back) is float
     assert (read_back, math.copysign(1, read_back)) == (value, math.copysign(1, value))
 

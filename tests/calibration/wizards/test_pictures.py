@@ -13,7 +13,7 @@ import pytest
 from smartcam._extras import load
 from smartcam.calibration._inside import PictureFolder, decode_picture
 from smartcam.calibration.wizards import _pictures as pictures
-from smartcam.calibration.wizards._pictures import taker
+from smartcam.calibration.wizards._pictures import picture_taker
 from smartcam.exceptions import FrameTimeoutError, LocalProtocolError
 from tests.calibration.scenes import refused
 from tests.frames.drivers import GoneError, frame, scripted
@@ -86,11 +86,11 @@ class Growing(PictureFolder):
         super().__init__(path, deadline=10.0)
         self.parts = [data[start : start + 20] for start in range(0, len(data), 20)]
 
-    def _look(self) -> dict[str, tuple[int, int]]:
+    def _scan_folder(self) -> dict[str, tuple[int, int]]:
         if self.parts:
             with (self.path / "shot.png").open("ab") as stream:
                 stream.write(self.parts.pop(0))
-        return super()._look()
+        return super()._scan_folder()
 
 
 async def test_folder_waits_for_a_file_that_grows(
@@ -166,7 +166,7 @@ async def test_folder_take_cancelled_leaves_nothing_open(tmp_path: Path) -> None
 
 async def test_picture_of_a_source_is_the_first_exposed_after_the_request() -> None:
     driver, source = scripted(stall=None, linger=60.0)
-    take = taker(source)
+    take = picture_taker(source)
     async with source, source.reader() as reader:
         await driver.streams()
         driver.give(frame(1))
@@ -184,7 +184,7 @@ async def test_picture_of_a_source_is_the_first_exposed_after_the_request() -> N
 
 async def test_picture_of_a_source_that_dies_or_is_silent_is_its_error() -> None:
     driver, source = scripted(stall=None)
-    take = taker(source)
+    take = picture_taker(source)
     async with source:
         with pytest.raises(FrameTimeoutError):
             await take()
@@ -203,4 +203,4 @@ async def test_function_that_takes_pictures_is_used_unchanged() -> None:
     async def take() -> Any:
         return GREY
 
-    assert taker(take) is take
+    assert picture_taker(take) is take

@@ -372,8 +372,8 @@ async def test_submit_onto_a_full_disk_keeps_the_step(tmp_path: Path) -> None:
     class Full(Journal):
         full = False
 
-        def _put(self, line: bytes) -> None:
-            super()._put(line[:9] if self.full else line)
+        def _write_bytes(self, line: bytes) -> None:
+            super()._write_bytes(line[:9] if self.full else line)
             if self.full:
                 raise OSError("no space left")
 

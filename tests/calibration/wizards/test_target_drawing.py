@@ -19,8 +19,13 @@ import pytest
 from smartcam.calibration import Checkerboard, PlaneCalibration, TargetView, fit_plane
 from smartcam.calibration._inside import LOOKS
 from smartcam.calibration.wizards._marks import Mark, Touch
-from smartcam.calibration.wizards._target_drawing import MAX_SIDE_PX, cell_counts, draw
-from smartcam.calibration.wizards._touch_previews import HEAT_MAP_CELLS, before, compared, plain
+from smartcam.calibration.wizards._target_drawing import MAX_SIDE_PX, cell_counts, draw_preview
+from smartcam.calibration.wizards._touch_previews import (
+    HEAT_MAP_CELLS,
+    compare_touches,
+    next_touch_preview,
+    touch_points,
+)
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
 from tests.calibration.inside import Look, outline
@@ -71,7 +76,7 @@ def picture_in(picture: str) -> NDArray[Any]:
 def test_preview_equals_the_approved_one() -> None:
     """To approve a new picture, run this test with SMARTCAM_REWRITE=1 and view the file."""
     one = view()
-    drawn = draw(
+    drawn = draw_preview(
         GREY,
         view=one,
         earlier=[view(350, 200)],
@@ -89,19 +94,19 @@ def test_preview_equals_the_approved_one() -> None:
 def test_preview_has_the_camera_s_picture_under_it() -> None:
     image = np.zeros((480, 640, 3), dtype=np.uint8)
     image[100:200, 300:400] = (255, 255, 255)
-    assert np.array_equal(picture_in(draw(image)), image[:, :, 0])
+    assert np.array_equal(picture_in(draw_preview(image)), image[:, :, 0])
 
 
 @pytest.mark.parametrize("size", [(2000, 3000), (3000, 20), (700, 16)])
 def test_preview_of_a_large_image_is_bounded(size: tuple[int, int]) -> None:
     random = np.random.default_rng(1)
-    drawn = draw(random.integers(0, 255, size, dtype=np.uint8))
+    drawn = draw_preview(random.integers(0, 255, size, dtype=np.uint8))
     assert max(picture_in(drawn).shape) == MAX_SIDE_PX
     assert len(drawn) < 1.5 * MAX_SIDE_PX**2 + 5000
 
 
 def test_preview_draws_points_at_their_places_in_the_picture() -> None:
-    points = elements(draw(GREY, view=view()), "point")
+    points = elements(draw_preview(GREY, view=view()), "point")
     zoom = 900 / 640
     assert len(points) == 12
     assert points[0].get("class") == "point origin"
@@ -119,14 +124,14 @@ def test_preview_without_the_origin_fills_no_point() -> None:
         points=part.points[1:],
         covariance=part.covariance[1:],
     )
-    drawn = draw(GREY, view=hidden)
+    drawn = draw_preview(GREY, view=hidden)
     assert elements(drawn, "origin") == []
     assert legend(drawn).startswith("11 of 12 points; ")
 
 
 def test_preview_residuals_are_enlarged_by_the_stated_factor() -> None:
     one = view()
-    drawn = draw(GREY, view=one, predicted=one.points + np.array([0.3, 0.4]))
+    drawn = draw_preview(GREY, view=one, predicted=one.points + np.array([0.3, 0.4]))
     (line, *rest) = elements(drawn, "residual")
     x1, y1, x2, y2 = (float(line.get(name, "")) for name in ("x1", "y1", "x2", "y2"))
     assert len(rest) == 11
@@ -137,25 +142,25 @@ def test_preview_residuals_are_enlarged_by_the_stated_factor() -> None:
 def test_preview_of_a_perfect_fit_enlarges_nothing() -> None:
     one = view()
     assert "(red) 1 times larger than they are, 0.000 px rms" in legend(
-        draw(GREY, view=one, predicted=one.points)
+        draw_preview(GREY, view=one, predicted=one.points)
     )
 
 
 def test_preview_counts_the_cells_of_all_views() -> None:
-    drawn = draw(GREY, view=view(0, 479, 10), earlier=[view(0, 479, 10), view(600, 50, 10)])
+    drawn = draw_preview(GREY, view=view(0, 479, 10), earlier=[view(0, 479, 10), view(600, 50, 10)])
     assert len(elements(drawn, "covered")) == 2
     assert legend(drawn) == "12 of 12 points; 2 of 48 cells seen by 3 views"
 
 
 def test_preview_without_a_view_reports_that_no_target_was_found() -> None:
-    drawn = draw(GREY, earlier=[view()])
+    drawn = draw_preview(GREY, earlier=[view()])
     assert elements(drawn, "point") == []
     assert legend(drawn).startswith("no target found; ")
     assert legend(drawn).endswith(" of 48 cells seen by 1 view")
 
 
 def test_preview_names_the_axes_at_their_ends() -> None:
-    drawn = draw(GREY, axes=[(100, 400), (160, 400), (100, 340), (90, 410)])
+    drawn = draw_preview(GREY, axes=[(100, 400), (160, 400), (100, 340), (90, 410)])
     assert [one.text for one in elements(drawn, "name")] == ["x", "y", "z"]
     (x,) = elements(drawn, "x")
     assert x.get("x2") == f"{20 + 160.5 * 900 / 640:.2f}"
@@ -184,13 +189,13 @@ def test_cell_counts_leaves_out_points_outside_of_the_image() -> None:
 )
 def test_preview_of_contradictory_arguments_is_refused(options: dict[str, Any], text: str) -> None:
     with pytest.raises(CalibrationError, match=text) as caught:
-        draw(GREY, **options)
+        draw_preview(GREY, **options)
     assert caught.value.code == Code.SHAPE
 
 
 def test_preview_of_no_image_is_refused() -> None:
     with pytest.raises(CalibrationError, match="image: expected an array of uint8 or uint16"):
-        draw(np.zeros((4, 4)))
+        draw_preview(np.zeros((4, 4)))
 
 
 # ----------------------------------------------------------------------
@@ -213,7 +218,9 @@ def calibrated(marks: Array = GRID, **options: Any) -> PlaneCalibration:
 
 def preview_of(found: PlaneCalibration) -> dict[str, Any]:
     done = touches(found.camera_points, found.robot_points)
-    return compared(found, done, found.camera_points, found.residuals, found.leave_one_out, worst=2)
+    return compare_touches(
+        found, done, found.camera_points, found.residuals, found.leave_one_out, worst=2
+    )
 
 
 def middles(preview: dict[str, Any]) -> Array:
@@ -268,7 +275,7 @@ def test_compared_marks_left_out_points_and_does_not_count_them(off: float, show
     found = fit_plane(GRID, touched, touch_sigma=SIGMA, model="similarity", robust=True)
     assert found.outliers == (2,)
     done = touches(GRID, touched)
-    preview = compared(
+    preview = compare_touches(
         found, done, GRID, found.residuals, found.leave_one_out, worst=found.worst, left_out=(2,)
     )
     (one,) = (point for point in preview["points"] if point["left_out"])
@@ -283,7 +290,7 @@ def test_compared_beyond_the_horizon_has_no_heat() -> None:
     seen = GRID / (1.0 + 2.5 * GRID[:, :1])
     found = fit_plane(seen, SCENE.robot(GRID), touch_sigma=SIGMA, model="homography")
     far = touches(seen[:1], SCENE.robot(np.array([[-0.6, 0.0]])))
-    preview = compared(found, far, seen[:1], np.ones((1, 3)), worst=0)
+    preview = compare_touches(found, far, seen[:1], np.ones((1, 3)), worst=0)
     assert preview["heat"] is None
     assert preview["points"][0]["held_out"] is None
 
@@ -291,10 +298,10 @@ def test_compared_beyond_the_horizon_has_no_heat() -> None:
 def test_before_shows_marks_and_the_next_one() -> None:
     done = touches(GRID[:1], SCENE.robot(GRID[:1]))
     mark, other = Mark("a", 0.1, 0.2, 0.0), Mark("b", 0.3, 0.4, 0.0)
-    assert before(done, [mark, other], other) == {
-        **plain(done), "marks": [[0.1, 0.2], [0.3, 0.4]], "next": [0.3, 0.4],
+    assert next_touch_preview(done, [mark, other], other) == {
+        **touch_points(done), "marks": [[0.1, 0.2], [0.3, 0.4]], "next": [0.3, 0.4],
     }  # fmt: skip
-    assert before(done, [], other) is None
+    assert next_touch_preview(done, [], other) is None
 
 
 # ----------------------------------------------------------------------

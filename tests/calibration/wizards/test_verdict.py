@@ -9,7 +9,7 @@ import pytest
 
 from smartcam.calibration import fit_plane
 from smartcam.calibration._verdict import CURES, VIEW_CURES, Allowed, judge, refused
-from smartcam.calibration.wizards._points import calibrated_plane
+from smartcam.calibration.wizards._points import plane_outcome
 from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def test_verdict_holds_for_new_points() -> None:
         touches = np.column_stack([FIELD + SHIFT, np.zeros(9)])
         touches += random.normal(0.0, 0.0002, touches.shape)
         found = fit_plane(FIELD, touches, touch_sigma=0.0002, tool_z=(0, 0, -1))
-        judged = calibrated_plane(found).judgement
+        judged = plane_outcome(found).judgement
         if judged.good_for is not None:
             true = np.column_stack([new + SHIFT, np.zeros(200)])
             off = true + random.normal(0.0, 0.0002, true.shape) - found.transform(new)

@@ -29,12 +29,12 @@ from tests.inspection.inside import (
     NotMeasuredError,
     Sectors,
     Strips,
-    circle_of,
     find_circle,
     find_line,
     find_pair,
     find_point,
-    line_of,
+    fit_circle_in_plane,
+    fit_line_in_plane,
     strip_between,
     width,
 )
@@ -299,8 +299,8 @@ class LineCase(Case):
                 settings=self.light.settings,
                 which="strongest",
             )
-            line = line_of(found, np.array([about - way, about + way]), PIXELS).shape
-            across = line.at + ((middle - line.at) @ line.direction) * line.direction
+            line = fit_line_in_plane(found, np.array([about - way, about + way]), PIXELS).curve
+            across = line.middle + ((middle - line.middle) @ line.direction) * line.direction
             bent = math.asin(float(ahead[0] * line.direction[1] - ahead[1] * line.direction[0]))
             measured = {
                 "offset": Trial(
@@ -388,7 +388,7 @@ class CircleCase(Case):
                 settings=self.light.settings,
                 which="strongest",
             )
-            circle = circle_of(found, PIXELS).shape
+            circle = fit_circle_in_plane(found, PIXELS).curve
             sigmas = np.sqrt(np.diag(circle.covariance))
             errors = np.array([*(circle.centre - centre), circle.radius - radius])
             trials = [Trial(*one) for one in zip(errors, sigmas, bounds, strict=True)]

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.inspection import PartModel, Picture
-from smartcam.inspection._locate.segments import pixels_in
+from smartcam.inspection._locate.segments import find_band_pixels
 from tests.inspection.drawn_parts import (
     PARTS,
     SAMPLES,
@@ -266,7 +266,7 @@ def _over_bound(kind: Kind, model: PartModel, scene: Scene, found: LocatedPart) 
     fitted = [True, True, model.symmetry.fold != 0, kind.scales[1] > kind.scales[0]]
     x, y, angle, scale = truth(model, scene.part).tolist()
     cos, sin = scale * math.cos(angle), scale * math.sin(angle)
-    pixels = pixels_in(
+    pixels = find_band_pixels(
         model.bands_at(scale), np.array([[cos, -sin, x], [sin, cos, y]]), scene.light
     )
     columns, rows = pixels.points.astype(int).T
