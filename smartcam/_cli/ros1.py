@@ -53,7 +53,7 @@ async def ros1(place: str, bridge: str, namespace: str | None, options: Options)
     has = _of_fleet if is_fleet(place) else _served
     async with has(place, bridge, namespace, tell) as ros:
         await ros.wait_first_attempts()
-        for node in ros.bridged:
+        for node in ros.bridged_nodes:
             why = "" if node.connected else f"  no rosbridge: {node.failure}"
             options.show(_node(node, bridge), f"{node.full_name}{why}")
             begun.add(node.full_name)
@@ -66,7 +66,7 @@ async def _served(
 ) -> AsyncIterator[RosbridgeFleet]:
     from smartcam.fleet import FleetServer, load_fleet
     from smartcam.fleet._inside import RosSection
-    from smartcam.ros1._inside import bridged
+    from smartcam.ros1._inside import run_bridged_nodes
 
     file, folder = load_fleet(path), Path(path).parent
     sections = {planned.name: planned.entry.ros2 for planned in file.plan()}
@@ -75,7 +75,7 @@ async def _served(
     section = file.ros2 or RosSection.model_validate({})
     async with FleetServer(file, folder=folder, restore=section.autostart) as server:
         await server.wait_first_attempts()
-        async with bridged(
+        async with run_bridged_nodes(
             bridge,
             report,
             server.address,
@@ -94,14 +94,14 @@ async def _of_fleet(
     url: str, bridge: str, namespace: str | None, report: Any
 ) -> AsyncIterator[RosbridgeFleet]:
     from smartcam.fleet._inside import FleetAddress
-    from smartcam.ros1._inside import bridged
+    from smartcam.ros1._inside import run_bridged_nodes
 
     address = FleetAddress.parse(url)
     if address.camera:
         raise ConfigurationError(
             f"fleet address {url!r} is a camera's: expected that of the fleet, fleet://HOST[:PORT]"
         )
-    async with bridged(bridge, report, address, _section(namespace or "/")) as ros:
+    async with run_bridged_nodes(bridge, report, address, _section(namespace or "/")) as ros:
         yield ros
 
 

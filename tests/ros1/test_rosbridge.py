@@ -179,10 +179,10 @@ async def test_newest_pictures_win_over_a_bridge_that_does_not_read(
     for number in range(60):  # more than any buffer of sockets holds
         publisher.publish(height=number, data=data)
         await asyncio.sleep(0)
-    waiting = len(publisher.lane._waiting)  # one less where the last turn has taken one
+    waiting = len(publisher.queue._waiting)  # one less where the last turn has taken one
     assert publisher.published + publisher.dropped + waiting == 60
     assert publisher.dropped > 30
-    assert publisher.lane.waiting_bytes < 3_000_000
+    assert publisher.queue.waiting_bytes < 3_000_000
     bridge.reading.set()
     await bridge.until(lambda: bridge.published and bridge.published[-1]["msg"]["height"] == 59)
     heights = [one["msg"]["height"] for one in bridge.published]
