@@ -50,7 +50,7 @@ def test_each_state_is_one_datagram(place: str, heard: socket.socket) -> None:
     notifier.ready("3 of 3,\nand a line")
     notifier.status("3 of 3, and a line")  # as before: nothing new
     notifier.status("x" * 1000)
-    notifier.alive()
+    notifier.report_alive()
     notifier.stopping()
     notifier.close()
     ready, reloading, again, long, alive, stopping = read(heard)
@@ -69,10 +69,10 @@ def test_who_does_not_read_stops_nothing_and_hears_of_states_later(
 ) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": place})
     for _ in range(1000):
-        notifier.alive()
+        notifier.report_alive()
     notifier.ready("here")
     assert ["READY=1", "STATUS=here"] not in read(heard)
-    notifier.alive()
+    notifier.report_alive()
     assert read(heard) == [["READY=1", "STATUS=here"], ["WATCHDOG=1"]]
     for _ in range(1000):
         notifier.ready("again")
@@ -83,7 +83,7 @@ def test_who_does_not_read_stops_nothing_and_hears_of_states_later(
 def test_nobody_is_told_if_nobody_wants_to_know(caplog: pytest.LogCaptureFixture) -> None:
     for given in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}):
         notifier = Notifier(given)
-        assert not notifier.wanted
+        assert not notifier.is_wanted
         notifier.ready("")
     assert "expected /PATH or @NAME, got 'vsock:2:1'" in caplog.text
     gone = Notifier({"NOTIFY_SOCKET": "/nowhere/at/all"})
@@ -106,7 +106,7 @@ async def test_the_loop_tells_that_it_runs_at_half_of_the_time(
 ) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": place, "WATCHDOG_USEC": "8000000"})
     said = "one"
-    with notifier.telling(lambda: said):
+    with notifier.reporting(lambda: said):
         assert read(heard) == [["WATCHDOG=1"], ["STATUS=one"]]
         await asyncio.sleep(3.9)
         assert read(heard) == []
