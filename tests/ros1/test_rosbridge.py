@@ -549,7 +549,7 @@ async def test_close_services_one_after_another(bridge: Bridge, node: RosbridgeN
     await bridge.until(lambda: not bridge.services)
     node.serve("~/last", TRIGGER, yes)
     assert (await bridge.call("/line1/cam3/last"))["result"] is True
-    assert not node._leaving
+    assert not node._to_withdraw
     assert [*bridge.services] == ["/line1/cam3/last"]
 
 

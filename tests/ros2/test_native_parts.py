@@ -152,13 +152,15 @@ def test_all_headers_are_moved_and_equal_stamps_stay_equal() -> None:
     image = TYPES.message("sensor_msgs/msg/Image")
     result = TYPES.message("smartcam_msgs/msg/Result")
     first = {"stamp": {"sec": 100, "nanosec": 250_000_000}, "frame_id": "cam"}
-    moved = image.decode(stamps.moved(image, image.encode({"header": first, "data": b"\1\2"})))
+    moved = image.decode(
+        stamps.to_ros_time(image, image.encode({"header": first, "data": b"\1\2"}))
+    )
     assert (moved.header.stamp.sec, moved.header.stamp.nanosec) == (98, 750_000_000)
     assert (moved.header.frame_id, bytes(moved.data)) == ("cam", b"\1\2")
     later = {"stamp": {"sec": 101}}
     parts = [{"pose": {"header": later}}, {"pose": {"header": first}}]
     fields = {"header": first, "localizations": parts}
-    again = result.decode(stamps.moved(result, result.encode(fields)))
+    again = result.decode(stamps.to_ros_time(result, result.encode(fields)))
     seconds = [again.header.stamp.sec, *(one.pose.header.stamp.sec for one in again.localizations)]
     assert seconds == [98, 99, 98]
 
@@ -166,5 +168,5 @@ def test_all_headers_are_moved_and_equal_stamps_stay_equal() -> None:
 def test_few_stamps_are_remembered() -> None:
     stamps = RosStamps(lambda: 1.0)
     for second in range(2 * MAX_STAMPS):
-        assert stamps._moved(second * BILLION) == (second + 1) * BILLION
-    assert len(stamps._moved_stamps) == MAX_STAMPS
+        assert stamps._shift_stamp(second * BILLION) == (second + 1) * BILLION
+    assert len(stamps._shifted_stamps) == MAX_STAMPS

@@ -32,7 +32,7 @@ from smartcam.exceptions import (
 from smartcam.frames import FrameSource, find_format
 from smartcam.ros2 import Node, frame_from
 from smartcam.ros2._cameras import picture_stream
-from smartcam.ros2._cameras.lens import as_path
+from smartcam.ros2._cameras.lens import path_from_url
 from smartcam.ros2._cameras.pictures import CameraPictures
 from smartcam.ros2._inside import DRIVER
 from tests.frames.drivers import ScriptedDriver, frame
@@ -298,9 +298,9 @@ def test_values_that_cannot_be_are_refused(options: dict[str, Any]) -> None:
 
 
 def test_where_a_lens_is_kept() -> None:
-    assert as_path("") is None
-    assert as_path("file:///a/b%20c.yaml") == Path("/a/b c.yaml")
-    assert as_path("b.yaml") == Path("b.yaml")
+    assert path_from_url("") is None
+    assert path_from_url("file:///a/b%20c.yaml") == Path("/a/b c.yaml")
+    assert path_from_url("b.yaml") == Path("b.yaml")
 
 
 # ---------------------------------------------------------------------- set_camera_info

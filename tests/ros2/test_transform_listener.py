@@ -251,9 +251,9 @@ async def test_a_clock_that_was_set_back_begins_anew(
 async def test_frames_and_moments_are_bounded(paper: Paper, listener: TransformListener) -> None:
     now = time.time()
     for number in range(MAX_FRAMES + 50):
-        listener._add(as_message("base", f"f{number}", now), static=True)
+        listener._add_transform(as_message("base", f"f{number}", now), static=True)
     for number in range(2 * MAX_TRANSFORMS_PER_FRAME):
-        listener._add(as_message("base", "f1", now + 1e-3 * number), static=False)
+        listener._add_transform(as_message("base", "f1", now + 1e-3 * number), static=False)
     assert len(listener._links) == MAX_FRAMES
     assert len(listener._links["f1"].times) == MAX_TRANSFORMS_PER_FRAME
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from smartcam._ros_names import check_domain
 from smartcam.exceptions import ConfigurationError, RosError
-from smartcam.ros2._native.installed import distribution, rclpy
+from smartcam.ros2._native.installed import installed_distribution, rclpy
 from smartcam.ros2._types.types import RosTypes
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class NativeContext:
         self.domain: int | None = None if domain is None else check_domain(domain)
         self.args: tuple[str, ...] = tuple(args)
         rclpy()
-        self.types: RosTypes = RosTypes(distribution or _distribution())
+        self.types: RosTypes = RosTypes(distribution or installed_distribution())
         self._lock = threading.Lock()
         self._context: Any = None
         self._user_count = 0
@@ -103,9 +103,6 @@ class NativeContext:
             context, self._context = self._context, None
         with contextlib.suppress(Exception):  # the context may already be shut down
             context.try_shutdown()
-
-
-_distribution = distribution
 
 
 class SpunNode:
