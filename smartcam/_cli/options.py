@@ -221,7 +221,7 @@ class Options:
                 f"{option}: it was made {done} --y-down: {to_do} here, too, or poses are mirrored"
             )
 
-    async def located(self, url: str) -> str:
+    async def locate_url(self, url: str) -> str:
         """Return the URL; for HOST[:PORT], search for a camera there and return its URL.
 
         Raises ConnectFailedError: no camera answers in any registered protocol; errors of
@@ -305,7 +305,7 @@ class Options:
         return calibration, doubt_of(calibration)
 
     @contextmanager
-    def tracing(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
+    def open_trace(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
         """Open the trace file; yield the function that writes an entry, None without ``--trace``.
 
         Raises UnsupportedError: the camera at ``url`` is a camera of a fleet; ConfigurationError:
@@ -391,7 +391,7 @@ class Options:
         layout = None if self.interpret_as is None else resolve(self.interpret_as).layout
         return value_text(value, ShownUnits(self.unit_names or ()), layout)
 
-    def remark(self, camera: Camera) -> None:
+    def show_remarks(self, camera: Camera) -> None:
         """Print on stderr what users of results should know about the camera's dialect, if any."""
         from smartcam._client._inside import remarks
 

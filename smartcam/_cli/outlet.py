@@ -61,7 +61,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
                     async with asyncio.timeout(options.seconds):
                         camera = make_camera()
                         await source.use_camera(camera, "", outlets)
-                        replace_camera = source.replacer(outlets)
+                        replace_camera = source.make_replacer(outlets)
                         await keep_open(camera, make_camera, replace_camera, source.show_open)
             finally:
                 await source.stop()
@@ -77,7 +77,7 @@ class _OutletSource:
         self.camera: Camera[Any] | None = None
         self._tasks: list[asyncio.Task[None]] = []
 
-    def replacer(self, outlets: Outlets) -> Any:
+    def make_replacer(self, outlets: Outlets) -> Any:
         async def replace_camera(camera: Camera[Any], reason: str) -> None:
             await self.use_camera(camera, reason, outlets)
 

@@ -128,7 +128,7 @@ class AgentRunner:
 
                 await stack.enter_async_context(FleetOutlets(server, self._notify_outlet))
             await self._start_agent(stack)
-            stack.callback(notifier.stopping)
+            stack.callback(notifier.report_stopping)
             server.reloads.on_reload = self._on_reload
             stack.enter_context(notifier.reporting(self._status))
             await stack.enter_async_context(
@@ -136,7 +136,7 @@ class AgentRunner:
             )
             await server.wait_first_attempts()
             self._is_ready = True
-            notifier.ready(self._status())
+            notifier.report_ready(self._status())
             if server.warning:
                 self._warn(server.warning)
             events = server.events()
@@ -227,10 +227,10 @@ class AgentRunner:
     def _on_reload(self, outcome: FleetChanges | SmartCamError | None) -> None:
         if outcome is None:
             if self._is_ready:
-                self._notifier.reloading("reading the fleet file again")
+                self._notifier.report_reloading("reading the fleet file again")
             return
         if self._is_ready:
-            self._notifier.ready(self._status())
+            self._notifier.report_ready(self._status())
         if not self._as_lines:  # otherwise it was logged
             failed = isinstance(outcome, Exception)
             text = (

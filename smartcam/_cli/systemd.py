@@ -51,20 +51,20 @@ class Notifier:
         self._failure_logged = False
         self._status = ""
 
-    def ready(self, status: str) -> None:
+    def report_ready(self, status: str) -> None:
         """Report that the program is ready, or ready again after a reload."""
         self._send("READY=1", self._status_line(status), keep=True)
 
-    def reloading(self, status: str) -> None:
-        """Report that a reload has begun; :meth:`ready` reports its end."""
+    def report_reloading(self, status: str) -> None:
+        """Report that a reload has begun; :meth:`report_ready` reports its end."""
         now = time.monotonic_ns() // 1000
         self._send("RELOADING=1", f"MONOTONIC_USEC={now}", self._status_line(status), keep=True)
 
-    def stopping(self) -> None:
+    def report_stopping(self) -> None:
         """Report that the program ends."""
         self._send("STOPPING=1", self._status_line("stopping"), keep=True)
 
-    def status(self, status: str) -> None:
+    def report_status(self, status: str) -> None:
         """Report the status, if it has changed."""
         old_status = self._status
         line = self._status_line(status)
@@ -126,7 +126,7 @@ class Notifier:
             timer = loop.call_later(period, tick)
             if self.watchdog is not None:
                 self.report_alive()
-            self.status(status())
+            self.report_status(status())
 
         tick()
         try:
