@@ -130,7 +130,9 @@ class RosPublisher(RosEndpoint):
         self._publisher: Any = None
         qos = entity.qos  # a message that must not be dropped may block, which the loop cannot
         self._may_send_directly = not qos.latched and not (qos.reliable and qos.depth is None)
-        self._blocking_publishers: dict[str, Any] = {}  # publishers that wait for room, by lane
+        self._blocking_publishers: dict[
+            str, Any
+        ] = {}  # publishers that wait for room, by thread name
         self._newest_publisher: Any = (
             None  # publisher that skips links with a message in transmission
         )
@@ -141,7 +143,7 @@ class RosPublisher(RosEndpoint):
         )
         self._declare_token()
 
-    def x(self, session: Any) -> Any:
+    def _declare_publisher(self, session: Any) -> Any:
         zenoh, qos = self._context.zenoh.engine, self.entity.qos
         drop = zenoh.CongestionControl.DROP
         block = zenoh.CongestionControl.BLOCK
