@@ -130,12 +130,10 @@ class RosPublisher(RosEndpoint):
         self._publisher: Any = None
         qos = entity.qos  # a message that must not be dropped may block, which the loop cannot
         self._may_send_directly = not qos.latched and not (qos.reliable and qos.depth is None)
-        self._blocking_publishers: dict[
-            str, Any
-        ] = {}  # publishers that wait for room, by thread name
-        self._newest_publisher: Any = (
-            None  # publisher that skips links with a message in transmission
-        )
+        # publishers that wait for room, by thread name
+        self._blocking_publishers: dict[str, Any] = {}
+        # publisher that skips links with a message in transmission
+        self._newest_publisher: Any = None
         self._slot: NewestSlot | None = None
         self._thread_name = "latched" if qos.latched else "short"
         self._declared_publisher = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(
