@@ -51,8 +51,8 @@ class LinkListener(Protocol):
     def on_operation(self, operation: dict[str, Any]) -> None:
         """Handle an operation; never wait."""
 
-    async def on_lost(self, was_connected: bool) -> None:
-        """Handle a lost connection; without ``was_connected``, a failed attempt to connect."""
+    async def on_lost(self, was: bool) -> None:
+        """Handle a lost connection; ``was``: it was connected, not only tried."""
 
 
 def checked_url(url: str) -> str:

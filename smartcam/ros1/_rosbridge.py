@@ -258,24 +258,24 @@ class RosbridgeNode(NamedNode):
 
     # ------------------------------------------------------------------ for publishers and services
 
-    def has(self, endpoint: RosbridgePublisher | RosbridgeService) -> bool:
+    def has(self, end: RosbridgePublisher | RosbridgeService) -> bool:
         """Return True if a publisher or service is not closed."""
-        return endpoint in (self._publishers.get(endpoint.name), self._services.get(endpoint.name))
+        return end in (self._publishers.get(end.name), self._services.get(end.name))
 
-    def forget(self, endpoint: RosbridgePublisher | RosbridgeService) -> None:
+    def forget(self, end: RosbridgePublisher | RosbridgeService) -> None:
         """Remove a closed publisher or service."""
-        if not self.has(endpoint):
+        if not self.has(end):
             return
-        if isinstance(endpoint, RosbridgePublisher):
-            del self._publishers[endpoint.name]
-            if endpoint.has_ros1_type:
-                self._outbox.remove_queue(endpoint.queue)
-                self.send(encode_operation({"op": "unadvertise", "topic": endpoint.name}))
+        if isinstance(end, RosbridgePublisher):
+            del self._publishers[end.name]
+            if end.has_ros1_type:
+                self._outbox.remove_queue(end.queue)
+                self.send(encode_operation({"op": "unadvertise", "topic": end.name}))
             return
-        del self._services[endpoint.name]
-        endpoint.discard_calls()
-        if endpoint.has_ros1_type:
-            self._to_withdraw.append(endpoint)
+        del self._services[end.name]
+        end.discard_calls()
+        if end.has_ros1_type:
+            self._to_withdraw.append(end)
             self._schedule_changes()
 
     def forget_subscription(self, subscription: RosbridgeSubscription) -> None:
@@ -300,9 +300,9 @@ class RosbridgeNode(NamedNode):
         """Wake the task that sends, since a message waits."""
         self._outbox.wake()
 
-    def begin(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Start a task that is cancelled when this bridge is lost."""
-        task = asyncio.create_task(coroutine)
+        task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
@@ -401,9 +401,9 @@ class RosbridgeNode(NamedNode):
         else:
             handle(operation)
 
-    async def on_lost(self, was_connected: bool) -> None:
+    async def on_lost(self, was: bool) -> None:
         """End the calls and tasks of the lost bridge."""
-        if self._link_task is not None and was_connected:
+        if self._link_task is not None and was:
             self._report_change()
         for service in self._services.values():
             service.discard_calls()

@@ -87,8 +87,8 @@ def test_nobody_is_told_if_nobody_wants_to_know(caplog: pytest.LogCaptureFixture
         notifier.report_ready("")
     assert "expected /PATH or @NAME, got 'vsock:2:1'" in caplog.text
     gone = Notifier({"NOTIFY_SOCKET": "/nowhere/at/all"})
-    gone.ready("")
-    gone.stopping()
+    gone.report_ready("")
+    gone.report_stopping()
     gone.close()
     assert caplog.text.count("reports to systemd by NOTIFY_SOCKET fail") == 1
 

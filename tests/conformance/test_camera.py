@@ -208,7 +208,7 @@ def test_judge_sinful_camera_fails_the_check(number: int, judged: Judged) -> Non
     sin = camera_sins.SINS[number]
     finding = judged[len(WORLDS) + len(SETTINGS) + number][sin.check]
     assert finding.outcome is CheckOutcome.DIFFERS, finding
-    assert sin.observed in finding.observed
+    assert sin.came in finding.observed
     assert finding.wire
 
 

@@ -678,7 +678,7 @@ async def test_answers_to_a_bridge_that_does_not_read_have_a_bound(
             await bridge.say({"op": "call_service", "service": service.name, "id": str(number)})
 
     calling = asyncio.create_task(call())
-    while not node._outbox.full:  # noqa: ASYNC110 - there is no event for it
+    while not node._outbox.is_full:  # noqa: ASYNC110 - there is no event for it
         await asyncio.sleep(0.001)
     assert service.calls < 20
     bridge.reading.set()
@@ -795,7 +795,7 @@ async def test_newest_messages_wait_and_wrong_ones_are_left_out(
 
 async def test_what_ros1_has_not_is_not_asked_for(bridge: Bridge, node: RosbridgeNode) -> None:
     heard = node.subscribe("found", "vision_msgs/msg/Detection3DArray")
-    assert not heard.exists
+    assert not heard.has_ros1_type
     heard.close()
     with pytest.raises(ConfigurationError):
         node.subscribe("no topic", STRING)

@@ -75,20 +75,20 @@ def test_jobs_are_done_in_order_and_all_before_it_ends() -> None:
     done: list[int] = []
     box = MessageThread("test")
     for number in range(1000):
-        box.put(lambda number=number: done.append(number))  # type: ignore[misc]
+        box.add_job(lambda number=number: done.append(number))  # type: ignore[misc]
     assert box.close(10.0)
     assert done == [*range(1000)]
     with pytest.raises(RosError, match="closed"):
-        box.put(lambda: done.append(1))
+        box.add_job(lambda: done.append(1))
 
 
 def test_what_waits_is_bounded_and_the_oldest_goes() -> None:
     go, done, dropped = threading.Event(), list[int](), list[int]()
     box = MessageThread("test")
-    box.put(go.wait)  # type: ignore[arg-type]
-    box.put(lambda: done.append(-1))  # which cannot be dropped
+    box.add_job(go.wait)  # type: ignore[arg-type]
+    box.add_job(lambda: done.append(-1))  # which cannot be dropped
     for number in range(MAX_WAITING_MESSAGES + 10):
-        box.put(
+        box.add_job(
             lambda number=number: done.append(number),  # type: ignore[misc]
             1,
             lambda number=number: dropped.append(number),  # type: ignore[misc]
@@ -103,7 +103,7 @@ def test_what_waits_is_bounded_and_the_oldest_goes() -> None:
 def test_one_that_does_not_end_holds_up_nobody_for_long() -> None:
     go = threading.Event()
     box = MessageThread("test")
-    box.put(go.wait)  # type: ignore[arg-type]
+    box.add_job(go.wait)  # type: ignore[arg-type]
     assert not box.close(0.05)
     go.set()
     assert box.close(10.0)
@@ -112,8 +112,8 @@ def test_one_that_does_not_end_holds_up_nobody_for_long() -> None:
 def test_a_job_that_fails_leaves_the_others() -> None:
     done: list[int] = []
     box = MessageThread("test")
-    box.put(lambda: [][0])
-    box.put(lambda: done.append(1))
+    box.add_job(lambda: [][0])
+    box.add_job(lambda: done.append(1))
     assert box.close(10.0)
     assert done == [1]
 

@@ -236,9 +236,9 @@ class RawClient:
                 return frame
         deadline = time.monotonic() + timeout
         while (remaining := deadline - time.monotonic()) > 0:
-            frame = self.next_frame(remaining)
-            if frame is not None and matches(frame):
-                return frame
+            next_frame = self.next_frame(remaining)
+            if next_frame is not None and matches(next_frame):
+                return next_frame
         raise Differs(f"{expected} within {timeout:g} s", self.describe_received(first_index))
 
     def ask(self, request: m.Message, *, timeout: float | None = None) -> ReceivedFrame:

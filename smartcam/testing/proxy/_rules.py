@@ -99,8 +99,8 @@ class Rule:
         """Return True if the rule is for this direction of this connection."""
         return self.direction == direction and self.connection in {None, connection}
 
-    def with_offset(self, offset: int) -> Self:
-        """Return the rule, acting ``offset`` bytes, or datagrams, later."""
+    def ahead(self, by: int) -> Self:
+        """Return the rule, acting ``by`` bytes, or datagrams, later."""
         return self
 
 
@@ -132,9 +132,9 @@ class PlacedRule(StreamRule):
 
     at: int = 0
 
-    def with_offset(self, offset: int) -> Self:
-        """Return the rule, acting ``offset`` bytes later."""
-        return replace(self, at=self.at + offset)
+    def ahead(self, by: int) -> Self:
+        """Return the rule, acting ``by`` bytes later."""
+        return replace(self, at=self.at + by)
 
 
 class PointRule(PlacedRule):
@@ -314,9 +314,9 @@ class DatagramRule(Rule):
             return chance.random() < self.probability
         return number == self.number
 
-    def with_offset(self, offset: int) -> Self:
-        """Return the rule for the datagram that comes ``offset`` datagrams later."""
-        return self if self.number is None else replace(self, number=self.number + offset)
+    def ahead(self, by: int) -> Self:
+        """Return the rule for the datagram that comes ``by`` datagrams later."""
+        return self if self.number is None else replace(self, number=self.number + by)
 
 
 class Lose(DatagramRule):

@@ -75,9 +75,7 @@ class _Peer(Proxied):
                 if isinstance(rule, DatagramRule) and rule.concerns(self.number, direction):
                     seed = f"{rule.seed}:{self.number}:{direction}"
                     rng = Random(seed)  # noqa: S311 - no secret
-                    self._rules[direction].append(
-                        (rule.with_offset(self._datagrams[direction]), rng)
-                    )
+                    self._rules[direction].append((rule.ahead(self._datagrams[direction]), rng))
 
     def pass_datagram(self, direction: Direction, data: bytes) -> None:
         """Apply the rules to a datagram, and send what they leave of it."""
