@@ -265,7 +265,7 @@ UNDESCRIBED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "sin", "dialect", "came"), UNDESCRIBED)
+@pytest.mark.parametrize(("name", "sin", "dialect", "observed"), UNDESCRIBED)
 @at_any_pace
 def test_judge_answer_that_no_setting_describes_is_reported(
     name: str, sin: Any, dialect: str, observed: str, monkeypatch: pytest.MonkeyPatch

@@ -132,7 +132,7 @@ def test_changes_of_parameters_reach_ros(monkeypatch: pytest.MonkeyPatch) -> Non
     )
     made = parameters.NativeParameters(node)
     monkeypatch.setattr(made, "_declare_in_ros", lambda name: seen.append(("declare", name)))
-    monkeypatch.setattr(made, "_parameter", lambda name: (name, made.get(name)))
+    monkeypatch.setattr(made, "_rclpy_parameter", lambda name: (name, made.get(name)))
     made.declare("rate", 1)
     assert seen == []
     made.open()

@@ -59,10 +59,10 @@ class SubscribedPictures(Generic[Item]):
     def start(self) -> None:
         """Start to check for subscribers."""
         if self._task is None:
-            stop_watching = [getattr(publisher, "watch", None) for publisher in self._publishers]
-            if None not in stop_watching:
+            methods = [getattr(publisher, "watch", None) for publisher in self._publishers]
+            if None not in methods:
                 self._stop_watching = [
-                    watch(self._subscriber_event.set) for watch in stop_watching if watch
+                    watch(self._subscriber_event.set) for watch in methods if watch
                 ]
             self._task = asyncio.get_running_loop().create_task(
                 self._run(), name=f"pictures of {self._name}"
