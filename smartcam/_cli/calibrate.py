@@ -291,7 +291,7 @@ def _make_service(folder: str, sources: _Sources) -> CalibrationService:
 
 @dataclass(frozen=True, slots=True)
 class _Sources:
-    """What the options give: the sources of localizations and pictures, the target, the lens."""
+    """The sources of localizations and pictures, the target and the lens of the options."""
 
     options: Options
     url: str | None

@@ -29,7 +29,7 @@ LAYERS: Final = 5
 """Number of blocks that the robot puts onto the tower."""
 
 PERSON: Final = {2: "add", 4: "remove"}
-"""What a person does to the tower, by the number of blocks that the robot has put on it before."""
+"""A person's actions on the tower, by the number of blocks that the robot has put on it before."""
 
 OVERVIEW: Final = (0.38, 0.0, 0.75)
 """Place from which the camera sees the whole table, metres."""

@@ -233,7 +233,7 @@ class _FirstTries:
             raise error
 
     async def run(self) -> None:
-        """Raise the first error when all sources have failed permanently; else wait for ever."""
+        """Raise the first error once all sources failed permanently; else wait until cancelled."""
         await self.wait_for_all()
         await asyncio.Event().wait()
 

@@ -142,7 +142,7 @@ async def record(
 
 
 class _Plan(NamedTuple):
-    """What a recording does in addition: triggers, and pictures."""
+    """The triggers that a recording sends, and the pictures that it records."""
 
     every: float | None  # seconds between triggers; None: none are sent
     source: FrameSource | None  # source whose pictures are recorded, too

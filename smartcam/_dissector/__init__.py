@@ -80,7 +80,7 @@ def _dialect_table(dialect: FramedDialect) -> dict[str, Any]:
 
 
 def _quirk_differences(variant: FramedDialect, rows_without_quirk: Rows) -> dict[str, Any]:
-    """Return how a dialect with one quirk differs from the dialect without it."""
+    """Return the differences of a dialect with one quirk from the dialect without it."""
     (name,) = variant.quirks
     return {
         "name": name,

@@ -94,7 +94,7 @@ class Outbox:
         self._queues.append(queue)
 
     def remove_queue(self, queue: TopicQueue) -> None:
-        """No longer send the messages of a queue."""
+        """Stop sending the messages of a queue."""
         self._queues.remove(queue)
 
     def wake(self) -> None:

@@ -50,7 +50,7 @@ class CameraServices:
         camera: the camera.
         node: the camera's node.
         results: the results that the node publishes.
-        life: the node's life cycle.
+        lifecycle: the node's life cycle.
         calibrations: the camera's calibrations; None if there is no folder for them.
     """
 

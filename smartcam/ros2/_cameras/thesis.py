@@ -48,13 +48,13 @@ class ManagedCamera(Protocol):
 
 
 class RosThesisFace:
-    """What the thesis' services do with a camera's node.
+    """The operations of the thesis' services on a camera's node.
 
     Args:
         camera: the camera.
         node: the camera's node.
         results: the results that the node publishes.
-        life: the node's life cycle.
+        lifecycle: the node's life cycle.
     """
 
     def __init__(

@@ -48,7 +48,7 @@ MAX_EXTRAPOLATION_SECONDS: Final = 0.25
 """Seconds before the first received transform for which that transform is still used."""
 
 MAX_STAMP_STEP_BACK: Final = 10.0
-"""Seconds by which a stamp may be older than the newest; an older one means a clock set back."""
+"""Largest age of a stamp against the newest one, seconds; an older one means a clock set back."""
 
 MAX_FRAMES: Final = 2000
 """Largest number of known frames; further ones are left out, and the first is logged."""
