@@ -44,9 +44,9 @@ class ViewCollector:
     def add_if_new(self, view: TargetView) -> bool:
         """Add a view if the target is still and at a new place; return True if it was added."""
         last, self._last = self._last, view
-        still = last is not None and _point_distance(last, view) <= MAX_STILL_MOTION_PX
+        is_still = last is not None and _point_distance(last, view) <= MAX_STILL_MOTION_PX
         least_motion = MIN_NEW_VIEW_SHARE * view.size[0]
-        if not still or any(
+        if not is_still or any(
             _point_distance(earlier, view) < least_motion for earlier in self.views
         ):
             return False

@@ -225,10 +225,10 @@ async def _read_text(
 
 def _prompt_text(schema: Mapping[str, Any], default: Any) -> str:
     unit = f", {schema['x-unit']}" if "x-unit" in schema else ""
-    shown = "" if default in {None, ""} else f" [{_default_text(default)}]"
+    default_text = "" if default in {None, ""} else f" [{_default_text(default)}]"
     rows = [f"    {choice['const']}: {choice['title']}\n" for choice in schema.get("oneOf", ())]
     head = f"{schema['title']}{unit}"
-    return f"{head}\n{''.join(rows)}  answer{shown}" if rows else f"{head}{shown}"
+    return f"{head}\n{''.join(rows)}  answer{default_text}" if rows else f"{head}{default_text}"
 
 
 def _default_text(value: Any) -> str:

@@ -161,7 +161,7 @@ def _show_frame(
     for sender in _possible_senders(dialect, frame):
         name = type(dialect.decode(sender, frame)).__name__  # raises if it is too short
         fields = view_fields(dialect, sender, raw)
-        shown: dict[str, Any] = {
+        frame_data: dict[str, Any] = {
             "offset": offset,
             "dialect": dialect.name,
             "sender": sender.value,
@@ -176,9 +176,9 @@ def _show_frame(
         ]
         lines.append(table_text(("offset", "field", "bytes", "value"), rows))
         if name == ResultContainer.__name__ and interpreter is not None:
-            shown["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
-            lines.append(options.value_text(shown["value"]))
-        options.show(shown, "\n".join(lines))
+            frame_data["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
+            lines.append(options.value_text(frame_data["value"]))
+        options.show(frame_data, "\n".join(lines))
 
 
 def _possible_senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
@@ -190,8 +190,8 @@ def _possible_senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
         for sender in Sender
         if dialect.knows(sender, frame.message_id) and dialect.surplus(sender, frame) == 0
     ]
-    known = [sender for sender in Sender if dialect.knows(sender, frame.message_id)]
-    return exact or known[-1:] or [Sender.CAMERA]
+    possible = [sender for sender in Sender if dialect.knows(sender, frame.message_id)]
+    return exact or possible[-1:] or [Sender.CAMERA]
 
 
 def _interpret(payload: bytes, interpreter: Interpreter, byte_order: ByteOrder) -> Any:

@@ -158,21 +158,21 @@ def _put_on_table(scene: TableScene, things: dict[str, TablePose]) -> None:
 
 
 def _calibrate(
-    seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, steps: Steps
+    marks_seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, steps: Steps
 ) -> PlaneCalibration:
     from smartcam.calibration import fit_plane
 
-    camera_points = [tuple(mark.pose.position[:2]) for mark in seen]
-    robot_points = [robot.touch(marks[mark.feature_id]).tolist() for mark in seen]
+    camera_points = [tuple(mark.pose.position[:2]) for mark in marks_seen]
+    robot_points = [robot.touch(marks[mark.feature_id]).tolist() for mark in marks_seen]
     steps.step(
-        f"The camera localizes {len(seen)} marks, the robot touches each of them "
+        f"The camera localizes {len(marks_seen)} marks, the robot touches each of them "
         f"({1e3 * TOUCH_SIGMA:g} mm of noise on each axis), mm:",
         camera_points=camera_points,
         robot_points=robot_points,
     )
     rows = [
         (mark.feature_id, *_mm_texts(*camera, *touched))
-        for mark, camera, touched in zip(seen, camera_points, robot_points, strict=True)
+        for mark, camera, touched in zip(marks_seen, camera_points, robot_points, strict=True)
     ]
     steps.detail(table_text(("mark", *_align_right("camera x", "y", "robot x", "y", "z")), rows))
     calibration = fit_plane(

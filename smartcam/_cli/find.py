@@ -132,15 +132,15 @@ async def find(
 
     if as_yaml and options.as_json:
         raise click.UsageError("--json and --yaml do not go together")
-    known: dict[str, dict[str, str]] = {}
+    fleet_cameras: dict[str, dict[str, str]] = {}
     used_names: set[str] = set()
     if fleet_file is not None:
-        known, used_names = await asyncio.to_thread(_fleet_cameras, fleet_file)
+        fleet_cameras, used_names = await asyncio.to_thread(_fleet_cameras, fleet_file)
     search = CameraSearch(
         networks,
         ports=ports,
         protocols=protocols or None,
-        leave=[*leave, *known],
+        leave=[*leave, *fleet_cameras],
         timeout=port_timeout,
         **search_options,
     )
@@ -149,7 +149,11 @@ async def find(
             await search.run()
     finally:
         if search.begun:
-            left_alone = {host: known[text] for host, text in search.left.items() if text in known}
+            left_alone = {
+                host: fleet_cameras[text]
+                for host, text in search.left.items()
+                if text in fleet_cameras
+            }
             if as_yaml:
                 click.echo("\n".join(fleet_lines(search.results(), used_names)))
             else:

@@ -78,8 +78,8 @@ def _require_cameras(fleet: Fleet) -> None:
 async def list_(url: str, pattern: str, options: Options) -> None:
     async with _make_fleet(url, options) as fleet:
         _require_cameras(fleet)
-        known = await fleet.status(pattern)
-        cameras = [_camera_data(fleet, name, known.get(name)) for name in fleet.names(pattern)]
+        summaries = await fleet.status(pattern)
+        cameras = [_camera_data(fleet, name, summaries.get(name)) for name in fleet.names(pattern)]
         warning = fleet.warning
     if warning:
         click.echo(f"{coloured('error', 'warning:')} {warning}", err=True)
@@ -97,26 +97,26 @@ async def list_(url: str, pattern: str, options: Options) -> None:
             click.echo(value["reason"])
 
 
-def _camera_data(fleet: Fleet, name: str, known: CameraSummary | None) -> dict[str, Any]:
+def _camera_data(fleet: Fleet, name: str, summary: CameraSummary | None) -> dict[str, Any]:
     """Return the state of a fleet's camera as values for JSON."""
-    is_connected = known is not None and known.connected
+    is_connected = summary is not None and summary.connected
     return {
         "camera": name,
-        "agents": fleet.agents(name) if known is None else [known.agent],
+        "agents": fleet.agents(name) if summary is None else [summary.agent],
         "connected": is_connected,
-        "application": known.application if known is not None and is_connected else None,
-        "status": known.status if known is not None and is_connected else None,
+        "application": summary.application if summary is not None and is_connected else None,
+        "status": summary.status if summary is not None and is_connected else None,
         "url": fleet.url_of(name),
-        "reason": _missing_reason(name, known),
+        "reason": _missing_reason(name, summary),
     }
 
 
-def _missing_reason(name: str, known: CameraSummary | None) -> str | None:
-    if known is None:
+def _missing_reason(name: str, summary: CameraSummary | None) -> str | None:
+    if summary is None:
         return f"{name}: its agent does not answer"
-    if known.reason is None:
+    if summary.reason is None:
         return None
-    return f"{name}: the agent has no session with the camera: {known.reason}"
+    return f"{name}: the agent has no session with the camera: {summary.reason}"
 
 
 def _camera_row(value: dict[str, Any]) -> tuple[str, ...]:
@@ -244,8 +244,8 @@ async def _ask_outlets(url: str, options: Options) -> None:
     if options.as_json:
         for outlet in outlets:
             account = outlet._asdict()
-            shown = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
-            options.show({**shown, "account": account}, "")
+            labels = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
+            options.show({**labels, "account": account}, "")
         return
     rows = [
         (outlet.agent, outlet.outlet, *_account_row(outlet._asdict()), outlet.trouble or "well")

@@ -67,8 +67,8 @@ async def list_(scheme: str | None, options: Options) -> None:
     from smartcam.frames._inside import FRAME_TIMEOUT
     from smartcam.registry import FRAMES
 
-    known = [info.name for info in FRAMES.available()]
-    schemes = known if scheme is None else [scheme]
+    all_schemes = [info.name for info in FRAMES.available()]
+    schemes = all_schemes if scheme is None else [scheme]
     seconds = options.step_timeout(FRAME_TIMEOUT)
     searches = await asyncio.gather(*(_search(name, seconds) for name in schemes))
     shown_urls: set[str] = set()

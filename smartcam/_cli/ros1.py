@@ -81,8 +81,8 @@ async def _serve_file(
             server.address,
             _make_section(namespace or section.namespace, autostart=section.autostart),
             cameras=sections,
-            calibrations={name: made for name, made in calibrations.items() if made is not None},
-            hand_eyes={name: made for name, made in hand_eyes.items() if made is not None},
+            calibrations={name: value for name, value in calibrations.items() if value is not None},
+            hand_eyes={name: value for name, value in hand_eyes.items() if value is not None},
             wanted=lambda agent, _camera: agent == file.agent_name,
             desks=server.calibrations,
         ) as ros:

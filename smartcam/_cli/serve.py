@@ -337,8 +337,8 @@ def _camera_data(server: FleetServer, name: str) -> dict[str, Any]:
 
 def report_event(server: FleetServer, event: CameraEvent, options: Options) -> None:
     """Report that a camera was connected, or lost."""
-    known = event.camera in server.hosts
-    if not (known and isinstance(event, (Connected, Disconnected, Reconnected))):
+    is_shared = event.camera in server.hosts
+    if not (is_shared and isinstance(event, (Connected, Disconnected, Reconnected))):
         return
     value = _camera_data(server, event.camera)
     if isinstance(event, Disconnected):

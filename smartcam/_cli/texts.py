@@ -143,10 +143,10 @@ def _field_text(
 def _records_text(rows: list[dict[str, Any]], symbols: Mapping[str, str], units: ShownUnits) -> str:
     """Return a table with a row for each record, and the units in the headings."""
     heads = [_heading(name, symbols.get(name, ""), units) for name in rows[0]]
-    shown = [
+    cells = [
         [units.shown(value, symbols.get(name, "")) for name, value in row.items()] for row in rows
     ]
-    return table_text(heads, shown)
+    return table_text(heads, cells)
 
 
 def _heading(name: str, symbol: str, units: ShownUnits) -> str:
@@ -164,9 +164,9 @@ def _localizations_text(parts: list[Localization], units: ShownUnits) -> str:
         head = ("x", "y", "theta")
         rows = [(*part.pose.position[:2], part.pose.orientation.theta) for part in parts]
     names = ("feature_id", "quality", *head)
-    named = [(*part[:2], *row) for part, row in zip(parts, rows, strict=True)]
+    all_rows = [(*part[:2], *row) for part, row in zip(parts, rows, strict=True)]
     symbols = {"x": "m", "y": "m", "z": "m", "theta": "rad"}
-    return _records_text([dict(zip(names, row, strict=True)) for row in named], symbols, units)
+    return _records_text([dict(zip(names, row, strict=True)) for row in all_rows], symbols, units)
 
 
 def _cell(value: object) -> str:

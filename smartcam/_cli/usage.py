@@ -154,8 +154,8 @@ def _suggesting_options() -> Iterator[None]:
         from smartcam._suggestions import did_you_mean
 
         params = exc.ctx.command.params
-        known = [name for each in params for name in (*each.opts, *each.secondary_opts)]
-        names = [name for name in known if name.startswith("--")]
+        all_names = [name for each in params for name in (*each.opts, *each.secondary_opts)]
+        names = [name for name in all_names if name.startswith("--")]
         hint = did_you_mean(exc.option_name, names) or "."
         text = f"No such option {exc.option_name!r}{hint}"
         raise click.NoSuchOption(exc.option_name, text, ctx=exc.ctx) from exc

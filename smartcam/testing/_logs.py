@@ -125,9 +125,9 @@ class CameraLog(Sequence["LogEntry"]):
         __tracebackhide__ = True
         only = check_flag(only, "only", "expect")
         timeout = check_seconds(timeout, "timeout", "expect")
-        wanted = [_checked_expectation(message) for message in expected]
+        expectations = [_checked_expectation(message) for message in expected]
         self._expect_no_mistake(
-            lambda entries: _find_order_mistake(entries, wanted, only=only),
+            lambda entries: _find_order_mistake(entries, expectations, only=only),
             timeout,
             needs_whole_log=only,
         )
@@ -195,8 +195,8 @@ class CameraLog(Sequence["LogEntry"]):
                     sessions.add(entry.peer)
         for peer in sorted(sessions):
             if not isinstance(last[peer].message, m.Disconnect):
-                ended = next((v for v in self._visits() if v.peer == peer), None)
-                how = "" if ended is None else f", and {_end_text(ended)}"
+                visit = next((v for v in self._visits() if v.peer == peer), None)
+                how = "" if visit is None else f", and {_end_text(visit)}"
                 return (
                     f"the last message of {peer} was {_entry_text(last[peer])}, not Disconnect{how}"
                 )
@@ -264,25 +264,25 @@ def _matches(entry: LogEntry, expected: Expected) -> bool:
 
 
 def _find_order_mistake(
-    entries: list[LogEntry], wanted: list[Expected], *, only: bool
+    entries: list[LogEntry], expectations: list[Expected], *, only: bool
 ) -> str | None:
     """Return the mistake as text, None without one."""
     frames = [entry for entry in entries if entry.error is None]
     matched_count = 0
     for entry in frames:
-        if matched_count < len(wanted) and _matches(entry, wanted[matched_count]):
+        if matched_count < len(expectations) and _matches(entry, expectations[matched_count]):
             matched_count += 1
         elif only and entry.direction == "in":
-            position = _position_text(wanted, matched_count)
+            position = _position_text(expectations, matched_count)
             return f"the client also sent {_entry_text(entry)}, {position}"
-    if matched_count == len(wanted):
+    if matched_count == len(expectations):
         return None
-    missing = _expectation_name(wanted[matched_count])
-    return f"expected {missing}, {_position_text(wanted, matched_count)}; it did not come"
+    missing = _expectation_name(expectations[matched_count])
+    return f"expected {missing}, {_position_text(expectations, matched_count)}; it did not come"
 
 
-def _position_text(wanted: list[Expected], matched_count: int) -> str:
-    done = ", ".join(_expectation_name(message) for message in wanted[:matched_count])
+def _position_text(expectations: list[Expected], matched_count: int) -> str:
+    done = ", ".join(_expectation_name(message) for message in expectations[:matched_count])
     return f"after {done}" if done else "at first"
 
 
@@ -313,8 +313,8 @@ def _find_refused_frame(entries: list[LogEntry]) -> str | None:
 
 
 def _end_text(visit: Visit) -> str:
-    how = "reset" if visit.reset else "closed"
-    return f"the {visit.ended_by} {how} the connection"
+    manner = "reset" if visit.reset else "closed"
+    return f"the {visit.ended_by} {manner} the connection"
 
 
 def _expectation_name(expected: Expected) -> str:

@@ -109,5 +109,5 @@ def only_documented_messages_came(camera: CameraUnderTest) -> None:
     if camera.flaws:
         raise Differs(
             "only messages and lengths that are documented",
-            "; ".join(f"{flaw} ({shown})" for flaw, shown in camera.flaws.items()),
+            "; ".join(f"{flaw} ({frame_text})" for flaw, frame_text in camera.flaws.items()),
         )

@@ -199,9 +199,9 @@ class RawClient:
 
     def _mark_ended(self, exc: OSError | None) -> LinkClosedError:
         self.ended = True
-        how = f"the camera has ended the link: {exc or 'it is closed'}"
-        self._note("!", how)
-        return LinkClosedError(how)
+        text = f"the camera has ended the link: {exc or 'it is closed'}"
+        self._note("!", text)
+        return LinkClosedError(text)
 
     def _note(self, sign: str, text: str) -> None:
         self._message_log.append(f"{time.monotonic() - self._opened_at:8.3f} {sign} {text}")
@@ -281,11 +281,11 @@ class RawClient:
 
     def describe_received(self, start_index: int = 0) -> str:
         """Return the frames of :attr:`received` from an index on as text, at most five of them."""
-        shown = [self.wire.describe(frame) for frame in self.received[start_index:]]
-        if len(shown) > 5:
-            shown = [*shown[:4], f"{len(shown) - 4} more"]
+        texts = [self.wire.describe(frame) for frame in self.received[start_index:]]
+        if len(texts) > 5:
+            texts = [*texts[:4], f"{len(texts) - 4} more"]
         end = ["the end of the link"] if self.ended else []
-        return "; ".join(shown + end) or "nothing"
+        return "; ".join(texts + end) or "nothing"
 
     # ------------------------------------------------------------------ the status
 

@@ -75,8 +75,8 @@ def trigger_is_acknowledged(camera: CameraUnderTest) -> None:
     for inspection in observe_inspections(camera):
         answers = frames_with_id(inspection.frames, MessageId.TRIGGER)
         if [camera.wire.read_numbers(answer.body) for answer in answers] != [(0,)]:
-            shown = "; ".join(map(camera.wire.describe, inspection.frames)) or "nothing"
-            raise Differs("one answer to the trigger, the code 0", shown)
+            frames_text = "; ".join(map(camera.wire.describe, inspection.frames)) or "nothing"
+            raise Differs("one answer to the trigger, the code 0", frames_text)
 
 
 @check({"": "SC-A30, SC-C50, published", "bid": "ID-b 210, published"}, needs=Allow.TRIGGER)
@@ -93,8 +93,8 @@ def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
             indices = inspection.transition_indices()
             fell, rose = indices[0] is not None, indices[2] is not None
         if not (fell and rose):
-            shown = "; ".join(map(camera.wire.describe, inspection.frames)) or "nothing"
-            raise Differs("Waiting for Trigger falls with a trigger and rises again", shown)
+            frames_text = "; ".join(map(camera.wire.describe, inspection.frames)) or "nothing"
+            raise Differs("Waiting for Trigger falls with a trigger and rises again", frames_text)
 
 
 @check("SC-A30, SC-B33, published", needs=Allow.TRIGGER, dialects=SMART)

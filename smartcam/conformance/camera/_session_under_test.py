@@ -161,8 +161,8 @@ class CameraUnderTest:
         try:
             client = self.open_link()
         except OSError as exc:
-            where = f"{self._address.host}:{self._address.port}"
-            raise NotObserved(f"there is no connection to {where}: {exc}") from exc
+            address_text = f"{self._address.host}:{self._address.port}"
+            raise NotObserved(f"there is no connection to {address_text}: {exc}") from exc
         try:
             with client:
                 yield client
@@ -387,7 +387,7 @@ class CameraUnderTest:
         before, reason = self.state_before, ""
         if not self._state_changed or before is None or (self.not_restored and not retry):
             return
-        gone, self.gone_reason = self.gone_reason, ""
+        old_reason, self.gone_reason = self.gone_reason, ""
         for _ in range(RESTORE_TRIES):
             try:
                 with self.session() as client:
@@ -400,7 +400,7 @@ class CameraUnderTest:
                 self._state_changed = False
                 self.not_restored = ""
                 return
-        self.gone_reason = self.gone_reason or gone
+        self.gone_reason = self.gone_reason or old_reason
         run = "running" if before.running else "stopped"
         self.not_restored = (
             f"application {before.application}, {run}, could not be put back: {reason}"

@@ -91,8 +91,8 @@ def busy_during_a_switch(camera: CameraUnderTest) -> None:
     busy = camera.wire.bits.busy
     words = camera.wire.status_words(observed.frames)
     if not any(word & busy for word in words) or words[-1] & busy:
-        shown = "; ".join(map(camera.wire.describe, observed.frames))
-        raise Differs("a status with BUSY during the switch, and one without it after", shown)
+        frames_text = "; ".join(map(camera.wire.describe, observed.frames))
+        raise Differs("a status with BUSY during the switch, and one without it after", frames_text)
 
 
 @check(

@@ -156,10 +156,10 @@ class RawDialect:
     def _describe(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
         spelled = self.dialect.spell(sender, LibraryFrame(message_id, body))
         fields = ", ".join(f"{name}={value}" for name, value in (spelled.fields or {}).items())
-        shown = f"{spelled.message}({fields})" if len(fields) <= 100 else spelled.message
+        label = f"{spelled.message}({fields})" if len(fields) <= 100 else spelled.message
         if not self.dialect.knows(sender, message_id):
-            shown = f"id {message_id:#04x}"
-        return f"{shown}: {hex_excerpt(raw or spelled.data)}"
+            label = f"id {message_id:#04x}"
+        return f"{label}: {hex_excerpt(raw or spelled.data)}"
 
     def find_flaw(self, frame: ReceivedFrame) -> str | None:
         """Return in what a frame's id or length differs from the documents; None if it does not."""

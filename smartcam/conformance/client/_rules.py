@@ -94,17 +94,17 @@ def sends_whole_messages(run: ClientRun) -> str | None:
 
 def connects_first(run: ClientRun) -> str | None:
     """The client sends only Connect, and Disconnect before it, until the answer to Connect."""
-    answered: set[str] = set()
+    connected_peers: set[str] = set()
     for message in run.messages:
         if isinstance(message.message, m.ConnectAnswer):
-            answered.add(message.peer)
+            connected_peers.add(message.peer)
         elif (
             message.sender is Sender.CLIENT
-            and message.peer not in answered
+            and message.peer not in connected_peers
             and not isinstance(message.message, (m.Connect, m.Disconnect))
         ):
             return f"{_message_name(message)} came before Connect was answered"
-    if not answered:
+    if not connected_peers:
         return "it did not connect"
     return None
 
@@ -167,8 +167,10 @@ def triggers_when_waiting(run: ClientRun) -> str | None:
         if isinstance(request.message, m.Trigger):
             status = run.status_before(index)
             if status is None or Status.WAITING_FOR_TRIGGER not in status:
-                shown = "no status had been sent" if status is None else f"the status was {status}"
-                return f"Trigger came when {shown}"
+                status_text = (
+                    "no status had been sent" if status is None else f"the status was {status}"
+                )
+                return f"Trigger came when {status_text}"
     return None
 
 

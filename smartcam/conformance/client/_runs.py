@@ -182,9 +182,9 @@ async def _wait_for_last_message(camera: EmulatedCamera) -> None:
 
 def _join_ignored_frames(log: Iterable[LogEntry]) -> list[LogEntry]:
     """Join each entry of an ignored frame with the next entry, which has the reason."""
-    joined: list[LogEntry] = []
+    merged: list[LogEntry] = []
     for entry in log:
-        previous = joined[-1] if joined else None
+        previous = merged[-1] if merged else None
         if (
             entry.error is not None
             and previous is not None
@@ -194,10 +194,10 @@ def _join_ignored_frames(log: Iterable[LogEntry]) -> list[LogEntry]:
             and previous.error is None
             and previous.hex == entry.hex
         ):
-            joined[-1] = previous._replace(error=entry.error)
+            merged[-1] = previous._replace(error=entry.error)
         else:
-            joined.append(entry)
-    return joined
+            merged.append(entry)
+    return merged
 
 
 def _record_entry(dialect: FramedDialect, entry: LogEntry, started_at: float) -> RecordedMessage:

@@ -64,8 +64,8 @@ def depth_fields(
             for depths of more than 65.535 m.
     """
     if encoding == "32FC1":
-        shown = np.where(depth > 0, depth, np.float32(np.nan)).astype(np.float32)
-        return array_fields(shown, encoding, header)
+        pixels = np.where(depth > 0, depth, np.float32(np.nan)).astype(np.float32)
+        return array_fields(pixels, encoding, header)
     return array_fields(_millimetres(depth), encoding, header)
 
 
@@ -129,10 +129,10 @@ def disparity_fields(
         largest: largest disparity of the search, pixels.
     """
     height, width = disparity.shape
-    shown = np.nan_to_num(disparity, nan=NO_DISPARITY).astype(np.float32)
+    pixels = np.nan_to_num(disparity, nan=NO_DISPARITY).astype(np.float32)
     return {
         "header": header,
-        "image": array_fields(shown, "32FC1", header),
+        "image": array_fields(pixels, "32FC1", header),
         "f": focal,
         "t": baseline,
         "valid_window": {"width": width, "height": height},

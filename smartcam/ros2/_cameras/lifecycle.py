@@ -126,9 +126,9 @@ class CameraLifecycle(Lifecycle):
         }
 
     async def _on_change_state(self, request: Any) -> dict[str, Any]:
-        wanted = request.transition
+        transition = request.transition
         try:
-            await self.change(wanted.label, wanted.id)
+            await self.change(transition.label, transition.id)
         except SmartCamError as exc:
             logger.warning("%s ! change_state: %s", self.name, exc)
             return {"success": False}

@@ -24,23 +24,23 @@ def address_of(camera: Camera[Any]) -> Address:
     return camera._place  # noqa: SLF001 - smartcam's own
 
 
-def calibrations_by_application(given: Any) -> dict[int | None, Any]:
+def calibrations_by_application(argument: Any) -> dict[int | None, Any]:
     """Return the calibrations of a camera's settings by application; key None is for all others."""
-    if hasattr(given, "items") and not hasattr(given, "to_robot"):
-        return {number: value for number, value in given.items() if value is not None}
-    return {} if given is None else {None: given}
+    if hasattr(argument, "items") and not hasattr(argument, "to_robot"):
+        return {number: value for number, value in argument.items() if value is not None}
+    return {} if argument is None else {None: argument}
 
 
-def calibration_of(given: Any, application: int) -> Any:
+def calibration_of(argument: Any, application: int) -> Any:
     """Return the calibration of an application in a camera's settings; None without one."""
-    calibrations = calibrations_by_application(given)
+    calibrations = calibrations_by_application(argument)
     return calibrations.get(application, calibrations.get(None))
 
 
 def robot_frame_of(calibration: Any) -> str:
     """Return the frame of a calibration's poses; empty if the calibration has no name for it."""
-    named = getattr(calibration, "robot_frame", None) or getattr(calibration, "frame", None)
-    return named if isinstance(named, str) else ""
+    frame = getattr(calibration, "robot_frame", None) or getattr(calibration, "frame", None)
+    return frame if isinstance(frame, str) else ""
 
 
 def is_calibrated(camera: Camera[Any], application: int) -> bool:

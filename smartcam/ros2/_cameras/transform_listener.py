@@ -268,13 +268,13 @@ class TransformListener:
     def _chain(self, frame: str) -> list[_FrameLink]:
         """Return the links from a frame up to its root."""
         links: list[_FrameLink] = []
-        seen = {frame}
+        visited = {frame}
         while (link := self._links.get(frame)) is not None:
             links.append(link)
             frame = link.parent
-            if frame in seen:
+            if frame in visited:
                 raise Code.WRONG_FRAME.refusal(f"TF: {frame} is above itself; expected a tree")
-            seen.add(frame)
+            visited.add(frame)
         return links
 
     def _find_pose(self, frame: str, base: str, utc: float | None) -> Transform:

@@ -266,8 +266,8 @@ def _domain_of_environment() -> int:
     return int(text)
 
 
-def _as_tuple(given: str | Sequence[str]) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
+def _as_tuple(value: str | Sequence[str]) -> tuple[str, ...]:
+    return (value,) if isinstance(value, str) else tuple(value)
 
 
 def _nothing() -> None:

@@ -227,11 +227,11 @@ class Lifecycle:
         for step in possible:
             if not self.closed and (step.label == label if label else step.id == number):
                 return step
-        wanted = repr(label[:40]) if label else f"transition {number}"
+        transition_text = repr(label[:40]) if label else f"transition {number}"
         possible_text = ", ".join(f"{step.label} ({step.id})" for step in possible) or "nothing"
         state = "closed" if self.closed else self.state.label
         raise RosError(
-            f"{self.name}: {wanted}: it is {state}, where {possible_text} can be asked for"
+            f"{self.name}: {transition_text}: it is {state}, where {possible_text} can be asked for"
         )
 
     async def _run_transition(self, transition: LifecycleTransition) -> None:

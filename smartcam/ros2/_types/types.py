@@ -206,10 +206,10 @@ class MessageType:
             raise RosMessageError(
                 f"{self.name}: {len(data)} bytes are no such message: {exc}"
             ) from exc
-        left = len(data) - end
-        if whole and left and (left > 3 or len(data) % 4 or any(data[end:])):
+        extra = len(data) - end
+        if whole and extra and (extra > 3 or len(data) % 4 or any(data[end:])):
             raise RosMessageError(
-                f"{self.name}: expected {end} bytes, got {len(data)}: {left} follow the message"
+                f"{self.name}: expected {end} bytes, got {len(data)}: {extra} follow the message"
             )
         return message
 
@@ -292,8 +292,8 @@ class RosTypes:
         Raises:
             ConfigurationError: there is no message of this name, or a nested one is not known.
         """
-        if (made := self._messages.get(name)) is not None:
-            return made
+        if (cached := self._messages.get(name)) is not None:
+            return cached
         split_name(name, "msg")
         return self.message_of(name)
 
@@ -304,19 +304,19 @@ class RosTypes:
             ConfigurationError: there is no service of this name, or a nested message is not
                 known.
         """
-        if (made := self._services.get(name)) is not None:
-            return made
+        if (cached := self._services.get(name)) is not None:
+            return cached
         split_name(name, "srv")
         if self._shared is not None and name not in self._added:
             return self._shared.service(name)
         if (text := self._service_text(name)) is None:
             raise self._unknown_type_error(name)
         with self._lock:
-            if (made := self._services.get(name)) is None:
+            if (cached := self._services.get(name)) is None:
                 for definition in (*parse_service(name, text), event_definition(name)):
                     self._definitions[definition.name] = definition
-                made = self._services[name] = ServiceType(name, self)
-        return made
+                cached = self._services[name] = ServiceType(name, self)
+        return cached
 
     def add(self, name: str, text: str) -> None:
         """Add a message (``pkg/msg/Name``) or service (``pkg/srv/Name``) by the text of its file.
@@ -349,25 +349,25 @@ class RosTypes:
         Raises:
             ConfigurationError: the message is not known.
         """
-        made = self._definitions.get(name)
-        if made is None:
+        cached = self._definitions.get(name)
+        if cached is None:
             if name in self._added:
-                made = parse_message(name, self._added[name])
+                cached = parse_message(name, self._added[name])
             elif self._shared is not None:
                 return self._shared.definition(name)
             elif name in self._stored:
-                made = read_stored(name, self._stored[name])
+                cached = read_stored(name, self._stored[name])
             elif name in MESSAGES:
-                made = parse_message(name, MESSAGES[name])
+                cached = parse_message(name, MESSAGES[name])
             else:
                 raise self._unknown_type_error(name)
-            self._definitions[name] = made
-        return made
+            self._definitions[name] = cached
+        return cached
 
     def message_of(self, name: str, outer_names: tuple[str, ...] = ()) -> MessageType:
         """Return a message's type; like the methods below, it is for this package only."""
-        if (made := self._messages.get(name)) is not None:
-            return made
+        if (cached := self._messages.get(name)) is not None:
+            return cached
         if self._shared is not None and name not in self._added and name not in self._definitions:
             return self._shared.message_of(name)
         if name in outer_names:
@@ -375,14 +375,14 @@ class RosTypes:
                 f"{name} has itself within: {' > '.join((*outer_names, name))}"
             )
         with self._lock:
-            if (made := self._messages.get(name)) is None:
+            if (cached := self._messages.get(name)) is None:
                 definition = self.definition(name)
                 nested_names = sorted(definition.nested_names())
                 nested = {
                     need: self.message_of(need, (*outer_names, name)) for need in nested_names
                 }
-                made = self._messages[name] = MessageType(definition, nested, self)
-        return made
+                cached = self._messages[name] = MessageType(definition, nested, self)
+        return cached
 
     def _service_text(self, name: str) -> str | None:
         if name in self._added:

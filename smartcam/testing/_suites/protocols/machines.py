@@ -82,8 +82,8 @@ class MachineChecks(Parameters):
                 for cut in range(1, size, 1 + size // MAX_CUTS):
                     player = Player(self.protocol, stream).play(step_index)
                     player.step(step, [step.data[:cut], step.data[cut:]])
-        joined = dataclasses.replace(stream, steps=_join_deliveries(stream.steps))
-        Player(self.protocol, joined).play()
+        joined_stream = dataclasses.replace(stream, steps=_join_deliveries(stream.steps))
+        Player(self.protocol, joined_stream).play()
 
     def test_any_cutting_of_any_bytes_tells_the_same(self, stream: Conversation) -> None:
         """Check any cut of bytes that no camera sends as well."""
@@ -282,9 +282,9 @@ class MachineChecks(Parameters):
         assert bytes(machine.pending) == b"", f"pending: {machine.pending!r} before anything came"
         for take in (machine.events, machine.data_to_send):
             name = getattr(take, "__name__", "it")
-            taken: list[Any] = take()
-            assert taken == [], f"{name}() gave {taken} before anything was said"
-            taken.append(None)
+            items: list[Any] = take()
+            assert items == [], f"{name}() gave {items} before anything was said"
+            items.append(None)
             assert take() == [], f"{name}() gives what its caller did to an earlier list"
         player.play()
         machine.adopt(machine.kin[0])
@@ -299,8 +299,8 @@ class MachineChecks(Parameters):
             state, where = machine.state, f"after step {step_index}, {step!r:.200}"
             if isinstance(step, Sent):
                 if isinstance(step.message, m.Connect):
-                    wanted = {State.CONNECTING, State.CONNECTED}
-                    assert state in wanted, f"{where}: it is {state}"
+                    allowed_states = {State.CONNECTING, State.CONNECTED}
+                    assert state in allowed_states, f"{where}: it is {state}"
                 continue
             for event in step.events:
                 if isinstance(event, m.ConnectAnswer) and step.events[-1] is event:
@@ -330,8 +330,10 @@ class MachineChecks(Parameters):
                 continue
             assert isinstance(frame, Frame), f"traced: expected a Frame, got {frame!r}"
             spelled = check_described(dialect, sender, frame)
-            shown = f"{frame!r} {spelled!r}"
-            assert not secret or secret not in shown, f"the trace has the password: {shown}"
+            trace_text = f"{frame!r} {spelled!r}"
+            assert not secret or secret not in trace_text, (
+                f"the trace has the password: {trace_text}"
+            )
         speakers = {
             sender
             for sender, frames in (
@@ -381,8 +383,8 @@ class _LinkChecker:
             self.machine.receive_data(b"too late\r\n\0")
             self._check_output()
         assert self.has_ended, "the link's end was not reported"
-        wanted = {State.FAILED, State.CLOSED} if before else {State.CLOSED}
-        assert self.machine.state in wanted, f"at the end it is {self.machine.state}"
+        allowed_states = {State.FAILED, State.CLOSED} if before else {State.CLOSED}
+        assert self.machine.state in allowed_states, f"at the end it is {self.machine.state}"
 
     def _check_output(self) -> None:
         for event in self.machine.events():
@@ -442,14 +444,14 @@ def _keep_whole(_: Step) -> None:
 
 def _join_deliveries(steps: Sequence[Step]) -> list[Step]:
     """Return the steps with consecutive deliveries joined."""
-    joined: list[Step] = []
+    joined_steps: list[Step] = []
     for step in steps:
-        last = joined[-1] if joined else None
+        last = joined_steps[-1] if joined_steps else None
         if isinstance(step, Received) and isinstance(last, Received) and not last.wire:
-            joined[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
+            joined_steps[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
         else:
-            joined.append(step)
-    return joined
+            joined_steps.append(step)
+    return joined_steps
 
 
 def _stop_points(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
