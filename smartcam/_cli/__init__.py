@@ -22,17 +22,17 @@ def _run(program: str, module: str) -> None:
         try:
             importlib.import_module("click")
         except ModuleNotFoundError:
-            sys.exit(_missing(program))
+            sys.exit(_report_missing_extra(program))
         # PyYAML is a package, a module of the same name is not it
         yaml = importlib.util.find_spec("yaml")
         if yaml is None or yaml.submodule_search_locations is None:
-            sys.exit(_missing(program))
+            sys.exit(_report_missing_extra(program))
         command = importlib.import_module(f"smartcam._cli.{module}").command
     except KeyboardInterrupt:  # Ctrl-C while still importing
         sys.exit(130)
     command(prog_name=program)
 
 
-def _missing(program: str) -> int:
+def _report_missing_extra(program: str) -> int:
     sys.stderr.write(f'{program}: needs the extra "cli": pip install "smartcam[cli]"\n')
     return 2

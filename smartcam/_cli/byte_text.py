@@ -11,10 +11,10 @@ _DUMP_LINE: Final = re.compile(r"\s*(?:0x)?([0-9a-fA-F]{4,8})(?::\s+|\s{2,})(\S.
 _LAST_OFFSET: Final = re.compile(r"\s*(?:0x)?[0-9a-fA-F]{4,8}:?\s*")
 _ESCAPES: Final = re.compile(r"(?:\\x[0-9a-fA-F]{2})+")
 _NUMBERS: Final = re.compile(r"(?:0x[0-9a-fA-F]{2}[,;\s]*)+")
-_PARTED: Final = re.compile(r"[0-9a-fA-F]{2}(?:[:-][0-9a-fA-F]{2})+")
+_SEPARATED: Final = re.compile(r"[0-9a-fA-F]{2}(?:[:-][0-9a-fA-F]{2})+")
 
 
-def bytes_of_text(text: str) -> bytes:
+def parse_bytes(text: str) -> bytes:
     r"""Return the bytes that a text stands for.
 
     It may be hex with or without blanks, with ``:`` or ``-`` between the bytes, ``0x50, 0x53``,
@@ -31,45 +31,45 @@ def bytes_of_text(text: str) -> bytes:
         matches.pop()
     dump = [match for match in matches if match is not None]
     if dump and len(dump) == len(matches) and int(dump[0][1], 16) == 0:
-        return _dumped(dump)
-    plain = re.sub(r"[\s\"']", "", text)
-    if _ESCAPES.fullmatch(plain):
-        return bytes.fromhex(plain.replace("\\x", ""))
-    bare = text.strip(" \t\r\n{}[];")
-    if _NUMBERS.fullmatch(bare) or _PARTED.fullmatch(bare):
+        return _parse_dump(dump)
+    without_blanks = re.sub(r"[\s\"']", "", text)
+    if _ESCAPES.fullmatch(without_blanks):
+        return bytes.fromhex(without_blanks.replace("\\x", ""))
+    stripped = text.strip(" \t\r\n{}[];")
+    if _NUMBERS.fullmatch(stripped) or _SEPARATED.fullmatch(stripped):
         return bytes.fromhex(re.sub(r"0x|[^0-9a-fA-F]", "", text))
     return bytes.fromhex(text)
 
 
-def _dumped(lines: list[re.Match[str]]) -> bytes:
-    """Return the bytes of a dump; the offsets give the number of bytes of each line."""
-    data, widest = b"", 0
+def _parse_dump(lines: list[re.Match[str]]) -> bytes:
+    """Return the bytes of a dump; the next line's offset gives the number of bytes of a line."""
+    data, bytes_end = b"", 0
     for number, line in enumerate(lines, 1):
         offset = int(line[1], 16)
         if offset != len(data):
             raise ConfigurationError(
                 f"decode: a hex dump whose line {number} has offset {offset:#x}: expected "
-                f"{len(data):#x}, since so many bytes are before it"
+                f"{len(data):#x}, the number of bytes before it"
             )
-        after = int(lines[number][1], 16) - offset if number < len(lines) else None
-        part, end = _row(line, after, widest)
-        data, widest = data + part, max(widest, end)
+        count = int(lines[number][1], 16) - offset if number < len(lines) else None
+        part, end = _parse_dump_line(line, count, bytes_end)
+        data, bytes_end = data + part, max(bytes_end, end)
     return data
 
 
-def _row(line: re.Match[str], count: int | None, widest: int) -> tuple[bytes, int]:
+def _parse_dump_line(line: re.Match[str], count: int | None, bytes_end: int) -> tuple[bytes, int]:
     """Return the bytes of a line, and the column where they end.
 
     Args:
         line: line of a dump.
-        count: number of its bytes; None: all bytes before the text beside them.
-        widest: column at which the bytes of earlier lines ended; 0 without such lines.
+        count: number of its bytes; None: all bytes before the dump's text column.
+        bytes_end: largest column at which the bytes of an earlier line ended; 0 without one.
     """
     start = line.start(2)
     body = line.string[start:].partition("|")[0]
     if count is None and "|" not in line.string:
-        body = re.split(r"\s{3,}" if widest else r"\s{2,}", body)[0]
-        body = body[: widest - start] if widest else body
+        body = re.split(r"\s{3,}" if bytes_end else r"\s{2,}", body)[0]
+        body = body[: bytes_end - start] if bytes_end else body
     digits, end = "", start
     for token in re.finditer(r"\S+", body):
         if count is not None and len(digits) >= 2 * count:

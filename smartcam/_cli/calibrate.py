@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.calibrate_files import (
-    DEFAULT,
+    DEFAULT_COMMAND,
     WIZARDS,
     DefaultCommand,
     DefaultCommandContext,
@@ -21,9 +21,16 @@ from smartcam._cli.calibrate_files import (
 )
 from smartcam._cli.calibrate_lens import lens as calibrate_lens
 from smartcam._cli.calibrate_lens import read_target
-from smartcam._cli.calibrate_terminal import drive, listing_text
-from smartcam._cli.frame_sources import is_source, opened
-from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
+from smartcam._cli.calibrate_terminal import listing_text, run_wizard
+from smartcam._cli.frame_sources import is_source, make_source
+from smartcam._cli.options import (
+    CONNECT_WARNING,
+    OUTPUT_OPTIONS,
+    Options,
+    async_command,
+    naming_file_errors,
+    option,
+)
 from smartcam._cli.page import PageOptions, page_options
 from smartcam.exceptions import CalibrationError, ConfigurationError, UnsupportedError
 
@@ -36,15 +43,15 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
     from smartcam.models import Localization
 
-ABORTED = 130
+ABORT_EXIT_CODE = 130
 """Exit code after an abort, as after Ctrl-C: there is no calibration."""
 
-STALE = 7
+STALE_EXIT_CODE = 7
 """Exit code after a check that found the calibration out of date."""
 
-LINGER = 30.0
-"""Seconds that a source of frames streams on after a picture, so that the next picture needs no new
-start, and exposure and white balance stay."""
+LINGER_TIME = 30.0
+"""Seconds for which a source of frames keeps streaming after a picture: then the next picture
+needs no new start, and exposure and white balance stay the same."""
 
 HELP = "Calibrate a camera against a robot: where its localizations lie in the robot's space. "
 
@@ -59,14 +66,16 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
     '{"answers": {...}} or {"do": "undo"|"repeat"|"abort"}, each with the "token" of its '
     "step, or without one for the current step. "
     "With --check it asks for a few touches only, and reports whether a calibration still holds: "
-    f"exit code {STALE} if it is stale. "
+    f"exit code {STALE_EXIT_CODE} if it is stale. "
     "With --wizard sheet or hand-eye it uses pictures: those of a camera "
     "that sends them, or those of --pictures, which arrive in a folder or are the frames of a "
     "source (see smartcam frames); then no URL is needed. "
-    f"The camera is connected for each picture only. {CONNECTS}",
+    f"The camera is connected for each picture only. {CONNECT_WARNING}",
 )
 @click.argument("url", required=False)
-@click.option("--name", "called", metavar="NAME", help="Its name.  [default: the wizard's]")
+@click.option(
+    "--name", "calibration_name", metavar="NAME", help="Its name.  [default: the wizard's]"
+)
 @click.option(
     "--wizard",
     type=click.Choice(WIZARDS),
@@ -103,7 +112,7 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
 )
 @click.option(
     "--list",
-    "listed",
+    "list_only",
     is_flag=True,
     help="Only list the calibrations of the folder: date, error, last check.",
 )
@@ -122,31 +131,31 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
     "--timeout",
     help="Longest time for each step of a picture: connect (default 10), switch (10), trigger (5).",
 )
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def wizard_command(
     url: str | None,
-    called: str | None,
+    calibration_name: str | None,
     wizard: str | None,
     pictures: str | None,
     target: str | None,
     lens: str | None,
     check: str | None,
     folder: str,
-    listed: bool,
+    list_only: bool,
     fresh: bool,
     feature: str | None,
     web: PageOptions,
     options: Options,
 ) -> None:
     """Calibrate a camera against a robot."""
-    if listed:
+    if list_only:
         _list(folder, options)
         return
-    if called is not None and check is not None:
-        raise click.UsageError("--check names the calibration: no --name beside it")
+    if calibration_name is not None and check is not None:
+        raise click.UsageError("--check names the calibration already: leave out --name")
     if wizard is not None and check is not None:
-        raise click.UsageError("--check asks for touches of marks: no --wizard beside it")
-    if url is not None and _only_frames(url):
+        raise click.UsageError("--check has its own steps, touches of marks: leave out --wizard")
+    if url is not None and _is_frame_source(url):
         from smartcam.frames import FrameAddress
 
         address = FrameAddress.parse(url).shown
@@ -156,17 +165,17 @@ async def wizard_command(
         )
     if url is None and (pictures is None or wizard in {None, "plane"}):
         raise click.UsageError(
-            "a URL is missing: only --wizard sheet and --wizard hand-eye do without one, with "
+            "a URL is missing: only --wizard sheet and --wizard hand-eye need none, with "
             "--pictures FOLDER or --pictures URL"
         )
-    async with _frames_of(pictures, options) as source:
+    async with _open_frames(pictures, options) as source:
         sources = _Sources(options, url, pictures, source, target, lens)
-        await _run(sources, called, wizard, check, folder, feature, fresh, web)
+        await _run(sources, calibration_name, wizard, check, folder, feature, fresh, web)
 
 
 async def _run(
     sources: _Sources,
-    called: str | None,
+    calibration_name: str | None,
     wizard: str | None,
     check: str | None,
     folder: str,
@@ -174,39 +183,39 @@ async def _run(
     fresh: bool,
     web: PageOptions,
 ) -> None:
-    """Run the wizard to its end."""
+    """Run the wizard on its page or in the terminal until it ends."""
     from smartcam.calibration._inside import WIZARD
 
     options = sources.options
-    started = WIZARD if check is not None else wizard or "plane"
+    wizard_name = WIZARD if check is not None else wizard or "plane"
     parameters: dict[str, Any] = {} if feature is None else {"feature": feature}
-    if sources.target is not None and started in {"sheet", "hand-eye"}:
-        parameters["target"] = sources.described
-    named = next(name for name in (check, called, started) if name is not None)
+    if sources.target is not None and wizard_name in {"sheet", "hand-eye"}:
+        parameters["target"] = sources.target_data
+    saved_name = next(name for name in (check, calibration_name, wizard_name) if name is not None)
     try:
-        service = _service(folder, sources)
+        service = _make_service(folder, sources)
         try:
             if check is not None:
                 options.check_y_down(service.load(check), f"--check {check}")
-            service.start(named, started, parameters, fresh=fresh)
-            if web.wanted:
+            service.start(saved_name, wizard_name, parameters, fresh=fresh)
+            if web.is_wanted:
                 await _serve(service, options, web)
             else:
 
-                def anew() -> WizardSession:
-                    service.start(named, started, parameters, fresh=True)
+                def restart() -> WizardSession:
+                    service.start(saved_name, wizard_name, parameters, fresh=True)
                     return service.session
 
-                picture = Path(folder) / f"{named}.step.svg"
-                _exit(await drive(service.session, options, anew, picture))
+                picture = Path(folder) / f"{saved_name}.step.svg"
+                _exit_with_code(await run_wizard(service.session, options, restart, picture))
         finally:
             service.close()
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
 
 
-def _only_frames(url: str) -> bool:
-    """Return True if a URL is the URL of a source of frames, and not of a camera."""
+def _is_frame_source(url: str) -> bool:
+    """Return True if a URL names a source of frames and not a camera."""
     from smartcam.registry import FRAMES, PROTOCOLS
     from smartcam.settings import is_fleet
 
@@ -215,7 +224,7 @@ def _only_frames(url: str) -> bool:
 
 
 @contextlib.asynccontextmanager
-async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[FrameSource | None]:
+async def _open_frames(pictures: str | None, options: Options) -> AsyncIterator[FrameSource | None]:
     """Open the source of frames that ``--pictures`` names; None if it names no source.
 
     Raises ConfigurationError: the URL is wrong; FrameSourceError: the source does not exist.
@@ -223,14 +232,19 @@ async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[Fr
     if pictures is None or not is_source(pictures):
         yield None
         return
-    async with opened(pictures, options, linger=LINGER) as source:
+    async with make_source(pictures, options, linger=LINGER_TIME) as source:
         yield source
 
 
 wizard_command.context_class = DefaultCommandContext
 calibrate = GroupWithDefault(
     "calibrate",
-    commands={DEFAULT: wizard_command, "lens": calibrate_lens, "compare": compare, "draw": draw},
+    commands={
+        DEFAULT_COMMAND: wizard_command,
+        "lens": calibrate_lens,
+        "compare": compare,
+        "draw": draw,
+    },
     help=HELP,
 )
 
@@ -249,11 +263,11 @@ def _list(path: str, options: Options) -> None:
         click.echo(listing_text(rows) if rows else f"no calibrations in {path}")
 
 
-def _exit(view: Mapping[str, Any]) -> None:
+def _exit_with_code(view: Mapping[str, Any]) -> None:
     if view["type"] == "abort":
-        raise SystemExit(ABORTED)
+        raise SystemExit(ABORT_EXIT_CODE)
     if view["result"].get("stale"):
-        raise SystemExit(STALE)
+        raise SystemExit(STALE_EXIT_CODE)
 
 
 async def _serve(service: CalibrationService, options: Options, web: PageOptions) -> None:
@@ -264,20 +278,20 @@ async def _serve(service: CalibrationService, options: Options, web: PageOptions
         await asyncio.Event().wait()
 
 
-def _service(folder: str, sources: _Sources) -> CalibrationService:
+def _make_service(folder: str, sources: _Sources) -> CalibrationService:
     from smartcam._extras import load
     from smartcam.calibration import Folder
     from smartcam.calibration.wizards import CalibrationService
 
     load("scipy")  # fails before anything is measured
-    with naming(f"--folder {folder}"):
-        inside = Folder(folder)
-    return CalibrationService(inside, sources.wizards(inside))
+    with naming_file_errors(f"--folder {folder}"):
+        calibrations = Folder(folder)
+    return CalibrationService(calibrations, sources.wizards(calibrations))
 
 
 @dataclass(frozen=True, slots=True)
 class _Sources:
-    """The sources of localizations and pictures, with the descriptions of target and lens."""
+    """The sources of localizations and pictures, the target and the lens of the options."""
 
     options: Options
     url: str | None
@@ -287,14 +301,14 @@ class _Sources:
     lens: str | None
 
     @property
-    def described(self) -> dict[str, Any]:
+    def target_data(self) -> dict[str, Any]:
         """Description of the sheet, as plain data."""
         from smartcam.calibration import target_to_data
 
         return target_to_data(read_target(str(self.target)))
 
     def wizards(self, folder: Folder) -> list[Wizard]:
-        """Return the wizards that these sources allow; the first is the page's default.
+        """Return the wizards that can run with these options; the first is the page's default.
 
         Raises ConfigurationError: a file of the options cannot be used.
         """
@@ -331,7 +345,7 @@ class _Sources:
         target = None if self.target is None else read_target(self.target)
         lens = None if self.lens is None else _read_lens(self.lens)
         pictures: dict[str, Any] = {
-            **self._taking(),
+            **self._picture_arguments(),
             "save_to": folder.calibration,
             "suggested": target,
             "camera": None if lens is None else lens.camera,
@@ -345,15 +359,15 @@ class _Sources:
         from smartcam.models import Localization
 
         options = self.options
-        with options.camera(str(self.url)) as unopened:
-            async with unopened as camera:
+        with options.camera(str(self.url)) as unopened_camera:
+            async with unopened_camera as camera:
                 # the agent of a fleet knows the direction of y
                 if camera.settings.y_down != options.y_down:
                     raise ConfigurationError(
-                        f"{camera.url}: its agent says y_down: true: give --y-down here, too, or "
-                        "the calibration is mirrored"
+                        f"{camera.url}: its agent has y_down: true: give --y-down here, too; "
+                        "otherwise the calibration is mirrored"
                     )
-                result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
+                result = await camera.trigger(timeout=options.step_timeout(DEFAULT_TRIGGER_TIMEOUT))
         value = result.value
         if not isinstance(value, list) or not all(isinstance(part, Localization) for part in value):
             raise ConfigurationError(
@@ -362,8 +376,8 @@ class _Sources:
             )
         return value
 
-    def _taking(self) -> dict[str, Any]:
-        """Return the wizard's arguments for the source of its pictures."""
+    def _picture_arguments(self) -> dict[str, Any]:
+        """Return the arguments of a wizard that say how it gets pictures."""
         from smartcam.calibration._inside import PictureFolder
 
         if self.source is not None:
@@ -379,13 +393,13 @@ class _Sources:
 
         # only the picture counts, not the result of the application
         options = replace(self.options, interpret_as=None)
-        wait = options.step(DEFAULT_TRIGGER_TIMEOUT)
-        with options.camera(str(self.url)) as unopened:
-            async with unopened as camera:
+        wait = options.step_timeout(DEFAULT_TRIGGER_TIMEOUT)
+        with options.camera(str(self.url)) as unopened_camera:
+            async with unopened_camera as camera:
                 if not camera.capabilities.read_image:
                     raise UnsupportedError(
-                        f"{camera.name}: its protocol sends no pictures; expected one with them, "
-                        "or --pictures FOLDER, to which the camera writes them by FTP"
+                        f"{camera.name}: its protocol sends no pictures; expected a protocol that "
+                        "does, or --pictures FOLDER, to which the camera writes them by FTP"
                     )
                 await camera.trigger(timeout=wait)
                 data = await camera.read_image(timeout=wait)
@@ -397,7 +411,7 @@ def _read_lens(path: str) -> Lens:
     from smartcam.calibration._inside import read_lenses
 
     try:
-        with naming(f"--lens {path}"):
+        with naming_file_errors(f"--lens {path}"):
             return read_lenses(path).lenses[0]
     except CalibrationError as exc:
         raise ConfigurationError(f"--lens: {exc}") from exc

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, naming, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, naming_file_errors
 from smartcam._cli.texts import table_text
 from smartcam._cli.usage import ListedGroup, write_commands
 from smartcam.exceptions import ConfigurationError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._inside import LengthUnit, LensComparison, MapFigures, StoredLenses
 
-DIFFERENT = 7
+DIFFERENT_EXIT_CODE = 7
 """Exit code after a comparison of calibrations that differ by more than noise explains."""
 
 COLUMNS = ("centre", "corners", "worst", "mean")
@@ -31,18 +31,19 @@ WIZARDS = ("plane", "sheet", "hand-eye")
 """The values of --wizard."""
 
 MIN_LIKENESS = 0.75
-"""Likeness to a command, 0 to 1, from which a word counts as that command and not as a host."""
+"""Least similarity to a command, 0 to 1, at which a word is taken for that command and not for a
+host."""
 
-DEFAULT = "wizard"
-"""Name of the default command below ``calibrate``, which users need not type."""
+DEFAULT_COMMAND = "wizard"
+"""Name of the default command of ``calibrate``, which users need not type."""
 
 
 class DefaultCommandContext(click.Context):
-    """The context of a group's default command, which usage texts show under the group's name."""
+    """The context of a group's default command; usage texts show only the group's name."""
 
     @property
     def command_path(self) -> str:
-        """Command as its usage shows it."""
+        """The command's path without the name of the default command."""
         return super().command_path.rstrip()
 
 
@@ -60,39 +61,39 @@ class GroupWithDefault(ListedGroup):
     """A group of commands; arguments without a command go to the default command."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse."""
-        is_file = not args or args[0] not in self.commands
-        if is_file and args and re.fullmatch(r"[A-Za-z][\w-]*", args[0]):
+        """Parse; insert the default command if the first word is no command."""
+        has_no_command = not args or args[0] not in self.commands
+        if has_no_command and args and re.fullmatch(r"[A-Za-z][\w-]*", args[0]):
             self._check_host(ctx, *args[:2])
-        return super().parse_args(ctx, [DEFAULT, *args] if is_file else args)
+        return super().parse_args(ctx, [DEFAULT_COMMAND, *args] if has_no_command else args)
 
-    def _check_host(self, ctx: click.Context, word: str, after: str = "-") -> None:
-        """Refuse a word that is more probably a command, or a wizard, than the name of a host."""
+    def _check_host(self, ctx: click.Context, word: str, next_word: str = "-") -> None:
+        """Fail for a word that is probably a command or a wizard, and not a host."""
         from smartcam._suggestions import closest, did_you_mean
 
         if word in WIZARDS:
             ctx.fail(f"{word!r} is no command but a wizard: smartcam calibrate URL --wizard {word}")
-        commands = [name for name in self.list_commands(ctx) if name != DEFAULT]
+        commands = [name for name in self.list_commands(ctx) if name != DEFAULT_COMMAND]
         if (
-            after.startswith("-")
+            next_word.startswith("-")
             and closest(word, [*commands, *WIZARDS], least=MIN_LIKENESS) is None
         ):
             return
-        end = did_you_mean(word, commands) or f"; commands are {', '.join(commands)}"
+        hint = did_you_mean(word, commands) or f"; commands are {', '.join(commands)}"
         ctx.fail(
-            f"No such command {word!r}{end}; a wizard is named by --wizard, one of "
+            f"No such command {word!r}{hint}; a wizard is named by --wizard, one of "
             f"{', '.join(WIZARDS)}; a host of that name is bvs://{word}"
         )
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command, and the arguments that are left for it."""
+        """Return the command and its arguments; the default command has no name."""
         name, command, arguments = super().resolve_command(ctx, args)
-        return (None if name == DEFAULT else name), command, arguments
+        return (None if name == DEFAULT_COMMAND else name), command, arguments
 
 
-def _svg(_context: object, _option: object, path: str | None) -> str | None:
+def _check_svg_name(_context: object, _option: object, path: str | None) -> str | None:
     if path is not None and Path(path).suffix.lower() != ".svg":
         raise click.BadParameter(f"{path}: expected a name that ends with .svg")
     return path
@@ -114,8 +115,8 @@ def distance_option(function: Any) -> Any:
     "of noise. A and B are calibrations of smartcam (lens, pair, camera on a robot), "
     "camera_info of ROS, camchains of Kalibr, files of OpenCV or of others whose format is known; "
     "the effect of noise is only known for calibrations of a lens. "
-    f"Exit code {DIFFERENT} if they differ by more than noise explains; 0 otherwise, also "
-    "without a verdict."
+    f"Exit code {DIFFERENT_EXIT_CODE} if they differ by more than noise explains; 0 otherwise, "
+    "also without a verdict."
 )
 @click.argument("a", type=click.Path(dir_okay=False))
 @click.argument("b", type=click.Path(dir_okay=False))
@@ -129,11 +130,11 @@ def distance_option(function: Any) -> Any:
     "--svg",
     metavar="FILE",
     type=click.Path(dir_okay=False),
-    callback=_svg,
+    callback=_check_svg_name,
     help="Draw the differences there, beside what noise leads to; of a pair two files, -left and "
     "-right.",
 )
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def compare(
     a: str,
     b: str,
@@ -156,7 +157,7 @@ async def compare(
         for lens, other in zip(first.lenses, second.lenses, strict=True)
     ]
     for name, comparison in zip(first.names, comparisons, strict=True):
-        options.show(_data(name, comparison), _text(name, comparison))
+        options.show(_comparison_data(name, comparison), _comparison_text(name, comparison))
     pairs = itertools.pairwise(comparisons)
     for transform, other, pair in zip(first.transforms, second.transforms, pairs, strict=True):
         turn, shift = rig_difference(transform, other, *pair)
@@ -165,9 +166,9 @@ async def compare(
         text = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
         options.show(value, text)
     if svg is not None:
-        _draw(svg, first.names, comparisons, f"{a} and {b}")
+        _draw_comparisons(svg, first.names, comparisons, f"{a} and {b}")
     if any(comparison.same is False for comparison in comparisons):
-        raise SystemExit(DIFFERENT)
+        raise SystemExit(DIFFERENT_EXIT_CODE)
 
 
 @click.command(
@@ -182,7 +183,7 @@ async def compare(
     metavar="FILE",
     type=click.Path(dir_okay=False),
     required=True,
-    callback=_svg,
+    callback=_check_svg_name,
     help="File for the picture; .svg.",
 )
 @click.option(
@@ -192,46 +193,48 @@ async def compare(
     help="What to draw.  [default: views; of a plane the plane]",
 )
 @distance_option
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def draw(
     file: str, output: str, drawing: Any, distance: float | None, options: Options
 ) -> None:
     """Draw a calibration."""
     from smartcam.calibration._inside import draw_file
 
-    with naming(file):
-        drawn = draw_file(file, drawing, distance)
-    _write(output, drawn)
+    with naming_file_errors(file):
+        svg_text = draw_file(file, drawing, distance)
+    _write(output, svg_text)
     options.show({"file": output}, output)
 
 
 def _read(path: str, unit: LengthUnit | None) -> StoredLenses:
     from smartcam.calibration._inside import read_lenses
 
-    with naming(path):
+    with naming_file_errors(path):
         return read_lenses(path, unit=unit)
 
 
-def _data(name: str, comparison: LensComparison) -> dict[str, Any]:
-    turn, shift = _motion(comparison)
+def _comparison_data(name: str, comparison: LensComparison) -> dict[str, Any]:
+    turn, shift = _camera_motion(comparison)
     return {
         "camera": name,
         "same": comparison.same,
         "ratio": comparison.ratio,
         "chance": comparison.chance,
         "distance_m": comparison.distance,
-        "difference_px": _numbers(comparison.observed),
-        "predicted_px": None if comparison.predicted is None else _numbers(comparison.predicted),
+        "difference_px": _figures_data(comparison.observed),
+        "predicted_px": None
+        if comparison.predicted is None
+        else _figures_data(comparison.predicted),
         "turn_deg": turn,
         "shift_mm": shift,
     }
 
 
-def _text(name: str, comparison: LensComparison) -> str:
-    rows = [_row("difference", comparison.observed)]
+def _comparison_text(name: str, comparison: LensComparison) -> str:
+    rows = [_figures_row("difference", comparison.observed)]
     if comparison.predicted is not None:
-        rows.append(_row("from noise", comparison.predicted))
-    turn, shift = _motion(comparison)
+        rows.append(_figures_row("from noise", comparison.predicted))
+    turn, shift = _camera_motion(comparison)
     where = "at infinity" if comparison.distance is None else f"at {comparison.distance:g} m"
     return "\n".join(
         [
@@ -243,26 +246,26 @@ def _text(name: str, comparison: LensComparison) -> str:
     )
 
 
-def _numbers(figures: MapFigures) -> dict[str, float | None]:
-    """Return the figures for JSON, which knows no NaN."""
+def _figures_data(figures: MapFigures) -> dict[str, float | None]:
+    """Return the figures for JSON, with None for NaN."""
     values = figures._asdict().items()
     return {name: value if math.isfinite(value) else None for name, value in values}
 
 
-def _row(name: str, figures: MapFigures) -> list[object]:
+def _figures_row(name: str, figures: MapFigures) -> list[object]:
     return [
         name,
         *(round(float(f"{figure:.3g}"), 6) if math.isfinite(figure) else "-" for figure in figures),
     ]
 
 
-def _motion(comparison: LensComparison) -> tuple[float, float]:
+def _camera_motion(comparison: LensComparison) -> tuple[float, float]:
     cosine = (float(comparison.motion.rotation.trace()) - 1.0) / 2.0
     turn = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
     return turn, 1e3 * math.hypot(*comparison.motion.translation)
 
 
-def _draw(
+def _draw_comparisons(
     path: str, names: Sequence[str], comparisons: Sequence[LensComparison], title: str
 ) -> None:
     from smartcam.calibration import draw_uncertainty
@@ -274,6 +277,6 @@ def _draw(
         _write(str(file), draw_uncertainty(comparison, title=f"{title}: {name}"))
 
 
-def _write(path: str, drawn: str) -> None:
-    with naming(path):
-        Path(path).write_text(drawn, encoding="utf-8", newline="\n")
+def _write(path: str, svg: str) -> None:
+    with naming_file_errors(path):
+        Path(path).write_text(svg, encoding="utf-8", newline="\n")

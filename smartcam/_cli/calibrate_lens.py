@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from smartcam._cli.frame_sources import is_source, opened
-from smartcam._cli.options import OUTPUT, Options, naming, option, runs
+from smartcam._cli.frame_sources import is_source, make_source
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, naming_file_errors, option
 from smartcam._cli.texts import table_text
 from smartcam.exceptions import CalibrationError, ConfigurationError, FrameTimeoutError
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
 
 MAX_STILL_MOTION_PX: Final = 1.0
-"""Largest motion of the points of a still target between two frames, in pixels."""
+"""Largest motion of the points between two frames, in pixels, at which a target counts as still."""
 
 MIN_NEW_VIEW_SHARE: Final = 0.05
-"""Least mean motion of the points for a new view, as a share of the image's width."""
+"""Least motion of the points since each earlier view, as a share of the image's width."""
 
 MAX_VIEWS: Final = 200
 
@@ -35,29 +35,31 @@ MAX_DESCRIPTION_BYTES: Final = 65_536
 
 
 @dataclass(slots=True)
-class Collecting:
-    """Collects views of a moved target, whenever it is held still."""
+class ViewCollector:
+    """Collects views of a target that is moved and held still in turn."""
 
     views: list[TargetView] = field(default_factory=list["TargetView"])
     _last: TargetView | None = None
 
-    def offer(self, view: TargetView) -> bool:
-        """Add a view if the target is still, and at a new place; return whether it was added."""
+    def add_if_new(self, view: TargetView) -> bool:
+        """Add a view if the target is still and at a new place; return True if it was added."""
         last, self._last = self._last, view
-        still = last is not None and _apart(last, view) <= MAX_STILL_MOTION_PX
+        is_still = last is not None and _point_distance(last, view) <= MAX_STILL_MOTION_PX
         least_motion = MIN_NEW_VIEW_SHARE * view.size[0]
-        if not still or any(_apart(earlier, view) < least_motion for earlier in self.views):
+        if not is_still or any(
+            _point_distance(earlier, view) < least_motion for earlier in self.views
+        ):
             return False
         self.views.append(view)
         return True
 
-    def gone(self) -> None:
+    def note_target_lost(self) -> None:
         """Note that the target was not seen."""
         self._last = None
 
 
-def _apart(first: TargetView, other: TargetView) -> float:
-    """Return the distance of common points in pixels, root of the mean square."""
+def _point_distance(first: TargetView, other: TargetView) -> float:
+    """Return the root mean square distance of the points that both views have, in pixels."""
     import numpy as np
 
     _, index, other_index = np.intersect1d(first.ids, other.ids, return_indices=True)
@@ -67,7 +69,7 @@ def _apart(first: TargetView, other: TargetView) -> float:
     return float(np.sqrt((distances**2).sum(axis=1).mean()))
 
 
-def _output(_context: object, _option: object, file: str) -> str:
+def _check_output_name(_context: object, _option: object, file: str) -> str:
     if Path(file).suffix.lower() not in {".json", ".yaml", ".yml"}:
         raise click.BadParameter(f"{file}: expected a name that ends with .yaml or .json")
     return file
@@ -90,7 +92,7 @@ def _output(_context: object, _option: object, file: str) -> str:
 @option(
     "--output",
     required=True,
-    callback=_output,
+    callback=_check_output_name,
     help="File for the lens: .yaml is a camera_info of ROS, .json also has the views, and the data "
     "that smartcam calibrate compare needs.",
 )
@@ -117,7 +119,7 @@ def _output(_context: object, _option: object, file: str) -> str:
 )
 @option("--seconds", help="Calibrate after this time with the views so far.")
 @option("--timeout", help="Longest wait for a frame.  [default: 5]")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def lens(
     pictures: tuple[str, ...],
     target: str,
@@ -135,21 +137,21 @@ async def lens(
         raise click.UsageError("expected files and folders, or one URL")
     if not sources and (options.count or options.seconds):
         raise click.UsageError("--count and --seconds are for a source of frames")
-    _check_free(output, force)
-    described = read_target(target)
+    _check_output_path(output, force)
+    target_data = read_target(target)
     try:
         if sources:
-            async with opened(sources[0], options) as source:
-                views = await _from_source(source, described, options)
+            async with make_source(sources[0], options) as source:
+                views = await _collect_views(source, target_data, options)
         else:
-            views = await _from_files(pictures, described, options)
+            views = await _find_views_in_files(pictures, target_data, options)
         calibration = await asyncio.to_thread(
             calibrate_intrinsics, views, distortion_model=model, sheet=sheet
         )
         await asyncio.to_thread(_save, output, calibration)
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
-    options.show(_value(output, calibration), _text(output, calibration))
+    options.show(_calibration_data(output, calibration), _calibration_text(output, calibration))
 
 
 def read_target(path: str) -> Target:
@@ -172,19 +174,19 @@ def read_target(path: str) -> Target:
         raise ConfigurationError(f"--target {path}: {exc}") from exc
 
 
-def _check_free(file: str, force: bool) -> None:
+def _check_output_path(file: str, force: bool) -> None:
     if Path(file).exists() and not force:
         raise ConfigurationError(f"{file}: the file exists already; --force replaces it")
     if not Path(file).parent.is_dir():
         raise ConfigurationError(f"{file}: there is no folder {Path(file).parent}")
 
 
-async def _from_files(
+async def _find_views_in_files(
     pictures: Sequence[str], target: Target, options: Options
 ) -> list[TargetView]:
-    """Return the views of files that show the target."""
+    """Find the target in files; return the views of those that show it."""
     views: list[TargetView] = []
-    for path in _files(pictures):
+    for path in _iter_files(pictures):
         try:
             view = await asyncio.to_thread(_view_of_file, path, target)
         except CalibrationError as exc:
@@ -195,8 +197,8 @@ async def _from_files(
     return views
 
 
-def _files(pictures: Sequence[str]) -> Iterator[Path]:
-    """Yield the named files, and the files of folders in the order of their numbers."""
+def _iter_files(pictures: Sequence[str]) -> Iterator[Path]:
+    """Yield the named files, and the pictures in named folders in natural order."""
     from smartcam._natural import natural
     from smartcam.calibration._inside import SUFFIXES
 
@@ -216,46 +218,46 @@ def _view_of_file(path: Path, target: Target) -> TargetView:
     from smartcam.calibration import find_target
     from smartcam.calibration._inside import MAX_PICTURE_BYTES, decode_picture
 
-    with naming(str(path)), path.open("rb") as stream:
+    with naming_file_errors(str(path)), path.open("rb") as stream:
         data = stream.read(MAX_PICTURE_BYTES + 1)
     return find_target(decode_picture(data, path.name), target, name=path.name)
 
 
-async def _from_source(source: FrameSource, target: Target, options: Options) -> list[TargetView]:
+async def _collect_views(source: FrameSource, target: Target, options: Options) -> list[TargetView]:
     """Return the views collected from a source while the target is moved."""
     from smartcam.calibration import find_target
     from smartcam.calibration._inside import LOOKS, suggestion
 
-    wanted = options.count or 15
-    taken, reported = Collecting(), set[str]()
+    view_count = options.count or 15
+    collector, reported = ViewCollector(), set[str]()
     if not options.as_json:
-        click.echo(f"view 1 of {wanted}: hold the target {LOOKS[0].text}; Ctrl-C gives up")
+        click.echo(f"view 1 of {view_count}: hold the target {LOOKS[0].text}; Ctrl-C gives up")
     try:
         async with asyncio.timeout(options.seconds), source.reader() as reader:
             async for frame in reader:
-                name = f"view {len(taken.views) + 1}"
+                name = f"view {len(collector.views) + 1}"
                 try:
                     view = await asyncio.to_thread(find_target, frame, target, name=name)
                 except CalibrationError as exc:
-                    taken.gone()
+                    collector.note_target_lost()
                     _report_once(exc, reported)
                     continue
-                if not taken.offer(view):
+                if not collector.add_if_new(view):
                     continue
-                _show_view(f"{name} of {wanted}", view, "", options)
-                if len(taken.views) == wanted:
+                _show_view(f"{name} of {view_count}", view, "", options)
+                if len(collector.views) == view_count:
                     break
-                following = await asyncio.to_thread(suggestion, taken.views, lens_known=False)
+                next_look = await asyncio.to_thread(suggestion, collector.views, lens_known=False)
                 if not options.as_json:
-                    click.echo(f"  next: {following.text}")
+                    click.echo(f"  next: {next_look.text}")
     except TimeoutError as exc:
         if isinstance(exc, FrameTimeoutError):  # else --seconds are over
             raise
-    return taken.views
+    return collector.views
 
 
 def _report_once(error: CalibrationError, reported: set[str]) -> None:
-    """Report once why a frame gives no view; raise an error that no frame can cure."""
+    """Report once why a frame gives no view; raise the error if later frames cannot help."""
     from smartcam.geometry._inside import Code
 
     if error.code == Code.SHAPE:
@@ -265,13 +267,13 @@ def _report_once(error: CalibrationError, reported: set[str]) -> None:
         click.echo(f"note: {error}", err=True)
 
 
-def _show_view(name: str, view: TargetView | None, why: str, options: Options) -> None:
+def _show_view(name: str, view: TargetView | None, reason: str, options: Options) -> None:
     points = 0 if view is None else len(view.ids)
-    value = {"picture": name, "used": view is not None, "points": points, "reason": why}
-    text = f"not used: {why}"
+    data = {"picture": name, "used": view is not None, "points": points, "reason": reason}
+    text = f"not used: {reason}"
     if view is not None:
         text = "; ".join([f"{points} points", *(warning.text for warning in view.warnings)])
-    options.show(value, f"{name}: {text}")
+    options.show(data, f"{name}: {text}")
 
 
 def _save(output: str, calibration: IntrinsicCalibration) -> None:
@@ -283,7 +285,7 @@ def _save(output: str, calibration: IntrinsicCalibration) -> None:
         write_camera_info(output, calibration.camera)
 
 
-def _value(output: str, calibration: IntrinsicCalibration) -> dict[str, Any]:
+def _calibration_data(output: str, calibration: IntrinsicCalibration) -> dict[str, Any]:
     """Return the calibration as values for JSON."""
     matrix = calibration.camera.matrix
     return {
@@ -304,23 +306,23 @@ def _value(output: str, calibration: IntrinsicCalibration) -> dict[str, Any]:
     }
 
 
-def _text(output: str, calibration: IntrinsicCalibration) -> str:
-    value = _value(output, calibration)
+def _calibration_text(output: str, calibration: IntrinsicCalibration) -> str:
+    data = _calibration_data(output, calibration)
     rows = [
-        (name, round(number, 3), round(value["deviations"].get(name, 0.0), 3))
-        for name, number in value["lens"].items()
+        (name, round(number, 3), round(data["deviations"].get(name, 0.0), 3))
+        for name, number in data["lens"].items()
     ]
     lines = [
-        f"{output}: {value['views']} views, error {value['held_out_px']:.3g} px in views left out",
+        f"{output}: {data['views']} views, error {data['held_out_px']:.3g} px in views left out",
         table_text(("", "pixels", "sigma"), rows),
     ]
-    if value["lacking"]:
-        lines.append(f"  lacking: {', '.join(_LACKING[kind] for kind in value['lacking'])}")
-    lines += [f"  {remark}" for remark in value["remarks"]]
+    if data["lacking"]:
+        lines.append(f"  lacking: {', '.join(_LACKING_TEXTS[kind] for kind in data['lacking'])}")
+    lines += [f"  {remark}" for remark in data["remarks"]]
     return "\n".join(lines)
 
 
-_LACKING = {
+_LACKING_TEXTS = {
     "x": "views at the left and right",
     "y": "views above and below",
     "size": "views near and far",

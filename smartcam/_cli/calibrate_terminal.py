@@ -34,85 +34,86 @@ COMMANDS: Final = ("undo", "repeat", "abort")
 """Words that may be typed instead of an answer."""
 
 
-async def drive(
+async def run_wizard(
     session: WizardSession,
     options: Options,
-    anew: Callable[[], WizardSession],
+    restart: Callable[[], WizardSession],
     picture: Path,
 ) -> dict[str, Any]:
-    """Ask until the wizard's end; return the last view.
+    """Ask for answers until the wizard ends; return its last view.
 
-    ``anew``: function that begins the wizard again. ``picture``: file for the picture of a step.
-    Raises ConfigurationError: a line of input is not valid, or the input has ended.
+    ``restart``: function that starts the wizard again and returns its session. ``picture``: file
+    for the picture of a step. Raises ConfigurationError: a line of input is not valid, or the input
+    has ended.
     """
-    lines = Lines()
+    lines = InputLines()
     if session.resumed and not options.as_json:
-        session = session if await _goes_on(session.resumed, lines) else anew()
+        session = session if await _wants_to_continue(session.resumed, lines) else restart()
     view = {**session.current, "resumed": session.resumed}
     while view["type"] not in {"result", "abort"}:
-        options.show(view, lambda shown: _step_text(shown, _drawn(shown, picture)))
+        options.show(view, lambda shown: _step_text(shown, _write_picture(shown, picture)))
         if options.as_json:
-            line = await lines.next()
-            if session.resumed and _asks_anew(line):
-                session = anew()
+            line = await lines.read_line()
+            if session.resumed and _asks_for_restart(line):
+                session = restart()
                 view = session.current
             else:
-                view = await _from_json(session, line)
+                view = await _submit_json(session, line)
         elif session.step is not None:
-            view = await _from_prompts(session, session.step, view, lines)
+            view = await _ask_step(session, session.step, view, lines)
     options.show(view, _end_text)
     return view
 
 
-def _asks_anew(line: str) -> bool:
+def _asks_for_restart(line: str) -> bool:
     with contextlib.suppress(ValueError, RecursionError):
         return bool(json.loads(line) == {"do": "anew"})
     return False
 
 
-async def _goes_on(resumed: Mapping[str, Any], lines: Lines) -> bool:
+async def _wants_to_continue(resumed: Mapping[str, Any], lines: InputLines) -> bool:
     """Show the finished steps, and ask whether to continue with them."""
     click.echo(_resumed_text(resumed))
     while True:
         click.echo("Go on, or begin anew? [go on]: ", nl=False)
-        text = (await lines.next()).lower()
+        text = (await lines.read_line()).lower()
         if text in {"", "go on", "g", "begin anew", "anew", "b"}:
             return text in {"", "go on", "g"}
         click.echo(f"! {text!r}: expected 'go on' or 'begin anew'; {len(resumed['done'])} are done")
 
 
 def _resumed_text(resumed: Mapping[str, Any]) -> str:
+    started, last_answer = _time_and_age(resumed["since"]), _time_and_age(resumed["last"])
     text = (
-        f"Broken off: begun {_ago(resumed['since'])}, answered last {_ago(resumed['last'])}. What "
-        "was touched or seen then counts as it was: begin anew if camera, marks or sheet may have "
-        "been moved since."
+        f"Broken off: begun {started}, answered last {last_answer}. What was touched or seen then "
+        "counts as it was: begin anew if camera, marks or sheet may have been moved since."
     )
     rows = [f"  {number}. {_done_text(step)}" for number, step in enumerate(resumed["done"], 1)]
     return "\n".join(["", *textwrap.wrap(text, WIDTH), *rows])
 
 
-def _done_text(done: Mapping[str, Any]) -> str:
+def _done_text(step: Mapping[str, Any]) -> str:
     answers = [
         f"{name} {_default_text(value)}"
-        for name, value in done["answers"].items()
+        for name, value in step["answers"].items()
         if value not in {None, ""}
     ]
-    return textwrap.shorten(f"{done['step']}: {', '.join(answers) or 'done'}", WIDTH - 5)
+    return textwrap.shorten(f"{step['step']}: {', '.join(answers) or 'done'}", WIDTH - 5)
 
 
-def _ago(at: str | None) -> str:
-    """Return a time, and its age."""
+def _time_and_age(at: str | None) -> str:
+    """Return the text of a time and of its age."""
     if at is None:
         return "at an unknown time"
     minutes = (datetime.now(UTC) - datetime.fromisoformat(at)).total_seconds() / 60
     for size, unit in ((1440, "day"), (60, "hour"), (1, "minute")):
         if minutes >= size:
             count = int(minutes // size)
-            return f"{_minute(at)} UTC ({count} {unit}{'s' * (count > 1)} ago)"
-    return f"{_minute(at)} UTC (just now)"
+            return f"{_minute_text(at)} UTC ({count} {unit}{'s' * (count > 1)} ago)"
+    return f"{_minute_text(at)} UTC (just now)"
 
 
-def _drawn(view: Mapping[str, Any], path: Path) -> Path | None:
+def _write_picture(view: Mapping[str, Any], path: Path) -> Path | None:
     """Write the picture of a step, if it has one; return its file."""
     svg = (view.get("preview") or {}).get("svg")
     if not svg:
@@ -127,12 +128,12 @@ def _drawn(view: Mapping[str, Any], path: Path) -> Path | None:
     return path
 
 
-async def _do(session: WizardSession, command: str, token: str) -> dict[str, Any]:
+async def _run_command(session: WizardSession, command: str, token: str) -> dict[str, Any]:
     view: dict[str, Any] = await getattr(session, command)(token)
     return view
 
 
-async def _from_json(session: WizardSession, line: str) -> dict[str, Any]:
+async def _submit_json(session: WizardSession, line: str) -> dict[str, Any]:
     try:
         request = json.loads(line)
         token = request.get("token", session.token)
@@ -145,84 +146,89 @@ async def _from_json(session: WizardSession, line: str) -> dict[str, Any]:
         return await session.submit(token, answers)
     if command not in COMMANDS:
         raise ConfigurationError(f"do: expected one of {', '.join(COMMANDS)}, got {command!r}")
-    return await _do(session, command, token)
+    return await _run_command(session, command, token)
 
 
-class _Instead(NamedTuple):
+class _TypedCommand(NamedTuple):
     """A word that was typed instead of an answer."""
 
     name: str
 
 
-async def _from_prompts(
-    session: WizardSession, step: Step, view: dict[str, Any], lines: Lines
+async def _ask_step(
+    session: WizardSession, step: Step, view: dict[str, Any], lines: InputLines
 ) -> dict[str, Any]:
-    """Ask for a step's answers, one by one, until it is left; earlier answers are defaults."""
-    token, can = view["token"], view["can"]
+    """Ask for a step's answers until the wizard leaves the step; earlier answers are defaults.
+
+    Returns the view that follows.
+    """
+    token, commands = view["token"], view["can"]
     answers = dict(view["defaults"])
-    wanted = [field.name for field in step.inputs]
+    field_names = [field.name for field in step.inputs]
     while view["token"] == token:
         for field in step.inputs:
-            if field.name in wanted:
-                value = await _answer(field, answers, can, lines)
-                if isinstance(value, _Instead):
-                    return await _do(session, value.name, token)
+            if field.name in field_names:
+                value = await _ask_field(field, answers, commands, lines)
+                if isinstance(value, _TypedCommand):
+                    return await _run_command(session, value.name, token)
                 answers[field.name] = value
         if not step.inputs:
-            typed = await _typed(f"{step.button}: press Enter", can, lines)
-            if isinstance(typed, _Instead):
-                return await _do(session, typed.name, token)
+            typed = await _read_text(f"{step.button}: press Enter", commands, lines)
+            if isinstance(typed, _TypedCommand):
+                return await _run_command(session, typed.name, token)
         if step.waiting:
             text = f"{step.waiting}; Ctrl-C ends it, and the same command goes on"
             click.echo("\n".join(textwrap.wrap(text, WIDTH)))
         view = await session.submit(token, answers)
-        wanted = [name for name in view["errors"] if name in answers] or list(answers)
+        field_names = [name for name in view["errors"] if name in answers] or list(answers)
         if view["token"] == token:
             click.echo(_errors_text(view))
     return view
 
 
-async def _answer(
-    field: Input, answers: Mapping[str, Any], can: Collection[str], lines: Lines
-) -> Any | _Instead:
-    """Return an answer that the step accepts, or a command; ask again after a wrong one."""
+async def _ask_field(
+    field: Input, answers: Mapping[str, Any], commands: Collection[str], lines: InputLines
+) -> Any | _TypedCommand:
+    """Return a valid answer, or a command; ask again after a wrong answer."""
     schema = field.schema()
-    prompt = _prompt(schema, answers.get(field.name))
+    prompt = _prompt_text(schema, answers.get(field.name))
     while True:
-        text = await _typed(prompt, can, lines)
-        if isinstance(text, _Instead):
+        text = await _read_text(prompt, commands, lines)
+        if isinstance(text, _TypedCommand):
             return text
         if not text and field.name in answers:
             return answers[field.name]
         try:
-            return field.checked(_value(schema, text))
+            return field.checked(_parse_value(schema, text))
         except ValueError as exc:
-            wrong = f"{text!r}: expected yes or no" if schema["type"] == "boolean" else exc
-            click.echo(f"! {field.label}: {wrong}")
+            message = f"{text!r}: expected yes or no" if schema["type"] == "boolean" else exc
+            click.echo(f"! {field.label}: {message}")
 
 
-async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Instead:
-    """Return the line typed; ask again after a command that is not possible now."""
+async def _read_text(
+    prompt: str, commands: Collection[str], lines: InputLines
+) -> str | _TypedCommand:
+    """Return the line typed, or a command; ask again after a command that is not possible now."""
     while True:
         click.echo(f"{prompt}: ", nl=False)
-        text = await lines.next()
+        text = await lines.read_line()
         command = text[1:].strip()
         if not text.startswith(":"):
             return text
-        if command in can:
-            return _Instead(command)
-        click.echo(f"! :{command}: expected one of {', '.join(f':{known}' for known in can)}")
+        if command in commands:
+            return _TypedCommand(command)
+        click.echo(f"! :{command}: expected one of {', '.join(f':{known}' for known in commands)}")
 
 
 # ---------------------------------------------------------------------- texts
 
 
-def _prompt(schema: Mapping[str, Any], default: Any) -> str:
+def _prompt_text(schema: Mapping[str, Any], default: Any) -> str:
     unit = f", {schema['x-unit']}" if "x-unit" in schema else ""
-    shown = "" if default in {None, ""} else f" [{_default_text(default)}]"
+    default_text = "" if default in {None, ""} else f" [{_default_text(default)}]"
     rows = [f"    {choice['const']}: {choice['title']}\n" for choice in schema.get("oneOf", ())]
     head = f"{schema['title']}{unit}"
-    return f"{head}\n{''.join(rows)}  answer{shown}" if rows else f"{head}{shown}"
+    return f"{head}\n{''.join(rows)}  answer{default_text}" if rows else f"{head}{default_text}"
 
 
 def _default_text(value: Any) -> str:
@@ -234,8 +240,8 @@ def _default_text(value: Any) -> str:
 _BOOLEANS = {"y": True, "yes": True, "n": False, "no": False}
 
 
-def _value(schema: Mapping[str, Any], text: str) -> Any:
-    """Return the value of a text; the input itself refuses a text without a value."""
+def _parse_value(schema: Mapping[str, Any], text: str) -> Any:
+    """Return the value that a text stands for, or the text itself, which the field then refuses."""
     kind = schema.get("type")
     if kind == "boolean":
         return _BOOLEANS.get(text.lower(), text)
@@ -316,39 +322,39 @@ def _result_text(value: Any) -> str:
 def listing_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the table of a folder's calibrations."""
     head = ("name", "kind", "date (UTC)", "error", "last check")
-    return table_text(head, [_listed(row) for row in rows])
+    return table_text(head, [_listing_row(row) for row in rows])
 
 
-def _listed(row: Mapping[str, Any]) -> tuple[str, ...]:
+def _listing_row(row: Mapping[str, Any]) -> tuple[str, ...]:
     if row["problem"] is not None:
         return row["name"], "-", "-", "-", f"cannot be read: {row['problem']}"
     error = "not known" if row["held_out_mm"] is None else f"{row['held_out_mm']:.2f} mm rms"
     verdict = "stale" if row["stale"] else "still true"
-    check = "none" if row["checked_at"] is None else f"{_minute(row['checked_at'])}: {verdict}"
-    return row["name"], row["kind"], _minute(row["written_at"]), error, check
+    check = "none" if row["checked_at"] is None else f"{_minute_text(row['checked_at'])}: {verdict}"
+    return row["name"], row["kind"], _minute_text(row["written_at"]), error, check
 
 
-def _minute(at: str) -> str:
+def _minute_text(at: str) -> str:
     return at[:16].replace("T", " ")
 
 
 # ---------------------------------------------------------------------- standard input
 
 
-class Lines:
-    """Lines of standard input, read one by one on demand while the event loop runs.
+class InputLines:
+    """Reads lines of standard input, one by one, without blocking the event loop.
 
-    A thread waits for each line. It reads the descriptor itself, since a thread that waits in
-    Python's own buffer would keep the interpreter from ending.
+    A thread waits for each line. It reads from the file descriptor, since a thread that waits in
+    ``sys.stdin`` would keep the interpreter from ending.
     """
 
     def __init__(self) -> None:
         self._buffer = b""
 
-    async def next(self) -> str:
+    async def read_line(self) -> str:
         """Return the next line without its end; ConfigurationError: the input has ended.
 
-        Cancellation: the thread waits on, and ends with the process.
+        Cancellation: the thread still waits for the line, until the process ends.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str] = loop.create_future()

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import click
 
 from smartcam._cli.options import (
-    CAMERA,
-    CONNECTS,
-    RESULTS,
+    CAMERA_OPTIONS,
+    CONNECT_WARNING,
+    RESULT_OPTIONS,
     Options,
-    application,
+    async_command,
     from_hex,
-    runs,
+    parse_application,
 )
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.texts import application_text, not_running
+from smartcam._cli.texts import application_text, not_running_error
 from smartcam.exceptions import NotRunningError, TriggerTimeoutError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -27,54 +27,54 @@ if TYPE_CHECKING:
     import smartcam
 
 
-@click.command(help=f"Show a camera's status; changes nothing on it. {CONNECTS}")
+@click.command(help=f"Show a camera's status; changes nothing on it. {CONNECT_WARNING}")
 @click.argument("url")
-@runs(*CAMERA)
+@async_command(*CAMERA_OPTIONS)
 async def status(url: str, options: Options) -> None:
-    await _then_show(url, options)
+    await _run_and_show(url, options)
 
 
 @click.command(
     help="Trigger and print the result. Without --application nothing is started: a stopped "
-    f"camera is an error (exit code 5). {CONNECTS}"
+    f"camera is an error (exit code 5). {CONNECT_WARNING}"
 )
 @click.argument("url")
 @click.option("--input", "input_hex", metavar="HEX", help="Input data for each inspection, as hex.")
-@runs(*RESULTS)
+@async_command(*RESULT_OPTIONS)
 async def trigger(url: str, input_hex: str | None, options: Options) -> None:
     import asyncio
 
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
-    as_text = options.result_text()
+    make_text = options.result_text()
     data = None if input_hex is None else from_hex(input_hex, "--input")
-    timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
+    timeout = options.step_timeout(DEFAULT_TRIGGER_TIMEOUT)
     loop = asyncio.get_running_loop()
-    url = await options.located(url)
-    with options.camera(url) as unopened:
-        options.remark(unopened)
-        async with unopened as camera:
+    url = await options.locate_url(url)
+    with options.camera(url) as unopened_camera:
+        options.show_remarks(unopened_camera)
+        async with unopened_camera as camera:
             end = loop.time() + options.seconds if options.seconds else None
             count = options.count or (None if end else 1)
-            done = 0
-            while (count is None or done < count) and (end is None or loop.time() < end):
+            result_count = 0
+            while (count is None or result_count < count) and (end is None or loop.time() < end):
                 try:
                     result = await camera.trigger(input=data, timeout=timeout)
                 except NotRunningError as exc:
-                    raise not_running(exc, camera, "trigger") from exc
-                options.show(result, functools.partial(as_text, camera))
-                done += 1
+                    raise not_running_error(exc, camera, "trigger") from exc
+                options.show(result, functools.partial(make_text, camera))
+                result_count += 1
 
 
 @click.command(
     help="Print results as they come, until Ctrl-C, --count or --seconds. With --count each "
-    f"result must come within --timeout. {CONNECTS}"
+    f"result must come within --timeout. {CONNECT_WARNING}"
 )
 @click.argument("url")
 @page_options("Show a page instead, as smartcam live does; its address goes to stdout.")
-@runs(*RESULTS, interrupted=0)
+@async_command(*RESULT_OPTIONS, interrupt_code=0)
 async def watch(url: str, web: PageOptions, options: Options) -> None:
-    if web.wanted:
+    if web.is_wanted:
         if options.count:
             raise click.UsageError("--count and --web do not go together")
         from smartcam._cli.live import serve_page
@@ -83,41 +83,41 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
         return
     import asyncio
 
-    from smartcam._cli.terminal import counting
+    from smartcam._cli.terminal import counting_line
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
     from smartcam.settings import is_fleet
 
-    as_text = options.result_text()
-    each = options.step(DEFAULT_TRIGGER_TIMEOUT) if options.count else None
-    url = await options.located(url)
-    with options.camera(url) as unopened:
-        # subscribed before the session begins, so the first result is seen, too
-        results = unopened.results()
-        async with unopened as camera:
+    make_text = options.result_text()
+    result_timeout = options.step_timeout(DEFAULT_TRIGGER_TIMEOUT) if options.count else None
+    url = await options.locate_url(url)
+    with options.camera(url) as unopened_camera:
+        # subscribe before the session begins, so that the first result is not missed
+        results = unopened_camera.results()
+        async with unopened_camera as camera:
             if not (camera.capabilities.unasked_results or is_fleet(url)):
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some: "
                     f"smartcam trigger {shlex.quote(camera.url)} --count N"
                 )
-            done = 0
+            result_count = 0
             try:
-                async with counting(camera) as line, asyncio.timeout(options.seconds):
-                    while options.count is None or done < options.count:
+                async with counting_line(camera) as line, asyncio.timeout(options.seconds):
+                    while options.count is None or result_count < options.count:
                         try:
-                            async with asyncio.timeout(each):
+                            async with asyncio.timeout(result_timeout):
                                 result = await anext(results)
                         except TimeoutError as exc:
                             raise TriggerTimeoutError(
-                                f"{camera.name}: no result within {each:g} s; "
+                                f"{camera.name}: no result within {result_timeout:g} s; "
                                 f"status: {camera.status}"
                             ) from exc
                         line.clear()
-                        options.show(result, functools.partial(as_text, camera))
-                        done += 1
+                        options.show(result, functools.partial(make_text, camera))
+                        result_count += 1
             except TriggerTimeoutError:
                 raise
             except TimeoutError:  # --seconds are over
-                if not done and not options.as_json:
+                if not result_count and not options.as_json:
                     click.echo(
                         f"note: no result came in {options.seconds:g} s; status: {camera.status}",
                         err=True,
@@ -126,14 +126,14 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
 
 @click.command(
     help="Load another application by its id, or by its file's name if the camera can do that; "
-    f"returns when the camera is ready. It runs if the previous one ran. {CONNECTS}"
+    f"returns when the camera is ready. It runs if the previous one ran. {CONNECT_WARNING}"
 )
 @click.argument("url")
-@click.argument("id_or_file", metavar="ID|FILE", type=application)
-@runs(*CAMERA)
+@click.argument("id_or_file", metavar="ID|FILE", type=parse_application)
+@async_command(*CAMERA_OPTIONS)
 async def switch(url: str, id_or_file: int | str, options: Options) -> None:
     try:
-        await _then_show(url, options, lambda camera: camera.switch_application(id_or_file))
+        await _run_and_show(url, options, lambda camera: camera.switch_application(id_or_file))
     except UnsupportedError as exc:
         if isinstance(id_or_file, int):
             raise
@@ -142,29 +142,33 @@ async def switch(url: str, id_or_file: int | str, options: Options) -> None:
         ) from exc
 
 
-@click.command(help=f"Enter run mode; returns when the camera is ready. {CONNECTS}")
+@click.command(help=f"Enter run mode; returns when the camera is ready. {CONNECT_WARNING}")
 @click.argument("url")
-@runs(*CAMERA)
+@async_command(*CAMERA_OPTIONS)
 async def start(url: str, options: Options) -> None:
-    await _then_show(url, options, lambda camera: camera.start(timeout=options.step(10.0)))
+    await _run_and_show(
+        url, options, lambda camera: camera.start(timeout=options.step_timeout(10.0))
+    )
 
 
-@click.command(help=f"Leave run mode; returns when the camera has stopped. {CONNECTS}")
+@click.command(help=f"Leave run mode; returns when the camera has stopped. {CONNECT_WARNING}")
 @click.argument("url")
-@runs(*CAMERA)
+@async_command(*CAMERA_OPTIONS)
 async def stop(url: str, options: Options) -> None:
-    await _then_show(url, options, lambda camera: camera.stop(timeout=options.step(10.0)))
+    await _run_and_show(
+        url, options, lambda camera: camera.stop(timeout=options.step_timeout(10.0))
+    )
 
 
-async def _then_show(
+async def _run_and_show(
     url: str,
     options: Options,
     action: Callable[[smartcam.Camera], Awaitable[None]] | None = None,
 ) -> None:
-    """Connect, run an action, and show the camera's state afterwards."""
-    url = await options.located(url)
-    with options.camera(url) as unopened:
-        async with unopened as camera:
+    """Connect, run an action, and show the camera's state after it."""
+    url = await options.locate_url(url)
+    with options.camera(url) as unopened_camera:
+        async with unopened_camera as camera:
             if action is not None:
                 await action(camera)
             _show_camera(camera, options)

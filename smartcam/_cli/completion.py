@@ -23,17 +23,17 @@ LINES: Mapping[str, str] = {
     "zsh": _EVAL,
     "fish": "command -q {program}; and {variable}=fish_source {program} | source",
 }
-"""The line for each shell that lets it complete an installed program."""
+"""By shell, the line that sets up the completion of a program, if it is installed."""
 
 
 def install(shell: str) -> str:
-    """Add the missing lines to the shell's file, and return a report.
+    """Add the missing lines to the shell's startup file, and return a report.
 
     Args:
-        shell: name of the shell; "": the shell of the variable SHELL.
+        shell: name of the shell; "": the one that the variable SHELL names.
 
     Raises:
-        click.UsageError: the shell is unknown, or its file cannot be written.
+        click.UsageError: the shell is unknown, or its startup file cannot be written.
     """
     name = shell or Path(os.environ.get("SHELL", "")).name
     if name not in LINES:
@@ -42,14 +42,14 @@ def install(shell: str) -> str:
             f"--install-completion: expected one of {known}, got {name!r}"
             f"{did_you_mean(name, LINES)}"
         )
-    path = _file_of(name)
+    path = _startup_file(name)
     try:
-        written = _append(path, [_line(name, program) for program in PROGRAMS])
+        added_count = _append_missing(path, [_line(name, program) for program in PROGRAMS])
     except (OSError, UnicodeDecodeError) as exc:
         raise click.UsageError(f"--install-completion: {path}: {exc}") from exc
-    if not written:
+    if not added_count:
         return f"{path}: has the lines already"
-    return f"{path}: {written} lines added; a new {name} completes {' and '.join(PROGRAMS)}"
+    return f"{path}: {added_count} lines added; a new {name} completes {' and '.join(PROGRAMS)}"
 
 
 def _line(shell: str, program: str) -> str:
@@ -57,7 +57,7 @@ def _line(shell: str, program: str) -> str:
     return LINES[shell].format(program=program, variable=variable, shell=shell)
 
 
-def _file_of(shell: str) -> Path:
+def _startup_file(shell: str) -> Path:
     """Return the startup file of an interactive shell."""
     home = Path.home()
     if shell == "fish":
@@ -67,14 +67,14 @@ def _file_of(shell: str) -> Path:
     return folder / f".{shell}rc"
 
 
-def _append(path: Path, lines: list[str]) -> int:
+def _append_missing(path: Path, lines: list[str]) -> int:
     """Append the lines that a file lacks; return their number."""
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     rc_lines = text.splitlines()
-    lacking = [line for line in lines if line not in rc_lines]
-    if lacking:
+    missing = [line for line in lines if line not in rc_lines]
+    if missing:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a", encoding="utf-8") as stream:
             stream.write("\n" * (bool(text) and not text.endswith("\n")))
-            stream.writelines(f"{line}\n" for line in lacking)
-    return len(lacking)
+            stream.writelines(f"{line}\n" for line in missing)
+    return len(missing)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.byte_text import bytes_of_text
-from smartcam._cli.options import DIALECTS, OUTPUT, Options, option, runs
+from smartcam._cli.byte_text import parse_bytes
+from smartcam._cli.options import DIALECTS, OUTPUT_OPTIONS, Options, async_command, option
 from smartcam._cli.texts import table_text
 from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
 
@@ -38,22 +38,22 @@ if TYPE_CHECKING:
     help="Dialect of the frames.",
 )
 @click.option("--quirks", metavar="NAMES", default="", help="The dialect's quirks, as in a URL.")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def decode(
     data: str, big_endian: bool, dialect_name: str | None, quirks: str, options: Options
 ) -> None:
-    """Print the meaning of bytes; a frame with a magic number shows its dialect by itself."""
+    """Print the meaning of bytes; a frame's magic number tells its dialect."""
     from smartcam.interpreters import resolve
     from smartcam.protocols import BVS
 
-    payload = _load(data)
+    payload = _read_bytes(data)
     if not payload:
         raise ConfigurationError("decode: there are no bytes to decode")
     byte_order: ByteOrder = "big" if big_endian else "little"
     interpreter = None if options.interpret_as is None else resolve(options.interpret_as)
     if dialect_name is None and quirks:
         raise ConfigurationError("decode: --quirks are a dialect's: name it with --dialect")
-    dialect = _dialect_of(payload) if dialect_name is None else BVS.dialects[dialect_name]
+    dialect = _find_dialect(payload) if dialect_name is None else BVS.dialects[dialect_name]
     if dialect is not None and quirks:
         dialect = dialect.with_quirks(name.strip() for name in quirks.split(","))
     if dialect is not None:
@@ -68,30 +68,30 @@ async def decode(
     options.show({"value": value}, options.value_text(value))
 
 
-def _load(data: str) -> bytes:
+def _read_bytes(data: str) -> bytes:
     if data == "-":
         raw = sys.stdin.buffer.read() if sys.stdin is not None else b""
     else:
         try:
             path = Path(data)
             if not path.is_file():
-                return _from_text(data)
+                return _parse_text(data)
             raw = path.read_bytes()
         except (OSError, ValueError) as exc:
             if isinstance(exc, ConfigurationError):
                 raise
             raise ConfigurationError(f"decode: {data[:64]!r}: {exc}") from exc
     try:
-        return bytes_of_text(raw.decode("ascii"))
+        return parse_bytes(raw.decode("ascii"))
     except ConfigurationError:
         raise
     except ValueError:
         return raw  # a binary file
 
 
-def _from_text(data: str) -> bytes:
+def _parse_text(data: str) -> bytes:
     try:
-        return bytes_of_text(data)
+        return parse_bytes(data)
     except ConfigurationError:
         raise
     except ValueError as exc:
@@ -101,7 +101,7 @@ def _from_text(data: str) -> bytes:
         ) from exc
 
 
-def _dialect_of(payload: bytes) -> FramedDialect | None:
+def _find_dialect(payload: bytes) -> FramedDialect | None:
     from smartcam.protocols import BVS
 
     for dialect in BVS.dialects.values():
@@ -158,10 +158,10 @@ def _show_frame(
     from smartcam.protocols.messages import ResultContainer
 
     raw = dialect.encode_frame(frame)
-    for sender in _senders(dialect, frame):
+    for sender in _possible_senders(dialect, frame):
         name = type(dialect.decode(sender, frame)).__name__  # raises if it is too short
         fields = view_fields(dialect, sender, raw)
-        shown: dict[str, Any] = {
+        frame_data: dict[str, Any] = {
             "offset": offset,
             "dialect": dialect.name,
             "sender": sender.value,
@@ -176,12 +176,12 @@ def _show_frame(
         ]
         lines.append(table_text(("offset", "field", "bytes", "value"), rows))
         if name == ResultContainer.__name__ and interpreter is not None:
-            shown["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
-            lines.append(options.value_text(shown["value"]))
-        options.show(shown, "\n".join(lines))
+            frame_data["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
+            lines.append(options.value_text(frame_data["value"]))
+        options.show(frame_data, "\n".join(lines))
 
 
-def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
+def _possible_senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
     """Return the senders that the frame can have, by id and size; both if neither fits."""
     from smartcam.protocols.messages import Sender
 
@@ -190,8 +190,8 @@ def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
         for sender in Sender
         if dialect.knows(sender, frame.message_id) and dialect.surplus(sender, frame) == 0
     ]
-    known = [sender for sender in Sender if dialect.knows(sender, frame.message_id)]
-    return exact or known[-1:] or [Sender.CAMERA]
+    possible = [sender for sender in Sender if dialect.knows(sender, frame.message_id)]
+    return exact or possible[-1:] or [Sender.CAMERA]
 
 
 def _interpret(payload: bytes, interpreter: Interpreter, byte_order: ByteOrder) -> Any:

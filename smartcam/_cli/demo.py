@@ -1,4 +1,4 @@
-"""``smartcam demo``: the main job against an emulated camera, step by step."""
+"""``smartcam demo``: connect to an emulated camera, switch, trigger, localize, step by step."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from smartcam.models import ApplicationChanged, StatusChanged
 if TYPE_CHECKING:
     from smartcam._cli.options import Options
 
-STREAMED = 10
+STREAMED_COUNT = 10
 TANGRAM, COUNTER, HELLO = 7, 9, 21
 
 
 @dataclass(eq=False)
 class Steps:
-    """Prints steps, as text or JSON lines."""
+    """Prints numbered steps and their details, as text or JSON lines."""
 
     _options: Options
     _number: int = 0
@@ -69,7 +69,7 @@ async def _switch(camera: smartcam.Camera, steps: Steps) -> None:
     steps.step(
         f"Switch to application {TANGRAM}. The camera must be stopped, is BUSY, then runs again:"
     )
-    begin = loop.time()
+    started_at = loop.time()
     events = camera.events()
     switching = asyncio.create_task(camera.switch_application(TANGRAM))
     await camera.wait_status(lambda status: smartcam.Status.BUSY in status)
@@ -86,8 +86,8 @@ async def _switch(camera: smartcam.Camera, steps: Steps) -> None:
             case _:
                 pass
     steps.detail(
-        f"   ready {1e3 * (loop.time() - begin):.0f} ms after the order, with a trigger that was "
-        f"asked for while BUSY: {len(result.value)} parts"
+        f"   ready {1e3 * (loop.time() - started_at):.0f} ms after the order, with a trigger that "
+        f"was asked for while BUSY: {len(result.value)} parts"
     )
 
 
@@ -120,13 +120,13 @@ async def _localize(camera: smartcam.Camera, emulator: EmulatedCamera, steps: St
 
 
 async def _stream(camera: smartcam.Camera, steps: Steps) -> None:
-    steps.step(f"Application {COUNTER} runs free: {STREAMED} results as they come:")
+    steps.step(f"Application {COUNTER} runs free: {STREAMED_COUNT} results as they come:")
     async with camera.application(COUNTER):
         numbers: list[int] = []
         async with camera.results() as results, asyncio.timeout(10):
             async for result in results:
                 numbers.append(result.value.n)
-                if len(numbers) == STREAMED:
+                if len(numbers) == STREAMED_COUNT:
                     break
     steps.detail(f"   {', '.join(map(str, numbers))}", numbers=numbers)
     steps.detail(f"   and back in application {camera.active_application}")

@@ -27,14 +27,14 @@ SHARED = "line1/cam1"
 CAMERAS_OF_AGENT = {"north": ("line1", 6), "south": ("line2", 4)}
 """Line of the cameras and their number, for each agent."""
 
-BY_ROBOT, BY_HAND = 9, 3
-"""Triggers of two programs at the same time."""
+ROBOT_TRIGGERS, HAND_TRIGGERS = 9, 3
+"""Number of triggers of the robot, and of the dashboard at the same time."""
 
 STEP_TIMEOUT = 30.0
-"""Seconds for any step; only a failure takes as long."""
+"""Longest time for any step, seconds."""
 
 RESERVED_TIMEOUT = 0.3
-"""Seconds that a program waits for a camera that another program has reserved."""
+"""Seconds that the dashboard waits for a camera that another program has reserved."""
 
 
 async def demo(options: Options) -> None:
@@ -50,17 +50,17 @@ async def demo(options: Options) -> None:
     async with contextlib.AsyncExitStack() as stack, asyncio.timeout(4 * STEP_TIMEOUT):
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         agents: dict[str, Process] = {}
-        for name, place in (("north", "listen"), ("south", "connect")):
+        for name, link_kind in (("north", "listen"), ("south", "connect")):
             line, count = CAMERAS_OF_AGENT[name]
             cameras = {f"{line}/**": {"emulated": {"count": count}, "application": TANGRAM}}
             file = Path(folder) / f"{name}.yaml"
             # JSON is YAML, too
-            file.write_text(json.dumps({"agent": name, place: endpoint, "cameras": cameras}))
-            agents[name] = await stack.enter_async_context(_agent(file, count))
-            doing = "is the router, too" if place == "listen" else "joins it there"
+            file.write_text(json.dumps({"agent": name, link_kind: endpoint, "cameras": cameras}))
+            agents[name] = await stack.enter_async_context(_run_agent(file, count))
+            role_text = "is the router, too" if link_kind == "listen" else "joins it there"
             steps.step(
                 f"Agent {name}, process {agents[name].pid}, has {count} emulated cameras and "
-                f"{doing}: {url}",
+                f"{role_text}: {url}",
                 agent=name,
                 url=url,
             )
@@ -71,16 +71,16 @@ async def demo(options: Options) -> None:
             for name in ("robot", "dashboard", "recorder")
         ]
         robot, dashboard, recorder = programs
-        await _share(robot, dashboard, recorder, steps)
-        await _reserve(fleet[SHARED], dashboard, steps)
+        await _show_sharing(robot, dashboard, recorder, steps)
+        await _show_reservation(fleet[SHARED], dashboard, steps)
         await _trigger_all(fleet, steps)
-        await _kill(fleet, agents["south"], robot, steps)
-        await _end(agents["north"], robot, steps)
+        await _kill_agent(fleet, agents["south"], robot, steps)
+        await _end_agent(agents["north"], robot, steps)
 
 
 @contextlib.asynccontextmanager
-async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
-    """Run an agent in a process of its own; its cameras are ready on return."""
+async def _run_agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
+    """Run an agent in a process of its own; the block begins when its cameras are ready."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "smartcam", "serve", str(file), "--json"),
         stdin=asyncio.subprocess.DEVNULL,
@@ -118,7 +118,7 @@ def _show_fleet(fleet: Fleet, steps: Steps) -> None:
     )
 
 
-async def _share(
+async def _show_sharing(
     robot: smartcam.Camera, dashboard: smartcam.Camera, recorder: smartcam.Camera, steps: Steps
 ) -> None:
     steps.step(
@@ -131,31 +131,32 @@ async def _share(
         return [(await camera.trigger(timeout=STEP_TIMEOUT)).number for _ in range(times)]
 
     async def record() -> list[int]:
-        return [(await anext(recorded)).number for _ in range(BY_ROBOT + BY_HAND)]
+        return [(await anext(recorded)).number for _ in range(ROBOT_TRIGGERS + HAND_TRIGGERS)]
 
     async with asyncio.timeout(STEP_TIMEOUT), asyncio.TaskGroup() as group:
-        recording = group.create_task(record())
-        moving = group.create_task(trigger(robot, BY_ROBOT))
-        pressing = group.create_task(trigger(dashboard, BY_HAND))
-    for name, task in (("robot", moving), ("dashboard", pressing), ("recorder", recording)):
+        recorder_task = group.create_task(record())
+        robot_task = group.create_task(trigger(robot, ROBOT_TRIGGERS))
+        dashboard_task = group.create_task(trigger(dashboard, HAND_TRIGGERS))
+    tasks = {"robot": robot_task, "dashboard": dashboard_task, "recorder": recorder_task}
+    for name, task in tasks.items():
         numbers = task.result()
         steps.detail(
             f"   {name:9} results {', '.join(map(str, numbers))}", program=name, numbers=numbers
         )
-    owned = sorted([*moving.result(), *pressing.result()])
-    each = "each is one's own" if owned == recording.result() else "they are NOT one's own"
-    account, seen = recorded.statistics(), statuses.statistics().offered
-    steps.detail(f"   {len(owned)} triggers, {len(set(owned))} results: {each}", own=owned)
+    owned = sorted([*robot_task.result(), *dashboard_task.result()])
+    verdict = "each is one's own" if owned == recorder_task.result() else "they are NOT one's own"
+    account, status_count = recorded.statistics(), statuses.statistics().offered
+    steps.detail(f"   {len(owned)} triggers, {len(set(owned))} results: {verdict}", own=owned)
     steps.detail(
         f"   the recorder's account: sent {account.offered + account.missed} = taken "
         f"{account.taken} + dropped {account.dropped} + queued {account.queued} + missed "
-        f"{account.missed}; the dashboard saw {seen} statuses",
+        f"{account.missed}; the dashboard saw {status_count} statuses",
         account=account,
-        statuses=seen,
+        statuses=status_count,
     )
 
 
-async def _reserve(camera: FleetCamera[Any], other: smartcam.Camera, steps: Steps) -> None:
+async def _show_reservation(camera: FleetCamera[Any], other: smartcam.Camera, steps: Steps) -> None:
     steps.step(
         f"One program has {SHARED} for itself; the dashboard's trigger waits, and says for whom:"
     )
@@ -170,35 +171,36 @@ async def _reserve(camera: FleetCamera[Any], other: smartcam.Camera, steps: Step
 
 async def _trigger_all(fleet: Fleet, steps: Steps) -> None:
     loop = asyncio.get_running_loop()
-    begin = loop.time()
+    started_at = loop.time()
     outcomes = await fleet.trigger(timeout=STEP_TIMEOUT)
-    taken = loop.time() - begin
+    duration = loop.time() - started_at
     results: list[Result] = [
         outcome for outcome in outcomes.values() if not isinstance(outcome, SmartCamError)
     ]
     steps.step(
         f"All cameras triggered at once: {len(results)} results of {len(outcomes)} cameras after "
-        f"{1e3 * taken:.0f} ms, each inspection about {1e3 * (results[0].latency or 0):.0f} ms",
+        f"{1e3 * duration:.0f} ms, each inspection about {1e3 * (results[0].latency or 0):.0f} ms",
         results=len(results),
         cameras=len(outcomes),
     )
 
 
-async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
+async def _kill_agent(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
     steps.step("Agent south is killed. Every program learns of it at once:")
     events, loop = fleet.events(), asyncio.get_running_loop()
     await _drain(events)
-    begin = loop.time()
+    started_at = loop.time()
     agent.kill()
-    left: list[str] = []
+    _, camera_count = CAMERAS_OF_AGENT["south"]
+    event_names: list[str] = []
     async with asyncio.timeout(STEP_TIMEOUT):
-        while "AgentLeft" not in left or left.count("CameraLeft") < CAMERAS_OF_AGENT["south"][1]:
-            left.append(type(await anext(events)).__name__)
-    gone = left.count("CameraLeft")
+        while "AgentLeft" not in event_names or event_names.count("CameraLeft") < camera_count:
+            event_names.append(type(await anext(events)).__name__)
+    lost_count = event_names.count("CameraLeft")
     steps.detail(
-        f"   {1e3 * (loop.time() - begin):.0f} ms later: {gone} cameras and their agent are gone; "
-        f"there are {len(fleet)}, of {', '.join(fleet.agents())}",
-        gone=gone,
+        f"   {1e3 * (loop.time() - started_at):.0f} ms later: {lost_count} cameras and their agent "
+        f"are gone; there are {len(fleet)}, of {', '.join(fleet.agents())}",
+        gone=lost_count,
         left=len(fleet),
     )
     result = await robot.trigger(timeout=STEP_TIMEOUT)
@@ -206,16 +208,16 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Ste
 
 
 async def _drain(events: Any) -> None:
-    """Read the waiting events: agents and cameras that were there at the start."""
+    """Read the waiting events, which report the agents and cameras that already exist."""
     while events.statistics().queued:
         await anext(events)
 
 
-async def _end(agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
-    gone = robot.events()
+async def _end_agent(agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
+    events = robot.events()
     agent.terminate()
     async with asyncio.timeout(STEP_TIMEOUT):
-        while not isinstance(await anext(gone), smartcam.Disconnected):
+        while not isinstance(await anext(events), smartcam.Disconnected):
             pass
         await agent.wait()
     try:

@@ -1,4 +1,4 @@
-"""``smartcam demo --inspect``: a software camera checks drawn parts; results beside the truth."""
+"""``smartcam demo --inspect``: a software camera checks drawn parts, whose faults are known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from smartcam._cli.demo import Steps
-from smartcam._cli.options import naming
+from smartcam._cli.options import naming_file_errors
 from smartcam._cli.texts import table_text
 from smartcam._extras import load
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Pixels = NDArray[np.uint8]
 
-USE: Final = "inspection needs"
+INSPECTION_NEEDS: Final = "inspection needs"
 
 SIZE_PX: Final = (640, 400)
 """Width and height of a picture, pixels."""
@@ -101,8 +101,8 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     from smartcam.inspection import Picture, load_cell
 
     steps = Steps(options)
-    with naming(f"--folder {folder}"):
-        await asyncio.to_thread(_write, folder, seed)
+    with naming_file_errors(f"--folder {folder}"):
+        await asyncio.to_thread(_write_folder, folder, seed)
     steps.step(
         f"A folder with drawn pictures of {len(PARTS)} parts, and a file with the expected "
         f"findings: {folder / 'cell.yaml'}",
@@ -118,14 +118,21 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     for part in PARTS:
         picture = await asyncio.to_thread(Picture.read, folder / "pictures" / f"{part.name}.png")
         inspection = await asyncio.to_thread(check.inspect, picture)
-        with naming(f"--folder {folder}"):
-            await asyncio.to_thread(_draw, folder / "seen" / f"{part.name}.png", inspection)
-        wrong = [name for name, finding in inspection.findings.items() if not finding.ok]
+        with naming_file_errors(f"--folder {folder}"):
+            await asyncio.to_thread(
+                _save_findings, folder / "seen" / f"{part.name}.png", inspection
+            )
+        failed_tools = [name for name, finding in inspection.findings.items() if not finding.ok]
         milliseconds = 1e3 * sum(inspection.seconds.values())
         rows.append(
-            (part.name, part.fault or "none", ", ".join(wrong) or "none", f"{milliseconds:.1f} ms")
+            (
+                part.name,
+                part.fault or "none",
+                ", ".join(failed_tools) or "none",
+                f"{milliseconds:.1f} ms",
+            )
         )
-        parts.append({"picture": part.name, "fault": part.fault, "found": wrong})
+        parts.append({"picture": part.name, "fault": part.fault, "found": failed_tools})
     steps.detail(table_text(("picture", "fault", "found", "took"), rows), parts=parts)
     steps.step(
         f"What the tools saw stands in {folder / 'seen'}. Change {folder / 'cell.yaml'}, and try "
@@ -134,57 +141,61 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     steps.detail(f"   smartcam inspect {folder}/cell.yaml desk/drawn check {folder}/pictures")
 
 
-def _write(folder: Path, seed: int) -> None:
+def _write_folder(folder: Path, seed: int) -> None:
     for name in ("pictures", "seen"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     random = np.random.default_rng(seed)
-    taught = draw_part(PARTS[0], random)
+    good_picture = draw_part(PARTS[0], random)
     x, y = round(PARTS[0].x) + LOGO[0], round(PARTS[0].y) + LOGO[1]
-    _save(folder / "print.png", taught[y : y + LOGO[3], x : x + LOGO[2]])
+    _save(folder / "print.png", good_picture[y : y + LOGO[3], x : x + LOGO[2]])
     for part in PARTS:
         _save(folder / "pictures" / f"{part.name}.png", draw_part(part, random))
     (folder / "cell.yaml").write_text(CELL, encoding="utf-8")
 
 
-def _draw(path: Path, inspection: Inspection) -> None:
+def _save_findings(path: Path, inspection: Inspection) -> None:
     _save(path, inspection.drawn()[:, :, ::-1])
 
 
 def _save(path: Path, pixels: NDArray[Any]) -> None:
-    path.write_bytes(load("cv2", USE).imencode(".png", pixels)[1].tobytes())
+    path.write_bytes(load("cv2", INSPECTION_NEEDS).imencode(".png", pixels)[1].tobytes())
 
 
 def draw_part(part: DrawnPart, random: np.random.Generator) -> Pixels:
     """Return a picture of a part, (H, W), uint8."""
-    cv2 = load("cv2", USE)
-    face = _face(part)
+    cv2 = load("cv2", INSPECTION_NEEDS)
+    part_picture = _draw_upright_part(part)
     cos, sin = math.cos(math.radians(part.degrees)), math.sin(math.radians(part.degrees))
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]])
-    middle = (np.array(face.shape[::-1]) - 1) / 2
-    place = OVERSAMPLING * (np.array([part.x, part.y]) + 0.5) - 0.5
-    turn[:, 2] = place - turn[:, :2] @ middle
-    large = tuple(OVERSAMPLING * side for side in SIZE_PX)
-    canvas = cv2.warpAffine(face, turn, large, flags=cv2.INTER_LINEAR, borderValue=120)
+    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]])
+    middle = (np.array(part_picture.shape[::-1]) - 1) / 2
+    centre = OVERSAMPLING * (np.array([part.x, part.y]) + 0.5) - 0.5
+    rotation[:, 2] = centre - rotation[:, :2] @ middle
+    canvas_size = tuple(OVERSAMPLING * side for side in SIZE_PX)
+    canvas = cv2.warpAffine(
+        part_picture, rotation, canvas_size, flags=cv2.INTER_LINEAR, borderValue=120
+    )
     levels = cv2.resize(canvas, SIZE_PX, interpolation=cv2.INTER_AREA).astype(np.float64)
     levels += random.normal(0.0, part.noise, levels.shape)
     picture: Pixels = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
     return picture
 
 
-def _face(part: DrawnPart) -> Pixels:
-    """Return the part from above, upright, oversampled."""
-    cv2, zxing = load("cv2", USE), load("zxingcpp", "codes need")
-    many = OVERSAMPLING
-    face = np.full((many * PART_PX[1], many * PART_PX[0]), 215, np.uint8)
+def _draw_upright_part(part: DrawnPart) -> Pixels:
+    """Return an oversampled picture of the part from above, upright."""
+    cv2, zxing = load("cv2", INSPECTION_NEEDS), load("zxingcpp", "codes need")
+    scale = OVERSAMPLING
+    part_picture = np.full((scale * PART_PX[1], scale * PART_PX[0]), 215, np.uint8)
     if part.hole:
-        cv2.circle(face, (many * 35, many * 35), many * 18, 40, -1, cv2.LINE_AA)
+        cv2.circle(part_picture, (scale * 35, scale * 35), scale * 18, 40, -1, cv2.LINE_AA)
     code = np.array(
-        zxing.create_barcode(part.code, zxing.BarcodeFormat.DataMatrix).to_image(scale=4 * many)
+        zxing.create_barcode(part.code, zxing.BarcodeFormat.DataMatrix).to_image(scale=4 * scale)
     )
     rows, columns = code.shape
-    left = face.shape[1] - columns - many * 12
-    face[many * 10 : many * 10 + rows, left : left + columns] = np.clip(code, 30, 215)
-    place = (many * 124, many * 146)
+    left = part_picture.shape[1] - columns - scale * 12
+    part_picture[scale * 10 : scale * 10 + rows, left : left + columns] = np.clip(code, 30, 215)
+    text_origin = (scale * 124, scale * 146)
     font = cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(face, part.print, place, font, 0.95 * many, 30, 2 * many, cv2.LINE_AA)
-    return face
+    cv2.putText(
+        part_picture, part.print, text_origin, font, 0.95 * scale, 30, 2 * scale, cv2.LINE_AA
+    )
+    return part_picture

@@ -26,7 +26,7 @@ from smartcam._cli.demo_table import (
     TableRobot,
     radius_of,
 )
-from smartcam._cli.options import naming
+from smartcam._cli.options import naming_file_errors
 from smartcam._cli.texts import table_text
 from smartcam._extras import load
 from smartcam.emulator import TablePose
@@ -48,7 +48,7 @@ MAX_PARTS: Final = 8
 DOWN: Final = (0.0, 0.0, -1.0)
 """Direction of the robot's tool when it touches."""
 
-TAUGHT: Final = TablePart("bracket", TablePose(0.15, 0.125, 0.4))
+TAUGHT_PART: Final = TablePart("bracket", TablePose(0.15, 0.125, 0.4))
 """The part in the picture from which it is taught."""
 
 MARKS_CELL: Final = """\
@@ -89,7 +89,7 @@ async def palletize(options: Options, folder: Path, seed: int, grid: Grid) -> No
     """
     load("scipy", "calibration needs")  # first, so that it fails before the other steps
     steps = Steps(options)
-    with naming(f"--folder {folder}"):
+    with naming_file_errors(f"--folder {folder}"):
         await asyncio.to_thread(folder.mkdir, parents=True, exist_ok=True)
     table = DrawnTable(seed)
     TableDriver.tables[table.address] = table
@@ -115,60 +115,60 @@ async def _run(demo: _Demo) -> None:
         f"{NOISE:g} grey levels. A robot beside it, which does not know where the table is.",
         address=table.address,
     )
-    bracket = await _taught(demo)
-    grip = table.shown(TAUGHT, bracket.reference)
+    bracket = await _teach_parts(demo)
+    grip = table.reference_pose(TAUGHT_PART, bracket.reference)
     await _calibrate(demo)
-    pattern = _pattern(demo)
-    await _write(demo, CELL_FILE, CELL.format(address=table.address, most=MAX_PARTS))
+    pattern = _touch_pallet(demo)
+    await _write_file(demo, CELL_FILE, CELL.format(address=table.address, most=MAX_PARTS))
     placed: list[Placed] = []
     expected: list[float] = []
     async with smartcam.connect(f"software:{demo.folder / CELL_FILE}") as camera:
-        timeout = demo.options.step(10.0)
+        timeout = demo.options.step_timeout(10.0)
         while len(placed) < len(pattern):
             if not table.parts:
-                table.lay("bracket", min(MAX_PARTS, len(pattern) - len(placed)))
+                table.lay_parts("bracket", min(MAX_PARTS, len(pattern) - len(placed)))
             result = await camera.trigger(timeout=timeout)
-            _palletize(demo, result.value, grip, pattern, placed, expected)
+            _move_parts(demo, result.value, grip, pattern, placed, expected)
             if not result.value.locate:
                 break
-        empty = (await camera.trigger(timeout=timeout)).value
-        reason = empty.reason or f"{len(empty.locate)} found"
+        last_value = (await camera.trigger(timeout=timeout)).value
+        reason = last_value.reason or f"{len(last_value.locate)} found"
         steps.step(f"Triggered once more: {reason}.", reason=reason, left=len(table.parts))
     errors = [part.error for part in placed]
-    beside = [part.off_place for part in placed if part.taken]
+    place_offsets = [part.off_place for part in placed if part.taken]
     steps.detail(
         f"   error {1e3 * _rms(errors):.3f} mm rms, predicted {1e3 * _rms(expected):.3f} mm; "
-        f"{len(beside)} of {len(pattern)} places filled, parts lie {1e3 * _rms(beside):.2f} mm rms "
-        "beside them",
+        f"{len(place_offsets)} of {len(pattern)} places filled, parts lie "
+        f"{1e3 * _rms(place_offsets):.2f} mm rms beside them",
         error=_rms(errors),
         predicted=_rms(expected),
-        filled=len(beside),
+        filled=len(place_offsets),
         places=len(pattern),
     )
     steps.step(
         f"Models, calibration, cell file and pictures are in {demo.folder}. Try changed settings "
         "on the pictures:"
     )
-    cell, to = demo.folder / CELL_FILE, demo.folder / "judged"
-    steps.detail(f"   smartcam inspect {cell} desk/camera 1 {to}")
+    cell, pictures = demo.folder / CELL_FILE, demo.folder / "judged"
+    steps.detail(f"   smartcam inspect {cell} desk/camera 1 {pictures}")
 
 
-async def _taught(demo: _Demo) -> PartModel:
-    """Teach both kinds of parts, each from one picture; return the model of the bracket."""
+async def _teach_parts(demo: _Demo) -> PartModel:
+    """Teach the mark and the bracket from one picture each; return the model of the bracket."""
     demo.steps.step("Taught from one picture each, by a region around the part:")
     rows: list[tuple[object, ...]] = []
-    for part in (TablePart("mark", TablePose(0.15, 0.125, 0.0)), TAUGHT):
+    for part in (TablePart("mark", TablePose(0.15, 0.125, 0.0)), TAUGHT_PART):
         demo.table.parts = [part]
-        with naming(f"--folder {demo.folder}"):
-            model = await asyncio.to_thread(_teach, demo, part)
-        place, angle = model.predicted_sigma()
+        with naming_file_errors(f"--folder {demo.folder}"):
+            model = await asyncio.to_thread(_teach_part, demo, part)
+        position_sigma, angle_sigma = model.predicted_sigma()
         rows.append(
             (
                 part.kind,
                 model.symmetry.text(),
                 str(len(model.segments.halves)),
-                f"{1e3 * place * demo.table.pixel:.4f} mm",
-                "-" if math.isnan(angle) else f"{math.degrees(angle):.4f} deg",
+                f"{1e3 * position_sigma * demo.table.pixel:.4f} mm",
+                "-" if math.isnan(angle_sigma) else f"{math.degrees(angle_sigma):.4f} deg",
             )
         )
     head = ("part", "symmetry", "pieces of edges", "a pose is good to", "")
@@ -176,14 +176,14 @@ async def _taught(demo: _Demo) -> PartModel:
     return model
 
 
-def _teach(demo: _Demo, part: TablePart) -> PartModel:
+def _teach_part(demo: _Demo, part: TablePart) -> PartModel:
     from smartcam.inspection import PartModel, Region
 
-    picture = demo.table.picture()
-    x, y, _ = demo.table.seen(part.pose)
-    reach = radius_of(part.kind) / demo.table.pixel + 12
-    corners = ((-reach, -reach), (reach, -reach), (reach, reach), (-reach, reach))
-    region = Region((x + dx, y + dy) for dx, dy in corners)
+    picture = demo.table.take_picture()
+    x, y, _ = demo.table.to_pixels(part.pose)
+    half_side = radius_of(part.kind) / demo.table.pixel + 12
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    region = Region((x + half_side * right, y + half_side * down) for right, down in signs)
     model = PartModel.teach(picture, region, name=part.kind)
     model.write(demo.folder / f"{part.kind}.model")
     return model
@@ -193,19 +193,21 @@ async def _calibrate(demo: _Demo) -> PlaneCalibration:
     """Locate the mark at nine places by the camera, and touch it there by the robot."""
     from smartcam.calibration import fit_plane
 
-    await _write(demo, MARKS_FILE, MARKS_CELL.format(address=demo.table.address))
-    seen: list[tuple[float, float]] = []
-    touched: list[list[float]] = []
+    await _write_file(demo, MARKS_FILE, MARKS_CELL.format(address=demo.table.address))
+    mark_points: list[tuple[float, float]] = []
+    touched_points: list[list[float]] = []
     async with smartcam.connect(f"software:{demo.folder / MARKS_FILE}") as camera:
         for pose in nine_marks().values():
             demo.table.parts = [TablePart("mark", pose)]
-            result = await camera.trigger(timeout=demo.options.step(10.0))
+            result = await camera.trigger(timeout=demo.options.step_timeout(10.0))
             (mark,) = result.value.locate
-            seen.append((mark.x, -mark.y))  # y up, as in calibrations
-            touched.append(demo.robot.touch_table(pose))
+            mark_points.append((mark.x, -mark.y))  # y up, as in calibrations
+            touched_points.append(demo.robot.touch_table(pose))
     demo.table.parts = []
-    calibration = fit_plane(seen, touched, touch_sigma=TOUCH_SIGMA, tool_z=DOWN, y_down=True)
-    with naming(f"--folder {demo.folder}"):
+    calibration = fit_plane(
+        mark_points, touched_points, touch_sigma=TOUCH_SIGMA, tool_z=DOWN, y_down=True
+    )
+    with naming_file_errors(f"--folder {demo.folder}"):
         await asyncio.to_thread(calibration.save, demo.folder / "plane.json")
     held_out = calibration.held_out_error or math.nan
     demo.steps.step(
@@ -219,25 +221,25 @@ async def _calibrate(demo: _Demo) -> PlaneCalibration:
     return calibration
 
 
-def _pattern(demo: _Demo) -> PlacePattern:
-    """Touch three places of the pallet by the robot."""
+def _touch_pallet(demo: _Demo) -> PlacePattern:
+    """Let the robot touch three corners of the pallet; return the pattern of its places."""
     rows, columns, layers = demo.grid
-    ends = ((0, 0), (columns - 1, 0), (0, rows - 1))
-    first, row_end, column_end = (demo.robot.touch_pallet(*end) for end in ends)
+    corners = ((0, 0), (columns - 1, 0), (0, rows - 1))
+    first, row_end, column_end = (demo.robot.touch_pallet(*end) for end in corners)
     pattern = PlacePattern.from_touches(
         first, row_end, column_end, rows=rows, columns=columns, layers=layers, height=HEIGHT
     )
-    across, along, _ = pattern.pitch
+    column_pitch, row_pitch, _ = pattern.pitch
     demo.steps.step(
         f"A pallet of {rows} rows, {columns} columns and {layers} layers, of which the robot "
-        f"touched three corners: {1e3 * across:.2f} mm from column to column, {1e3 * along:.2f} mm "
-        "from row to row",
+        f"touched three corners: {1e3 * column_pitch:.2f} mm from column to column, "
+        f"{1e3 * row_pitch:.2f} mm from row to row",
         places=len(pattern),
     )
     return pattern
 
 
-def _palletize(
+def _move_parts(
     demo: _Demo,
     value: Any,
     grip: TablePose,
@@ -245,7 +247,7 @@ def _palletize(
     placed: list[Placed],
     expected: list[float],
 ) -> None:
-    """Move every part that was found to the next place, and print the errors."""
+    """Move each part that was found to the next place of the pallet, and print the errors."""
     rows: list[tuple[object, ...]] = []
     for part in value.locate:
         number = sum(part.taken for part in placed)
@@ -253,17 +255,19 @@ def _palletize(
             break
         pose = (part.x, part.y, part.theta)
         sigma = math.hypot(part.sigma_x, part.sigma_y)
-        put = demo.robot.palletize(pose, grip, pattern, number)
-        placed.append(put)
+        placed_part = demo.robot.palletize(pose, grip, pattern, number)
+        placed.append(placed_part)
         expected.append(sigma)
         rows.append(
             (
                 *(f"{1e3 * length:.2f}".rjust(8) for length in (part.x, part.y)),
-                *(f"{1e3 * length:.3f}" for length in (put.error, sigma)),
-                f"{math.degrees(put.turned):+.3f}",
+                *(f"{1e3 * length:.3f}" for length in (placed_part.error, sigma)),
+                f"{math.degrees(placed_part.turned):+.3f}",
                 f"{math.degrees(part.sigma_theta):.3f}",
-                "/".join(str(1 + count) for count in pattern.at(number)) if put.taken else "missed",
-                f"{1e3 * put.off_place:.2f}",
+                "/".join(str(1 + count) for count in pattern.at(number))
+                if placed_part.taken
+                else "missed",
+                f"{1e3 * placed_part.off_place:.2f}",
             )
         )
     demo.steps.step(
@@ -277,8 +281,8 @@ def _palletize(
         demo.steps.detail(table_text(head, rows), placed=placed[-len(rows) :])
 
 
-async def _write(demo: _Demo, name: str, text: str) -> None:
-    with naming(f"--folder {demo.folder}"):
+async def _write_file(demo: _Demo, name: str, text: str) -> None:
+    with naming_file_errors(f"--folder {demo.folder}"):
         await asyncio.to_thread((demo.folder / name).write_text, text, encoding="utf-8")
 
 

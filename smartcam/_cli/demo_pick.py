@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import smartcam
 from smartcam._cli.demo import Steps
-from smartcam._cli.options import naming
+from smartcam._cli.options import naming_file_errors
 from smartcam._cli.texts import table_text
 from smartcam.emulator import EmulatedCamera, TablePose
 from smartcam.emulator._inside import TABLE_SIZE
@@ -32,11 +32,11 @@ TANGRAM: Final = 7
 TOUCH_SIGMA: Final = 2e-4
 """Standard deviation of a touch along each of the robot's axes, metres."""
 
-GRIP: Final = 2e-3
-"""Largest distance in metres from a part at which the gripper still takes it."""
+MAX_GRIP_ERROR: Final = 2e-3
+"""Largest distance from a part at which the gripper can take it, metres."""
 
-EDGE: Final = 0.025
-"""Metres from the table's edge to the outer marks."""
+EDGE_DISTANCE: Final = 0.025
+"""Distance of the outer marks from the table's edge, metres."""
 
 
 class Pick(NamedTuple):
@@ -53,7 +53,7 @@ class Pick(NamedTuple):
 
 
 class SimulatedRobot:
-    """A robot beside the table, which lies somewhere in its frame.
+    """A robot beside the table; the table's pose in the robot's frame is random.
 
     Args:
         scene: the table.
@@ -67,12 +67,12 @@ class SimulatedRobot:
 
         self._scene = scene
         self._random = np.random.default_rng(seed)
-        turn = self._random.normal(size=4)
-        place = self._random.uniform(-0.6, 0.6, 3)
+        quaternion = self._random.normal(size=4)
+        position = self._random.uniform(-0.6, 0.6, 3)
         self.table: Transform = Transform.from_quaternion(
-            "robot", "table", place, turn / np.linalg.norm(turn)
+            "robot", "table", position, quaternion / np.linalg.norm(quaternion)
         )
-        """The truth; only the comparison uses it."""
+        """The table's true pose; only the comparison uses it."""
 
     @property
     def tool_z(self) -> NDArray[Any]:
@@ -85,10 +85,10 @@ class SimulatedRobot:
         return true + self._random.normal(0.0, TOUCH_SIGMA, 3)
 
     def pick(self, part: Localization, predicted: float) -> Pick:
-        """Go to a pose in the robot's frame and close the gripper; take the part that is there.
+        """Go to a part and close the gripper, which takes the part if it is near enough.
 
-        ``part``: its pose, the tool's z into the table. ``predicted``: rms of the expected error,
-        metres.
+        ``part``: the pose to go to, in the robot's frame, z into the table. ``predicted``: rms of
+        the expected error, metres.
         """
         from smartcam.geometry import Transform
 
@@ -100,7 +100,7 @@ class SimulatedRobot:
         error = math.dist((x, y, z), (true.x, true.y, 0.0))
         heading = math.atan2(pose_on_table.rotation[1, 0], pose_on_table.rotation[0, 0])
         turned = math.remainder(heading - true.theta, math.tau)
-        taken = error < GRIP
+        taken = error < MAX_GRIP_ERROR
         if taken:
             del self._scene.pieces[part.feature_id]
         return Pick(part.feature_id, *pose.position, error, predicted, turned, taken)
@@ -127,52 +127,54 @@ async def pick(options: Options, picture: str, seed: int) -> None:
         async with smartcam.connect(
             emulator.url, name="demo", application=TANGRAM, interpret_as="localizations"
         ) as camera:
-            timeout = options.step(5.0)
+            timeout = options.step_timeout(5.0)
             pieces = dict(emulator.scene.pieces)
             marks = nine_marks()
-            _lay(emulator.scene, marks)
-            seen = (await camera.trigger(timeout=timeout)).value
-            calibration = _calibrate(seen, marks, robot, steps)
-            _lay(emulator.scene, pieces)
+            _put_on_table(emulator.scene, marks)
+            marks_seen = (await camera.trigger(timeout=timeout)).value
+            calibration = _calibrate(marks_seen, marks, robot, steps)
+            _put_on_table(emulator.scene, pieces)
             result = await camera.trigger(timeout=timeout)
             noise = emulator.scene.pixel_noise / emulator.scene.scale
             _pick_all(result.value, calibration, robot, noise, steps)
-            left = (await camera.trigger(timeout=timeout)).value
-            steps.step(f"Triggered once more: {len(left)} parts on the table.", left=len(left))
-    _write(picture, calibration, result.value, steps)
+            parts_left = (await camera.trigger(timeout=timeout)).value
+            steps.step(
+                f"Triggered once more: {len(parts_left)} parts on the table.", left=len(parts_left)
+            )
+    _write_picture(picture, calibration, result.value, steps)
 
 
 def nine_marks() -> dict[str, TablePose]:
     """Return marks on a grid over the whole table: three by three."""
-    columns, rows = ((EDGE, size / 2, size - EDGE) for size in TABLE_SIZE)
+    columns, rows = ((EDGE_DISTANCE, size / 2, size - EDGE_DISTANCE) for size in TABLE_SIZE)
     places = [(x, y) for y in rows for x in columns]
     return {f"mark_{n}": TablePose(x, y, 0.0) for n, (x, y) in enumerate(places, start=1)}
 
 
-def _lay(scene: TableScene, things: dict[str, TablePose]) -> None:
-    """Clear the table and put these marks or parts onto it."""
+def _put_on_table(scene: TableScene, things: dict[str, TablePose]) -> None:
+    """Replace everything on the table by these marks or parts."""
     scene.pieces.clear()
     scene.pieces.update(things)
 
 
 def _calibrate(
-    seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, steps: Steps
+    marks_seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, steps: Steps
 ) -> PlaneCalibration:
     from smartcam.calibration import fit_plane
 
-    camera_points = [tuple(mark.pose.position[:2]) for mark in seen]
-    robot_points = [robot.touch(marks[mark.feature_id]).tolist() for mark in seen]
+    camera_points = [tuple(mark.pose.position[:2]) for mark in marks_seen]
+    robot_points = [robot.touch(marks[mark.feature_id]).tolist() for mark in marks_seen]
     steps.step(
-        f"The camera localizes {len(seen)} marks, the robot touches each of them "
+        f"The camera localizes {len(marks_seen)} marks, the robot touches each of them "
         f"({1e3 * TOUCH_SIGMA:g} mm of noise on each axis), mm:",
         camera_points=camera_points,
         robot_points=robot_points,
     )
     rows = [
-        (mark.feature_id, *_mm(*camera, *touched))
-        for mark, camera, touched in zip(seen, camera_points, robot_points, strict=True)
+        (mark.feature_id, *_mm_texts(*camera, *touched))
+        for mark, camera, touched in zip(marks_seen, camera_points, robot_points, strict=True)
     ]
-    steps.detail(table_text(("mark", *_right("camera x", "y", "robot x", "y", "z")), rows))
+    steps.detail(table_text(("mark", *_align_right("camera x", "y", "robot x", "y", "z")), rows))
     calibration = fit_plane(
         camera_points, robot_points, touch_sigma=TOUCH_SIGMA, tool_z=robot.tool_z
     )
@@ -196,22 +198,27 @@ def _pick_all(
     noise: float,
     steps: Steps,
 ) -> None:
-    """Pick every part; the camera's noise on both axes adds to the calibration's error."""
-    where = [part.pose.position[:2] for part in parts]
-    predicted = [math.hypot(p, noise, noise) for p in calibration.predicted_error(where).tolist()]
+    """Pick every part, and print the errors beside the predicted ones.
+
+    ``noise``: the camera's noise along each axis, metres; it adds to the calibration's error.
+    """
+    positions = [part.pose.position[:2] for part in parts]
+    predicted = [
+        math.hypot(p, noise, noise) for p in calibration.predicted_error(positions).tolist()
+    ]
     targets = calibration.to_robot(parts, tool_flip=True)
     picks = [robot.pick(part, error) for part, error in zip(targets, predicted, strict=True)]
     steps.step(f"Triggered: {len(parts)} parts. The robot goes to each of them and picks it, mm:")
     rows = [
         (
             pick.part,
-            *_mm(pick.x, pick.y, pick.z, pick.error, pick.predicted),
+            *_mm_texts(pick.x, pick.y, pick.z, pick.error, pick.predicted),
             f"{math.degrees(pick.turned):+.2f} deg",
             "picked" if pick.taken else "missed",
         )
         for pick in picks
     ]
-    head = ("part", *_right("x", "y", "z", "error", "predicted"), "turned by", "")
+    head = ("part", *_align_right("x", "y", "z", "error", "predicted"), "turned by", "")
     steps.detail(table_text(head, rows), picks=picks)
     errors, expected = ([getattr(pick, name) for pick in picks] for name in ("error", "predicted"))
     steps.detail(
@@ -223,12 +230,12 @@ def _pick_all(
     )
 
 
-def _mm(*metres: float) -> list[str]:
+def _mm_texts(*metres: float) -> list[str]:
     """Return lengths as millimetres."""
-    return _right(*(f"{1e3 * value:.2f}" for value in metres))
+    return _align_right(*(f"{1e3 * value:.2f}" for value in metres))
 
 
-def _right(*texts: str) -> list[str]:
+def _align_right(*texts: str) -> list[str]:
     """Return texts in cells of one width, aligned to the right."""
     return [text.rjust(9) for text in texts]
 
@@ -237,12 +244,12 @@ def _rms(values: list[float]) -> float:
     return math.hypot(*values) / math.sqrt(len(values))
 
 
-def _write(
+def _write_picture(
     path: str, calibration: PlaneCalibration, parts: list[Localization], steps: Steps
 ) -> None:
     from smartcam.calibration._inside import draw
 
     text = draw(calibration, parts, title="smartcam demo --pick")
-    with naming(f"--picture {path}"):
+    with naming_file_errors(f"--picture {path}"):
         Path(path).write_text(text, encoding="utf-8", newline="\n")
     steps.step(f"The touches, their errors and the calibration's uncertainty: {path}", picture=path)

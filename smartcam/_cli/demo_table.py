@@ -41,7 +41,7 @@ FRAMES_PER_SECOND: Final = 8.0
 """Pictures a second while there is a reader."""
 
 DARK, CONTRAST, NOISE = 60.0, 130.0, 2.0
-"""Grey level of the table, its distance to the parts', and standard deviation of the noise."""
+"""Grey level of the table; by how much parts are brighter; standard deviation of the noise."""
 
 BLUR_PX: Final = 0.8
 """Standard deviation of the lens' blur."""
@@ -52,8 +52,8 @@ SAMPLES: Final = 8
 TOUCH_SIGMA: Final = 2e-4
 """Standard deviation of a touch along each of the robot's axes, metres."""
 
-GRIP: Final = 2e-3
-"""Largest distance in metres from a part at which the gripper still takes it."""
+MAX_GRIP_ERROR: Final = 2e-3
+"""Largest distance from a part at which the gripper can take it, metres."""
 
 HEIGHT: Final = 0.008
 """Thickness of a part, metres."""
@@ -73,9 +73,9 @@ class PaintedShape(NamedTuple):
 
 
 def _disc(level: float, x: float, y: float, radius: float) -> PaintedShape:
-    turns = np.linspace(0.0, math.tau, 120, endpoint=False)
+    angles = np.linspace(0.0, math.tau, 120, endpoint=False)
     return PaintedShape(
-        level, np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
+        level, np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
     )
 
 
@@ -83,7 +83,7 @@ def _polygon(level: float, *corners: tuple[float, float]) -> PaintedShape:
     return PaintedShape(level, np.array(corners))
 
 
-KINDS: Final[dict[str, tuple[PaintedShape, ...]]] = {
+PART_SHAPES: Final[dict[str, tuple[PaintedShape, ...]]] = {
     "mark": (_disc(1.0, 0, 0, 0.009), _disc(0.0, 0, 0, 0.004)),
     "bracket": (
         _polygon(
@@ -95,12 +95,12 @@ KINDS: Final[dict[str, tuple[PaintedShape, ...]]] = {
         _disc(0.0, 0.005, -0.0055, 0.0018),
     ),
 }
-"""Parts by the names of their kinds."""
+"""The shapes of each kind of part."""
 
 
 def radius_of(kind: str) -> float:
     """Return the distance of the farthest edge of a part from its own frame's origin, metres."""
-    return max(float(np.linalg.norm(shape.corners, axis=1).max()) for shape in KINDS[kind])
+    return max(float(np.linalg.norm(shape.corners, axis=1).max()) for shape in PART_SHAPES[kind])
 
 
 class TablePart(NamedTuple):
@@ -128,95 +128,97 @@ class DrawnTable:
         self.address: str = f"{SCHEME}://table{next(self._numbers)}"
         self._camera = TableScene(y_down=True, offset=(45.0, 1010.0))
         self._random = np.random.default_rng(seed)
-        self._drawn: tuple[list[TablePart], NDArray[np.float32]] | None = None
+        self._last_drawn: tuple[list[TablePart], NDArray[np.float32]] | None = None
 
     @property
     def pixel(self) -> float:
         """Side of a pixel on the table, metres."""
         return 1.0 / self._camera.scale
 
-    def seen(self, pose: TablePose) -> tuple[float, float, float]:
-        """Return the camera's view of a pose: x, y (pixels), angle from x towards y (radians)."""
+    def to_pixels(self, pose: TablePose) -> tuple[float, float, float]:
+        """Return a pose in the picture: x, y (pixels), angle from x towards y (radians)."""
         return self._camera.to_pixels(pose)
 
-    def lay(self, kind: str, count: int) -> None:
-        """Clear the table, and lay parts that do not touch anywhere onto it."""
-        reach = radius_of(kind) + MIN_GAP
-        low, high = np.array([reach, reach]), np.array(TABLE_SIZE) - reach
+    def lay_parts(self, kind: str, count: int) -> None:
+        """Replace the parts on the table by ``count`` parts at random poses that do not touch."""
+        margin = radius_of(kind) + MIN_GAP
+        low, high = np.array([margin, margin]), np.array(TABLE_SIZE) - margin
         places: list[Array] = []
         for place in self._random.uniform(low, high, (2000, 2)):
-            if all(np.linalg.norm(place - other) > 2 * reach for other in places):
+            if all(np.linalg.norm(place - other) > 2 * margin for other in places):
                 places.append(place)
                 if len(places) == count:
                     break
         else:
             raise ConfigurationError(f"demo: the table has no room for {count} parts")
-        turns = self._random.uniform(-math.pi, math.pi, count)
+        angles = self._random.uniform(-math.pi, math.pi, count)
         self.parts = [
-            TablePart(kind, TablePose(float(x), float(y), float(turn)))
-            for (x, y), turn in zip(places, turns, strict=True)
+            TablePart(kind, TablePose(float(x), float(y), float(angle)))
+            for (x, y), angle in zip(places, angles, strict=True)
         ]
 
-    def picture(self) -> NDArray[np.uint8]:
+    def take_picture(self) -> NDArray[np.uint8]:
         """Return a picture of the table as it is now, (H, W), with new noise."""
         parts = list(self.parts)
-        if self._drawn is None or self._drawn[0] != parts:
-            self._drawn = parts, self._levels(parts)
-        levels = self._drawn[1]
+        if self._last_drawn is None or self._last_drawn[0] != parts:
+            self._last_drawn = parts, self._draw_levels(parts)
+        levels = self._last_drawn[1]
         noise = self._random.standard_normal(levels.shape, np.float32)
         return np.clip(np.rint(levels + NOISE * noise), 0, 255).astype(np.uint8)
 
-    def _levels(self, parts: list[TablePart]) -> NDArray[np.float32]:
+    def _draw_levels(self, parts: list[TablePart]) -> NDArray[np.float32]:
         """Return the grey levels of the parts without noise."""
         canvas = np.full(SIZE_PX[::-1], DARK, np.float32)
         for part in parts:
-            corner, light = self._drawn_part(part)
+            corner, coverage = self._draw_part(part)
             low = np.maximum(corner, 0)
-            high = np.minimum(corner + light.shape[::-1], SIZE_PX)
-            shown = light[low[1] - corner[1] : high[1] - corner[1], low[0] - corner[0] :]
-            canvas[low[1] : high[1], low[0] : high[0]] += CONTRAST * shown[:, : high[0] - low[0]]
+            high = np.minimum(corner + coverage.shape[::-1], SIZE_PX)
+            visible = coverage[low[1] - corner[1] : high[1] - corner[1], low[0] - corner[0] :]
+            canvas[low[1] : high[1], low[0] : high[0]] += CONTRAST * visible[:, : high[0] - low[0]]
         return canvas
 
-    def _drawn_part(self, part: TablePart) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
-        """Return the first pixel of a part's patch, and the part's light in it, 0 to 1."""
+    def _draw_part(self, part: TablePart) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
+        """Return a patch with a drawn part: its first pixel, and the part's brightness, 0 to 1."""
         cv2 = load("cv2", "inspection needs")
-        u, v, _ = self.seen(part.pose)
-        reach = math.ceil(radius_of(part.kind) / self.pixel + 5 * BLUR_PX + 1)
-        corner = np.array([math.floor(u) - reach, math.floor(v) - reach])
-        side = 2 * reach + 2
+        u, v, _ = self.to_pixels(part.pose)
+        half_side = math.ceil(radius_of(part.kind) / self.pixel + 5 * BLUR_PX + 1)
+        corner = np.array([math.floor(u) - half_side, math.floor(v) - half_side])
+        side = 2 * half_side + 2
         fine = np.zeros((side * SAMPLES, side * SAMPLES), np.uint8)
-        for shape in KINDS[part.kind]:
-            at = (self._in_picture(part.pose, shape.corners) - corner + 0.5) * SAMPLES - 0.5
+        for shape in PART_SHAPES[part.kind]:
+            pixels = (self._part_to_pixels(part.pose, shape.corners) - corner + 0.5) * SAMPLES - 0.5
             level = round(255 * shape.level)
-            cv2.fillPoly(fine, [np.rint(16 * at).astype(np.int32)], level, cv2.LINE_8, 4)
+            cv2.fillPoly(fine, [np.rint(16 * pixels).astype(np.int32)], level, cv2.LINE_8, 4)
         smooth = cv2.GaussianBlur(fine.astype(np.float32), (0, 0), BLUR_PX * SAMPLES)
-        light = cv2.resize(smooth, (side, side), interpolation=cv2.INTER_AREA) / 255
-        return corner, np.asarray(light, np.float32)
+        coverage = cv2.resize(smooth, (side, side), interpolation=cv2.INTER_AREA) / 255
+        return corner, np.asarray(coverage, np.float32)
 
-    def _in_picture(self, pose: TablePose, points: Array) -> Array:
-        """Return points (N, 2) of a part as pixels."""
+    def _part_to_pixels(self, pose: TablePose, points: Array) -> Array:
+        """Return the pixels (N, 2) of points in the frame of a part."""
         cos, sin = math.cos(pose.theta), math.sin(pose.theta)
         placed = points @ [[cos, sin], [-sin, cos]] + (pose.x, pose.y)
-        return np.array([self.seen(TablePose(x, y, 0.0))[:2] for x, y in placed])
+        return np.array([self.to_pixels(TablePose(x, y, 0.0))[:2] for x, y in placed])
 
-    def shown(self, taught: TablePart, reference: tuple[float, float]) -> TablePose:
+    def reference_pose(self, taught_part: TablePart, reference: tuple[float, float]) -> TablePose:
         """Return the pose of a model's reference in its part's own frame.
 
-        ``taught``: the part as it lay in the picture that was taught; ``reference``: the place of
-        the model's reference there, pixels. A real cell does not know this true pose.
+        ``taught_part``: the part in the picture from which the model was taught; ``reference``: the
+        model's reference in this picture, pixels. A real cell does not know this true pose.
         """
-        here = self._on_table(*reference)
-        ahead = self._on_table(reference[0] + 1.0, reference[1])
-        angle = math.atan2(ahead[1] - here[1], ahead[0] - here[0]) - taught.pose.theta
-        cos, sin = math.cos(taught.pose.theta), math.sin(taught.pose.theta)
-        x, y = here[0] - taught.pose.x, here[1] - taught.pose.y
+        origin = self._pixel_to_table(*reference)
+        next_pixel = self._pixel_to_table(reference[0] + 1.0, reference[1])
+        part = taught_part.pose
+        angle = math.atan2(next_pixel[1] - origin[1], next_pixel[0] - origin[0]) - part.theta
+        cos, sin = math.cos(part.theta), math.sin(part.theta)
+        x, y = origin[0] - part.x, origin[1] - part.y
         return TablePose(cos * x + sin * y, cos * y - sin * x, angle)
 
-    def _on_table(self, u: float, v: float) -> tuple[float, float]:
-        origin, ahead = self.seen(TablePose(0, 0, 0)), self.seen(TablePose(1, 0, 0))
-        along = complex(ahead[0] - origin[0], -(ahead[1] - origin[1]))
-        place = complex(u - origin[0], -(v - origin[1])) / along
-        return place.real, place.imag
+    def _pixel_to_table(self, u: float, v: float) -> tuple[float, float]:
+        """Return the point of the table that a pixel shows, metres."""
+        origin, x_end = self.to_pixels(TablePose(0, 0, 0)), self.to_pixels(TablePose(1, 0, 0))
+        x_axis = complex(x_end[0] - origin[0], -(x_end[1] - origin[1]))
+        point = complex(u - origin[0], -(v - origin[1])) / x_axis
+        return point.real, point.imag
 
 
 class TableDriver(TaskDriver):
@@ -240,7 +242,7 @@ class TableDriver(TaskDriver):
         """Draw pictures of the table."""
         while True:
             captured, utc = time.monotonic(), time.time()
-            picture = await asyncio.to_thread(self._table.picture)
+            picture = await asyncio.to_thread(self._table.take_picture)
             self._number += 1
             sink.frame(
                 Frame(
@@ -284,28 +286,31 @@ class TableRobot:
     def __init__(self, table: DrawnTable, seed: int) -> None:
         self._table = table
         self._random = np.random.default_rng([seed, 1])
-        self._true = self._level("table", 0.0)
-        self._pallet = self._level("pallet", 0.8)
+        self._table_pose = self._random_level_pose("table", 0.0)
+        self._pallet_pose = self._random_level_pose("pallet", 0.8)
 
-    def _level(self, name: str, distance: float) -> Transform:
-        x, y, z, turn = self._random.uniform(
+    def _random_level_pose(self, name: str, distance: float) -> Transform:
+        """Return a random pose with z upwards, about ``distance`` metres along the robot's x."""
+        x, y, z, angle = self._random.uniform(
             [distance - 0.2, -0.4, 0, -3], [distance + 0.2, 0.4, 0.3, 3]
         )
-        cos, sin = math.cos(turn), math.sin(turn)
+        cos, sin = math.cos(angle), math.sin(angle)
         rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         return Transform("robot", name, rotation, np.array([x, y, z]))
 
     def touch_table(self, pose: TablePose) -> list[float]:
         """Return the robot's reading when its tip touches a place on the table, metres."""
-        return self._touch(self._true.apply([pose.x, pose.y, 0.0]))
+        return self._add_touch_noise(self._table_pose.apply([pose.x, pose.y, 0.0]))
 
     def touch_pallet(self, column: int, row: int) -> list[float]:
         """Return the robot's reading when its tip touches a place of the pallet, metres."""
-        return self._touch(self._pallet.apply([column * PITCH[0], row * PITCH[1], 0.0]))
+        return self._add_touch_noise(
+            self._pallet_pose.apply([column * PITCH[0], row * PITCH[1], 0.0])
+        )
 
-    def _touch(self, true: Array) -> list[float]:
-        touched: list[float] = (true + self._random.normal(0.0, TOUCH_SIGMA, 3)).tolist()
-        return touched
+    def _add_touch_noise(self, true: Array) -> list[float]:
+        reading: list[float] = (true + self._random.normal(0.0, TOUCH_SIGMA, 3)).tolist()
+        return reading
 
     def palletize(
         self,
@@ -320,34 +325,34 @@ class TableRobot:
         ``grip``: the true pose of the reference in the part's frame.
         """
         offset, part = min(
-            ((self._off(part, pose, grip), part) for part in self._table.parts),
+            ((self._reference_error(part, pose, grip), part) for part in self._table.parts),
             key=lambda pair: abs(pair[0][0]),
         )
         error, turned = abs(offset[0]), offset[1]
-        if error > GRIP:
+        if error > MAX_GRIP_ERROR:
             return Placed(pose[0], pose[1], error, turned, False, math.nan)
         self._table.parts.remove(part)
         row, column, layer = pattern.at(number)
-        true = self._pallet.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
-        # the part keeps its place in the gripper, and moves along with it
+        true = self._pallet_pose.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
+        # the part does not move in the gripper, so its offset turns with the gripper
         place = pattern[number]
-        held = place.rotation[:2, :2] @ _turned([offset[0].real, offset[0].imag], -pose[2])
-        off_place = float(np.linalg.norm(place.translation[:2] + held - true[:2]))
+        part_offset = place.rotation[:2, :2] @ _rotate([offset[0].real, offset[0].imag], -pose[2])
+        off_place = float(np.linalg.norm(place.translation[:2] + part_offset - true[:2]))
         return Placed(pose[0], pose[1], error, turned, True, off_place)
 
-    def _off(
-        self, part: TablePart, located: tuple[float, float, float], grip: TablePose
+    def _reference_error(
+        self, part: TablePart, found_pose: tuple[float, float, float], grip: TablePose
     ) -> tuple[complex, float]:
-        """Return the offset of a part's reference from a pose, and the angle it is turned by."""
+        """Return the offset of a part's true reference from the found pose, and its rotation."""
         pose = part.pose
-        x, y = _turned([grip.x, grip.y], pose.theta).tolist()
-        true = self._true.apply([pose.x + x, pose.y + y, 0.0])
-        heading = pose.theta + grip.theta + math.atan2(*self._true.rotation[1::-1, 0])
-        offset = complex(true[0] - located[0], true[1] - located[1])
-        return offset, math.remainder(located[2] - heading, math.tau)
+        x, y = _rotate([grip.x, grip.y], pose.theta).tolist()
+        true = self._table_pose.apply([pose.x + x, pose.y + y, 0.0])
+        heading = pose.theta + grip.theta + math.atan2(*self._table_pose.rotation[1::-1, 0])
+        offset = complex(true[0] - found_pose[0], true[1] - found_pose[1])
+        return offset, math.remainder(found_pose[2] - heading, math.tau)
 
 
-def _turned(place: Any, angle: float) -> Array:
+def _rotate(vector: Any, angle: float) -> Array:
     cos, sin = math.cos(angle), math.sin(angle)
-    turned: Array = np.array([[cos, -sin], [sin, cos]]) @ np.asarray(place)
-    return turned
+    rotated: Array = np.array([[cos, -sin], [sin, cos]]) @ np.asarray(vector)
+    return rotated

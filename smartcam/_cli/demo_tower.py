@@ -1,8 +1,8 @@
 """``smartcam demo --tower``: a robot builds a tower of the black blocks that its camera finds.
 
-The robot only knows the looks of a block: it finds the place of a block by its colour, and the
-place and height of the tower by the depth. A person adds a block meanwhile, and removes one. The
-findings are compared with the truth, which a real cell does not know.
+The robot only knows how a block looks: it finds a block by its colour, and the place and height of
+the tower by the depth. In between, a person adds a block to the tower, and later removes one. The
+measured poses are compared with the true ones, which a real cell does not know.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LAYERS: Final = 5
 """Number of blocks that the robot puts onto the tower."""
 
 PERSON: Final = {2: "add", 4: "remove"}
-"""The disturbances of the tower by a person, by the number of blocks put on before."""
+"""A person's actions on the tower, by the number of blocks that the robot has put on it before."""
 
 OVERVIEW: Final = (0.38, 0.0, 0.75)
 """Place from which the camera sees the whole table, metres."""
@@ -37,40 +37,41 @@ OVERVIEW: Final = (0.38, 0.0, 0.75)
 MEASURING_HEIGHT: Final = 0.25
 """Metres above the table at which the camera measures a block's pose."""
 
-ABOVE: Final = 0.45
+TOWER_VIEW_HEIGHT: Final = 0.45
 """Metres above the table at which the camera measures the tower."""
 
-MAPS: Final = 5
+DEPTH_MAP_COUNT: Final = 5
 """Number of depth maps that are averaged."""
 
-EDGE: Final = BLOCK[2] / 2
-"""Metres below which a step of the depth is noise, since no block is so thin."""
+MIN_DEPTH_STEP: Final = BLOCK[2] / 2
+"""Smallest step of the depth that is not noise, metres: half the height of a block."""
 
-REACH: Final = (0.15, 0.50)
+REACH_RANGE: Final = (0.15, 0.50)
 """Least and greatest distance from the robot's foot at which it can grip, metres."""
 
 BLACK: Final = ColourRange(value=(0, 60))
 """The colour of the blocks that the robot has to take."""
 
-AREA: Final = (0.6, 1.7)
-"""Area of a block in the picture, in areas of its upper side: other sides may be visible, too."""
+AREA_RANGE: Final = (0.6, 1.7)
+"""Least and largest area of a block in the picture, relative to the area of its upper side: other
+sides may be visible, too."""
 
-SIDE_RATIO: Final = (2.2, 3.8)
-"""Longer side of a block in the picture over the shorter one, from least to most."""
+SIDE_RATIO_RANGE: Final = (2.2, 3.8)
+"""Least and largest ratio of a block's longer side to its shorter side, in the picture."""
 
 MIN_FULLNESS: Final = 0.8
-"""Least share of its rectangle that a block fills."""
+"""Least share of the rectangle around a block that the block fills."""
 
-RIM: Final = 2
-"""Width of a region's rim, in pixels; depths there are mixed from two surfaces."""
+RIM_WIDTH_PX: Final = 2
+"""Width of a region's rim, pixels; a depth there is a mean of two surfaces."""
 
 TOLERANCE: Final = (2e-3, math.radians(1.0), 1e-3)
 """Largest errors of a found block: metres in the plane, radians, and metres of height."""
 
-MISSED: Final = 7
+MISSED_EXIT_CODE: Final = 7
 """Exit code after an error above the tolerance."""
 
-ARM: Final = "camera at the hand"
+CAMERA_NAME: Final = "camera at the hand"
 """Name of the camera in error texts."""
 
 
@@ -85,7 +86,7 @@ class BlockPose(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """A finding beside the truth: metres and radians."""
+    """The errors of a found pose: metres and radians."""
 
     what: str
     found: BlockPose
@@ -107,7 +108,7 @@ async def tower(
     colours: ColourRange = BLACK,
     layers: int = LAYERS,
 ) -> None:
-    """Build the tower, and report how accurate the findings were.
+    """Build the tower, and report how accurate the measured poses were.
 
     Args:
         options: the options of the command.
@@ -129,19 +130,19 @@ async def tower(
         layers=layers,
         seed=seed,
     )
-    compared: list[Compared] = []
+    comparisons: list[Compared] = []
     for layer in range(1, layers + 1):
-        seen = await asyncio.to_thread(_look, table, colours)
-        compared += _put_one(table, seen, layer, steps)
-        doing = PERSON.get(layer)
-        if doing is not None:
-            getattr(table, doing)()
-            did = {"add": "puts a wooden block on top", "remove": "takes the highest block away"}
-            steps.step(f"A person {did[doing]}. The robot is not told.", person=doing)
-    _judge(compared, table, steps)
+        measurements = await asyncio.to_thread(_measure, table, colours)
+        comparisons += _put_block(table, measurements, layer, steps)
+        action = PERSON.get(layer)
+        if action is not None:
+            getattr(table, action)()
+            text = {"add": "puts a wooden block on top", "remove": "takes the highest block away"}
+            steps.step(f"A person {text[action]}. The robot is not told.", person=action)
+    _report_errors(comparisons, table, steps)
 
 
-class Seen(NamedTuple):
+class Measurements(NamedTuple):
     """The measurements that the robot makes before it moves a block."""
 
     blocks: list[BlockPose]  # blocks that lie on the table
@@ -150,59 +151,65 @@ class Seen(NamedTuple):
     top: BlockPose  # block on top of the tower
 
 
-def _look(table: TowerTable, colours: ColourRange) -> Seen:
+def _measure(table: TowerTable, colours: ColourRange) -> Measurements:
     """Measure the blocks on the table, the nearest block within reach, and the tower.
 
     Raises:
         FrameFormatError: there is no such block, or no tower.
     """
     overview = table.look(OVERVIEW)
-    depth = SpatialFilter(delta=EDGE)(overview.depth[0])
-    blocks = loose_blocks(overview, depth, colours)
-    reached = [block for block in blocks if REACH[0] <= math.hypot(block.x, block.y) <= REACH[1]]
-    if not reached:
+    depth = SpatialFilter(delta=MIN_DEPTH_STEP)(overview.depth[0])
+    blocks = find_loose_blocks(overview, depth, colours)
+    least, most = REACH_RANGE
+    within_reach = [block for block in blocks if least <= math.hypot(block.x, block.y) <= most]
+    if not within_reach:
         raise FrameFormatError(
-            f"{ARM}: expected a block within {REACH[0]:g} to {REACH[1]:g} m of the robot, got "
+            f"{CAMERA_NAME}: expected a block within {least:g} to {most:g} m of the robot, got "
             f"{len(blocks)} that are not: nothing to pick",
-            source=ARM,
+            source=CAMERA_NAME,
         )
-    rough = min(reached, key=lambda block: math.hypot(block.x, block.y))
-    block = measured_block(table, rough, colours)
-    return Seen(blocks, reached, block, measured_top(table, *tower_place(overview, depth)))
+    nearest = min(within_reach, key=lambda block: math.hypot(block.x, block.y))
+    block = measure_block(table, nearest, colours)
+    return Measurements(
+        blocks, within_reach, block, measure_top(table, *find_tower(overview, depth))
+    )
 
 
-def _put_one(table: TowerTable, seen: Seen, layer: int, steps: Steps) -> list[Compared]:
-    """Put the block on top; return the findings beside the truth.
+def _put_block(
+    table: TowerTable, measurements: Measurements, layer: int, steps: Steps
+) -> list[Compared]:
+    """Move the block onto the tower; return the errors of the two measured poses.
 
     Raises:
         FrameFormatError: the gripper missed the block.
     """
-    block, top = seen.block, seen.top
+    block, top = measurements.block, measurements.top
     true_top = table.tower()[-1]
     grip = table.pick(block.x, block.y, block.angle)
     rows = [
         Compared("block", block, grip.off, grip.turned, 0.0),
-        _compared("tower's top", top, true_top),
+        _compare("tower's top", top, true_top),
     ]
     steps.step(
-        f"Layer {layer}: {len(seen.blocks)} black blocks lie on the table, {len(seen.reached)} "
-        "within reach. The nearest of these, and the tower's top:",
+        f"Layer {layer}: {len(measurements.blocks)} black blocks lie on the table, "
+        f"{len(measurements.reached)} within reach. The nearest of these, and the tower's top:",
         layer=layer,
-        seen=len(seen.blocks),
-        reached=len(seen.reached),
+        seen=len(measurements.blocks),
+        reached=len(measurements.reached),
     )
     values = [row._asdict() | {"found": row.found._asdict()} for row in rows]
     steps.detail(_text(rows), compared=values)
     if table.held is None:
         raise FrameFormatError(
-            f"{ARM}: the gripper closed {1e3 * grip.off:.1f} mm beside the block, on nothing",
-            source=ARM,
+            f"{CAMERA_NAME}: the gripper closed {1e3 * grip.off:.1f} mm beside the block, on "
+            "nothing",
+            source=CAMERA_NAME,
         )
-    lies = table.place(top.x, top.y, top.angle + math.pi / 2)
+    placed_block = table.place(top.x, top.y, top.angle + math.pi / 2)
     steps.detail(
         f"   picked, and put down across at {1e3 * top.height:.1f} mm; the tower is now "
-        f"{1e3 * lies.top:.1f} mm high",
-        height=lies.top,
+        f"{1e3 * placed_block.top:.1f} mm high",
+        height=placed_block.top,
     )
     return rows
 
@@ -210,119 +217,122 @@ def _put_one(table: TowerTable, seen: Seen, layer: int, steps: Steps) -> list[Co
 # ---------------------------------------------------------------------- findings
 
 
-def loose_blocks(
+def find_loose_blocks(
     sight: TableSight, depth: NDArray[np.float32], colours: ColourRange
 ) -> list[BlockPose]:
-    """Return the blocks of a colour that lie on the table, as seen from far above.
+    """Return the blocks of a colour that lie on the table and not on the tower.
 
     Raises:
         FrameFormatError: there is no block of the colour; the error describes the largest region.
     """
-    lying: list[BlockPose] = []
-    for region in _regions(sight, colours):
+    blocks: list[BlockPose] = []
+    for region in _find_block_regions(sight, colours):
         height = sight.camera[2] - region_depth(depth, region.mask).median
-        if abs(height - BLOCK[2]) < EDGE:  # the block is not on the tower
-            lying.append(_pose(sight, region, height))
-    if not lying:
+        if abs(height - BLOCK[2]) < MIN_DEPTH_STEP:  # the block is not on the tower
+            blocks.append(_block_pose(sight, region, height))
+    if not blocks:
         raise _nothing_found_error(sight, colours)
-    return lying
+    return blocks
 
 
-def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) -> BlockPose:
-    """Go above a block and return its pose; from there its sides are hardly visible.
+def measure_block(table: TowerTable, rough: BlockPose, colours: ColourRange) -> BlockPose:
+    """Move the camera above a block, where its sides are hardly visible, and return its pose.
 
     Raises:
         FrameFormatError: the block is not there.
     """
     sight = table.look((rough.x, rough.y, MEASURING_HEIGHT), maps=0)
-    poses = [_pose(sight, region, BLOCK[2]) for region in _regions(sight, colours)]
+    poses = [_block_pose(sight, region, BLOCK[2]) for region in _find_block_regions(sight, colours)]
     if not poses:
         raise _nothing_found_error(sight, colours)
     block = min(poses, key=lambda pose: math.dist(pose[:2], rough[:2]))
     beside = math.dist(block[:2], rough[:2])
     if beside > BLOCK[1] / 2:
         raise FrameFormatError(
-            f"{ARM}: expected the block that was seen from above, got one {1e3 * beside:.0f} mm "
-            "beside it: something has moved",
-            source=ARM,
+            f"{CAMERA_NAME}: expected the block that was seen from above, got one "
+            f"{1e3 * beside:.0f} mm beside it: something has moved",
+            source=CAMERA_NAME,
         )
     return block
 
 
-def tower_place(sight: TableSight, depth: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the place of a region higher than one block, x and y in metres.
+def find_tower(sight: TableSight, depth: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the place of the tower, x and y in metres: the largest region above one block.
 
     Raises:
-        FrameFormatError: no place is higher.
+        FrameFormatError: nothing is higher than one block.
     """
-    region = _high(sight, depth)[0]
+    region = _find_high_regions(sight, depth)[0]
     height = sight.camera[2] - region_depth(depth, region.mask).median
     return to_robot(sight.camera, *region.centre, height)
 
 
-def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
-    """Go above the tower and return the pose and the height of its top.
+def measure_top(table: TowerTable, x: float, y: float) -> BlockPose:
+    """Move the camera above the tower and return the pose of its topmost block.
 
     Raises:
         FrameFormatError: the tower is not there, or its top is no block.
     """
-    sight = table.look((x, y, ABOVE), MAPS)
-    average, smooth = TemporalFilter(delta=EDGE), SpatialFilter(delta=EDGE)
+    sight = table.look((x, y, TOWER_VIEW_HEIGHT), DEPTH_MAP_COUNT)
+    average, smooth = TemporalFilter(delta=MIN_DEPTH_STEP), SpatialFilter(delta=MIN_DEPTH_STEP)
     depth = smooth([average(each) for each in sight.depth][-1])
     middle = (sight.rgb.shape[1] / 2, sight.rgb.shape[0] / 2)
-    high = min(_high(sight, depth), key=lambda region: math.dist(region.centre, middle))
-    level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of the region
-    upper = high.mask & (np.abs(depth - level) < EDGE)
-    top = find_regions(upper)[0]
-    if not SIDE_RATIO[0] <= top.ratio <= SIDE_RATIO[1] or top.fullness < MIN_FULLNESS:
+    regions = _find_high_regions(sight, depth)
+    tower_region = min(regions, key=lambda region: math.dist(region.centre, middle))
+    # the top block is more than a fifth of the region
+    top_depth = np.percentile(depth[tower_region.mask], 20)
+    top_mask = tower_region.mask & (np.abs(depth - top_depth) < MIN_DEPTH_STEP)
+    top = find_regions(top_mask)[0]
+    if not SIDE_RATIO_RANGE[0] <= top.ratio <= SIDE_RATIO_RANGE[1] or top.fullness < MIN_FULLNESS:
         raise FrameFormatError(
-            f"{ARM}: expected a block on top of the tower, got {_shape(top)}", source=ARM
+            f"{CAMERA_NAME}: expected a block on top of the tower, got {_region_text(top)}",
+            source=CAMERA_NAME,
         )
-    measured = region_depth(depth, _inner(top.mask), shared=smooth.shared)
-    return _pose(sight, top, sight.camera[2] - measured.median)._replace(sigma=measured.sigma)
+    measured = region_depth(depth, _without_rim(top.mask), shared=smooth.shared)
+    return _block_pose(sight, top, sight.camera[2] - measured.median)._replace(sigma=measured.sigma)
 
 
-def _regions(sight: TableSight, colours: ColourRange) -> list[ColourRegion]:
-    """Return the regions that may be blocks by their colour, area and sides."""
+def _find_block_regions(sight: TableSight, colours: ColourRange) -> list[ColourRegion]:
+    """Return the regions whose colour, area and sides are those of a block."""
     return find_regions(
         colours.mask(sight.rgb),
-        area=_area(sight),
-        ratio=SIDE_RATIO,
+        area=_area_limits(sight),
+        ratio=SIDE_RATIO_RANGE,
         fullness=MIN_FULLNESS,
         whole=True,
     )
 
 
-def _area(sight: TableSight) -> tuple[float, float]:
+def _area_limits(sight: TableSight) -> tuple[float, float]:
     """Return the least and largest area of a block on the table, pixels."""
     scale = FOCAL / (sight.camera[2] - BLOCK[2])
-    least, most = (part * BLOCK[0] * BLOCK[1] * scale**2 for part in AREA)
+    least, most = (part * BLOCK[0] * BLOCK[1] * scale**2 for part in AREA_RANGE)
     return least, most
 
 
-def _high(sight: TableSight, depth: NDArray[np.float32]) -> list[ColourRegion]:
+def _find_high_regions(sight: TableSight, depth: NDArray[np.float32]) -> list[ColourRegion]:
     """Return the regions that are higher than one block, the largest first."""
-    mask = (depth > 0) & (sight.camera[2] - depth > BLOCK[2] + EDGE)
-    regions = find_regions(mask, area=(_area(sight)[0], math.inf))
+    mask = (depth > 0) & (sight.camera[2] - depth > BLOCK[2] + MIN_DEPTH_STEP)
+    regions = find_regions(mask, area=(_area_limits(sight)[0], math.inf))
     if not regions:
         raise FrameFormatError(
-            f"{ARM}: expected a tower, got nothing that is higher than a block of "
+            f"{CAMERA_NAME}: expected a tower, got nothing that is higher than a block of "
             f"{1e3 * BLOCK[2]:g} mm",
-            source=ARM,
+            source=CAMERA_NAME,
         )
     return regions
 
 
-def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return a mask without its rim."""
     inner = mask.copy()
     for axis in (0, 1):
-        for step in (-RIM, RIM):
+        for step in (-RIM_WIDTH_PX, RIM_WIDTH_PX):
             inner &= np.roll(mask, step, axis)  # a whole region does not touch the rim
     return inner
 
 
-def _pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
+def _block_pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
     x, y = to_robot(sight.camera, *region.centre, height)
     direction = AXES @ (math.cos(region.orientation), math.sin(region.orientation), 0.0)
     return BlockPose(x, y, math.remainder(math.atan2(direction[1], direction[0]), math.pi), height)
@@ -330,26 +340,27 @@ def _pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
 
 def _nothing_found_error(sight: TableSight, colours: ColourRange) -> FrameFormatError:
     """Return an error that describes the regions of a colour, none of which is a block."""
-    least, most = _area(sight)
+    least, most = _area_limits(sight)
     regions = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
-    got = "none of it"
+    found = "none of it"
     if regions:
-        got = f"{len(regions)} regions of it, the largest {_shape(regions[0])}"
+        found = f"{len(regions)} regions of it, the largest {_region_text(regions[0])}"
     return FrameFormatError(
-        f"{ARM}: expected a block on the table of the colour {colours.as_json()}, {least:.0f} to "
-        f"{most:.0f} pixels with sides of {SIDE_RATIO[0]:g}:1 to {SIDE_RATIO[1]:g}:1, got {got}",
-        source=ARM,
+        f"{CAMERA_NAME}: expected a block on the table of the colour {colours.as_json()}, "
+        f"{least:.0f} to {most:.0f} pixels with sides of {SIDE_RATIO_RANGE[0]:g}:1 to "
+        f"{SIDE_RATIO_RANGE[1]:g}:1, got {found}",
+        source=CAMERA_NAME,
     )
 
 
-def _shape(region: ColourRegion) -> str:
+def _region_text(region: ColourRegion) -> str:
     return f"{region.area} pixels with sides of {region.ratio:.1f}:1"
 
 
 # ---------------------------------------------------------------------- comparison
 
 
-def _compared(label: str, measured: BlockPose, true: WoodenBlock) -> Compared:
+def _compare(label: str, measured: BlockPose, true: WoodenBlock) -> Compared:
     beside = math.hypot(measured.x - true.x, measured.y - true.y)
     turned = math.remainder(measured.angle - true.angle, math.pi)
     return Compared(label, measured, beside, turned, measured.height - true.top)
@@ -360,21 +371,25 @@ def _text(rows: list[Compared]) -> str:
     titles = [title.rjust(8) for title in ("beside", "turned", "higher", "sigma")]
     cells: list[tuple[Any, ...]] = []
     for label, block, beside, turned, higher in rows:
-        places = (1e3 * block.x, 1e3 * block.y, math.degrees(block.angle), 1e3 * block.height)
+        values = (1e3 * block.x, 1e3 * block.y, math.degrees(block.angle), 1e3 * block.height)
         errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * block.sigma)
-        known = errors if block.sigma else errors[:2]  # otherwise its height was not measured
-        shown = [f"{value:8.2f}" for value in (*places, *known)]
-        cells.append((label, *shown, *[""] * (8 - len(shown))))
+        measured_errors = (
+            errors if block.sigma else errors[:2]
+        )  # otherwise its height was not measured
+        texts = [f"{value:8.2f}" for value in (*values, *measured_errors)]
+        cells.append((label, *texts, *[""] * (8 - len(texts))))
     return table_text((*head, *titles), cells)
 
 
-def _judge(compared: list[Compared], table: TowerTable, steps: Steps) -> None:
+def _report_errors(comparisons: list[Compared], table: TowerTable, steps: Steps) -> None:
     """Print the largest errors; raise SystemExit if one of them is above its tolerance."""
     beside, turned, higher = (
-        max(row.errors[place] for row in compared) for place in range(len(TOLERANCE))
+        max(row.errors[place] for row in comparisons) for place in range(len(TOLERANCE))
     )
     within = all(
-        error <= most for row in compared for error, most in zip(row.errors, TOLERANCE, strict=True)
+        error <= most
+        for row in comparisons
+        for error, most in zip(row.errors, TOLERANCE, strict=True)
     )
     most = f"{1e3 * TOLERANCE[0]:g} mm, {math.degrees(TOLERANCE[1]):g} degree"
     stack = table.tower()
@@ -389,4 +404,4 @@ def _judge(compared: list[Compared], table: TowerTable, steps: Steps) -> None:
         height=higher,
     )
     if not within:
-        raise SystemExit(MISSED)
+        raise SystemExit(MISSED_EXIT_CODE)

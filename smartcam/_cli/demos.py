@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam._extras import from_part
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class PalletSize(_ParamType):
 )
 @click.option(
     "--fleet",
-    "shared",
+    "use_fleet",
     is_flag=True,
     help="Share ten cameras by two agents, and one of them by three programs, instead. Needs the "
     'extra "fleet".',
@@ -67,7 +67,7 @@ class PalletSize(_ParamType):
 )
 @click.option(
     "--inspect",
-    "inspected",
+    "use_inspection",
     is_flag=True,
     help="Read, check and compare drawn parts by a software camera, instead, and draw its "
     'findings. Needs the extra "inspection".',
@@ -92,27 +92,27 @@ class PalletSize(_ParamType):
     show_default=True,
     help="With --pick, --tower and --inspect: seed of all noise and places.",
 )
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def demo(
     pick: bool,
     plain: bool,
     pallet: tuple[int, int, int],
-    shared: bool,
+    use_fleet: bool,
     tower: bool,
-    inspected: bool,
+    use_inspection: bool,
     folder: str | None,
     picture: str,
     seed: int,
     options: Options,
 ) -> None:
     """Show smartcam's main job with an emulated camera over real TCP."""
-    flags = {"--pick": pick, "--fleet": shared, "--tower": tower, "--inspect": inspected}
-    given = [name for name, wanted in flags.items() if wanted]
-    if len(given) > 1:
-        raise click.UsageError(f"{' and '.join(given)} do not go together")
+    flags = {"--pick": pick, "--fleet": use_fleet, "--tower": tower, "--inspect": use_inspection}
+    chosen = [name for name, is_chosen in flags.items() if is_chosen]
+    if len(chosen) > 1:
+        raise click.UsageError(f"{' and '.join(chosen)} do not go together")
     if plain and not pick:
         raise click.UsageError("--plain goes with --pick")
-    if inspected:
+    if use_inspection:
         with from_part("inspection", "smartcam demo --inspect needs"):
             from smartcam._cli import demo_inspect
 
@@ -122,7 +122,7 @@ async def demo(
             from smartcam._cli import demo_tower
 
         await demo_tower.tower(options, seed)
-    elif shared:
+    elif use_fleet:
         with from_part("fleet", "smartcam demo --fleet needs"):
             from smartcam._cli import demo_fleet
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, option
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.usage import ListedGroup
 from smartcam.exceptions import ConfigurationError
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
     from smartcam.depth import Cloud
     from smartcam.web._inside import Up
 
-UP = ("x", "y", "z", "-x", "-y", "-z")
-"""Axes that may point upwards on the page."""
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
+"""Values of ``--up``: the axis that points upwards on the page."""
 
 
-def _ranges(
+def _parse_ranges(
     _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
 ) -> list[tuple[str, float, float]]:
-    """Return axis, low and high of ``AXIS:LOW:HIGH``; an empty limit is no limit."""
+    """Return axis, low and high of each ``AXIS:LOW:HIGH``; an empty number means no bound."""
     ranges = []
     for value in values:
         axis, _, limits = value.partition(":")
         low, colon, high = limits.partition(":")
         try:
-            ends = (float(low or "-inf"), float(high or "inf"))
+            bounds = (float(low or "-inf"), float(high or "inf"))
         except ValueError:
-            ends = (math.nan, math.nan)
-        if axis not in ("x", "y", "z") or not colon or not ends[0] <= ends[1]:
+            bounds = (math.nan, math.nan)
+        if axis not in ("x", "y", "z") or not colon or not bounds[0] <= bounds[1]:
             raise click.BadParameter(f"expected AXIS:LOW:HIGH, such as z:0.2:1.5, got {value!r}")
-        ranges.append((axis, *ends))
+        ranges.append((axis, *bounds))
     return ranges
 
 
@@ -55,7 +55,7 @@ def depth() -> None:
 # ---------------------------------------------------------------------- show
 
 
-_UNIT = click.option(
+_unit_option = click.option(
     "--unit",
     type=click.Choice(["m", "cm", "mm", "inch"]),
     help="Unit of the file's lengths; files that smartcam wrote contain it.",
@@ -70,15 +70,15 @@ _UNIT = click.option(
 @click.argument("file")
 @click.option(
     "--up",
-    type=click.Choice(UP),
+    type=click.Choice(UP_AXES),
     default="z",
     show_default=True,
     help="The axis that points up; -y in the frame of a level camera.",
 )
-@_UNIT
+@_unit_option
 @page_options(always=True)
 @option("--seconds")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def show(
     file: str, up: Up, unit: LengthUnit | None, web: PageOptions, options: Options
 ) -> None:
@@ -111,7 +111,7 @@ async def show(
     "--pass",
     "ranges",
     metavar="AXIS:LOW:HIGH",
-    callback=_ranges,
+    callback=_parse_ranges,
     multiple=True,
     help="Keep the points of a range in metres, such as z:0.2:1.5, z:0.2: or z::1.5. May be given "
     "more than once.",
@@ -128,10 +128,10 @@ async def show(
     metavar="METRES",
     help="Keep one point for each cube of this size, metres.",
 )
-@_UNIT
+@_unit_option
 @click.option("--text", is_flag=True, help="Numbers as text in place of bytes.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def convert(
     source: str,
     target: str,
@@ -151,11 +151,11 @@ async def convert(
         voxel_grid,
     )
 
-    def work() -> tuple[int, Cloud]:
+    def convert_file() -> tuple[int, Cloud]:
         if Path(target).exists() and not force:
             raise ConfigurationError(f"{target}: the file exists already; --force replaces it")
         cloud = load_cloud(source, unit=unit)
-        before = len(cloud)
+        old_count = len(cloud)
         for axis, low, high in ranges:
             cloud = pass_through(cloud, axis, low, high)
         if outliers:
@@ -163,16 +163,16 @@ async def convert(
         if voxel is not None:
             cloud = voxel_grid(cloud, voxel)
         save_cloud(target, cloud, text=text)
-        return before, cloud
+        return old_count, cloud
 
-    before, cloud = await asyncio.to_thread(work)
+    old_count, cloud = await asyncio.to_thread(convert_file)
     options.show(
         {
             "file": target,
             "points": len(cloud),
-            "of": before,
+            "of": old_count,
             "colours": cloud.colours is not None,
             "sigma": cloud.sigma is not None,
         },
-        f"{target}: {len(cloud):,} of {before:,} points",
+        f"{target}: {len(cloud):,} of {old_count:,} points",
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import naming, option, runs
+from smartcam._cli.options import async_command, naming_file_errors, option
 
 if TYPE_CHECKING:
     from smartcam._cli.options import Options
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @click.command()
 @option("--output", help="Write the dissector to this file instead.")
 @option("--debug", help="Show tracebacks, on stderr.")
-@runs()
+@async_command()
 async def dissector(output: str | None, options: Options) -> None:
     """Print the Wireshark dissector: one Lua file for every dialect of bvs.
 
@@ -32,5 +32,5 @@ async def dissector(output: str | None, options: Options) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    with naming(f"--output {path}"):
+    with naming_file_errors(f"--output {path}"):
         path.write_text(text, encoding="ascii")

@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import CAMERA, CONNECTS, Options, option, runs
+from smartcam._cli.options import CAMERA_OPTIONS, CONNECT_WARNING, Options, async_command, option
 from smartcam._cli.probe import frame_text
-from smartcam._cli.terminal import tinted
+from smartcam._cli.terminal import coloured
 from smartcam._cli.texts import table_text
 
 if TYPE_CHECKING:
     from smartcam.doctor._inside import Finding
 
-MAX_BROKEN = 4
-"""Largest number of lines of broken bytes below a finding."""
+MAX_BROKEN_LINES = 4
+"""Largest number of lines with broken frames below a finding."""
 
 
 @click.command(
     help="Report each problem with its cure, in plain words: name, session, status, application, "
     "round trip, run state, results, clock. Changes nothing on the camera and triggers nothing, "
-    f"unless --trigger is given. Exit code: that of the worst finding. {CONNECTS}"
+    f"unless --trigger is given. Exit code: that of the worst finding. {CONNECT_WARNING}"
 )
 @click.argument("url")
 @click.option(
@@ -38,14 +38,14 @@ MAX_BROKEN = 4
 @option("--y-down")
 @option("--count", type=click.IntRange(1, 10_000), help="How many triggers; 10 by default.")
 @option("--seconds", help="Seconds to watch for unasked results; 3 by default.")
-@runs(*CAMERA)
+@async_command(*CAMERA_OPTIONS)
 async def doctor(url: str, trigger: bool, options: Options) -> None:
     """Print each finding of an examination at once; end with the exit code of the worst."""
     from smartcam.doctor import examine
     from smartcam.doctor._inside import summary
 
     findings: list[Finding] = []
-    with options.tracing(url) as trace:
+    with options.open_trace(url) as trace:
         examination = examine(
             url,
             application=options.application,
@@ -60,17 +60,17 @@ async def doctor(url: str, trigger: bool, options: Options) -> None:
         async with aclosing(examination):
             async for finding in examination:
                 findings.append(finding)
-                options.show(finding, _text)
-    end = summary(findings)
-    options.show(end, f"{end.text[0].upper()}{end.text[1:]}.")
-    if end.exit_code:
-        raise SystemExit(int(end.exit_code))
+                options.show(finding, _finding_text)
+    verdict = summary(findings)
+    options.show(verdict, f"{verdict.text[0].upper()}{verdict.text[1:]}.")
+    if verdict.exit_code:
+        raise SystemExit(int(verdict.exit_code))
 
 
-def _text(finding: Finding) -> str:
-    severity = tinted(finding.severity, f"{finding.severity:<8}")
+def _finding_text(finding: Finding) -> str:
+    severity = coloured(finding.severity, f"{finding.severity:<8}")
     lines = [f"{severity} {finding.check}: {finding.text}"]
-    lines += [f"         {line}" for line in _broken(finding)]
+    lines += [f"         {line}" for line in _broken_frames(finding)]
     if finding.cure:
         lines.append(f"         -> {finding.cure}")
     rows = finding.details.get("dump")
@@ -80,8 +80,8 @@ def _text(finding: Finding) -> str:
     return "\n".join(lines)
 
 
-def _broken(finding: Finding) -> list[str]:
-    """Return the broken bytes that came, which help the owner of the camera more than words."""
+def _broken_frames(finding: Finding) -> list[str]:
+    """Return the last broken frames as text; their bytes help the camera's owner most."""
     frames = [entry for trial in finding.details.get("frames", ()) for entry in trial]
     broken = {entry.hex: frame_text(entry) for entry in reversed(frames) if entry.direction == "!"}
-    return list(broken.values())[:MAX_BROKEN]
+    return list(broken.values())[:MAX_BROKEN_LINES]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam._cli.texts import table_text
 from smartcam._extras import from_part
 
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
 
 DEFAULT_ADDRESSES, MAX_ADDRESSES = 65_536, 1 << 24
 MAX_OPEN_CONNECTIONS, MAX_OPENINGS_PER_SECOND, MAX_SECONDS = 1_000, 10_000.0, 60.0
-"""Bounds of a search, equal to the library's; they are repeated for ``--help``."""
+"""Limits of a search; the library has the same, but ``--help`` must not import it."""
 
 PERIOD = 1.0
 """Seconds between two updates of the progress line."""
 
-DISTURBED = (
+DISTURBANCE_WARNING = (
     "No document says that a camera of {} keeps its client when another one connects and says "
     "nothing: --leave and --fleet keep away from those at work."
 )
 """The warning about open ports of cameras that serve one client."""
 
-_EVIDENCE = {
+_EVIDENCE_TEXTS = {
     "greeted": "greets as {protocols}: {greeting}",
     "silent": "silent, as {protocols} is before a client speaks",
     "said": "may be {protocols}: {greeting}",
     "ended": "hangs up at once: {protocols} with a client, or something else",
 }
-"""Texts on the received bytes, by kind of evidence."""
+"""The text about the received bytes, by kind of evidence."""
 
 
 @click.command(
@@ -98,7 +98,7 @@ _EVIDENCE = {
 )
 @click.option(
     "--timeout",
-    "patience",
+    "port_timeout",
     type=click.FloatRange(0, MAX_SECONDS, min_open=True),
     default=1.0,
     show_default=True,
@@ -112,19 +112,19 @@ _EVIDENCE = {
     help="Refuse more.",
 )
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print cameras as entries of a fleet file.")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def find(
     networks: tuple[str, ...],
     ports: tuple[int, ...],
     protocols: tuple[str, ...],
     fleet_file: str | None,
     leave: tuple[str, ...],
-    patience: float,
+    port_timeout: float,
     options: Options,
     as_yaml: bool,
-    **given: Any,
+    **search_options: Any,
 ) -> None:
-    """Search and show the findings; after Ctrl-C, those so far.
+    """Search, and show what was found; also after Ctrl-C.
 
     Raises ConfigurationError: an argument is wrong, or consent is missing.
     """
@@ -132,33 +132,37 @@ async def find(
 
     if as_yaml and options.as_json:
         raise click.UsageError("--json and --yaml do not go together")
-    known: dict[str, dict[str, str]] = {}
-    taken: set[str] = set()
+    fleet_cameras: dict[str, dict[str, str]] = {}
+    used_names: set[str] = set()
     if fleet_file is not None:
-        known, taken = await asyncio.to_thread(_fleet_cameras, fleet_file)
+        fleet_cameras, used_names = await asyncio.to_thread(_fleet_cameras, fleet_file)
     search = CameraSearch(
         networks,
         ports=ports,
         protocols=protocols or None,
-        leave=[*leave, *known],
-        timeout=patience,
-        **given,
+        leave=[*leave, *fleet_cameras],
+        timeout=port_timeout,
+        **search_options,
     )
     try:
-        async with telling(search):
+        async with show_progress_line(search):
             await search.run()
     finally:
         if search.begun:
-            alone = {host: known[text] for host, text in search.left.items() if text in known}
+            left_alone = {
+                host: fleet_cameras[text]
+                for host, text in search.left.items()
+                if text in fleet_cameras
+            }
             if as_yaml:
-                click.echo("\n".join(fleet_lines(search.results(), taken)))
+                click.echo("\n".join(fleet_lines(search.results(), used_names)))
             else:
-                _show(search.results(), alone, options)
+                _show_findings(search.results(), left_alone, options)
             click.echo(summary(search), err=True)
 
 
 def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
-    """Return the hosts of a fleet file's cameras, with their names and URLs; and all names."""
+    """Return the URLs of a fleet file's cameras by host and name, and the names of all cameras."""
     with from_part("fleet", "a fleet file needs"):
         from smartcam.fleet import load_fleet
     from smartcam.settings import parse_address
@@ -175,43 +179,45 @@ def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
 # ---------------------------------------------------------------------- showing
 
 
-def _show(
-    ports: Sequence[FoundPort], alone: Mapping[str, Mapping[str, str]], options: Options
+def _show_findings(
+    ports: Sequence[FoundPort], left_alone: Mapping[str, Mapping[str, str]], options: Options
 ) -> None:
-    """Print the findings, and the addresses left alone, as a table or as JSON."""
+    """Print the open ports, and the addresses that were left alone, as a table or as JSON."""
     if options.as_json:
         for port in ports:
             value = {name: getattr(port, name) for name in port.__dataclass_fields__}
             value["said"] = value.pop("received")
             options.show({**value, "greeting": port.greeting, "urls": port.urls}, "")
-        for host, cameras in alone.items():
+        for host, cameras in left_alone.items():
             for name, url in cameras.items():
                 options.show({"host": host, "url": url, "fleet_camera": name}, "")
-    elif ports or alone:
+    elif ports or left_alone:
         rows = [
-            (port.host, str(port.port), ", ".join(port.protocols) or "-", _ms(port), evidence(port))
+            (
+                port.host,
+                str(port.port),
+                ", ".join(port.protocols) or "-",
+                f"{port.seconds * 1e3:.1f} ms",
+                evidence_text(port),
+            )
             for port in ports
         ]
         rows += [
             (host, "", "", "", f"not touched: it is {' and '.join(cameras)} of the fleet")
-            for host, cameras in alone.items()
+            for host, cameras in left_alone.items()
         ]
         click.echo(table_text(("host", "port", "protocol", "opened", "what is known"), rows))
 
 
-def _ms(port: FoundPort) -> str:
-    return f"{port.seconds * 1e3:.1f} ms"
-
-
-def evidence(port: FoundPort) -> str:
-    """Return a line about the device that answers, or may answer, at an open port."""
+def evidence_text(port: FoundPort) -> str:
+    """Return a line about the device at an open port."""
     if port.answer is not None:
         return f"a camera answers: {port.answer.url}"
     if port.evidence == "other":
         greeting = f"it says {port.greeting!r:.60}" if port.received else "it does not greet"
         return f"another service: {greeting}"
     protocols = " or ".join(port.protocols)
-    text = _EVIDENCE[port.evidence].format(protocols=protocols, greeting=port.greeting[:60])
+    text = _EVIDENCE_TEXTS[port.evidence].format(protocols=protocols, greeting=port.greeting[:60])
     return f"{text}; asked: {port.refusal}" if port.refusal else text
 
 
@@ -224,42 +230,42 @@ def summary(search: CameraSearch) -> str:
         text += f" (failed: {search.why})"
     text += ". Cameras that are set to UDP do not show."
     if search.exclusive:
-        text += f" {DISTURBED.format(' or '.join(search.exclusive))}"
+        text += f" {DISTURBANCE_WARNING.format(' or '.join(search.exclusive))}"
     return text
 
 
-def fleet_lines(ports: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:
-    """Return lines for a fleet file; devices that are no camera, or did not answer, are comments.
+def fleet_lines(ports: Iterable[FoundPort], used_names: Iterable[str] = ()) -> list[str]:
+    """Return lines for a fleet file; a port that may not be a camera's becomes a comment.
 
-    ``taken``: names that the fleet uses already.
+    ``used_names``: names of the fleet's cameras, which no line may use.
     """
-    names, lines = set(taken), ["cameras:"]
-    live = False
+    names, lines = set(used_names), ["cameras:"]
+    any_certain = False
     for port in ports:
-        for nth, url in enumerate(port.urls):
-            name = _fresh(port, names)
-            sure = nth == 0 and not port.refusal
-            live = live or sure
+        for index, url in enumerate(port.urls):
+            name = _unused_name(port, names)
+            is_certain = index == 0 and not port.refusal
+            any_certain = any_certain or is_certain
             line = f'{name}: {{url: "{url}"}}'
-            if sure:
+            if is_certain:
                 names.add(name)
-            lines.append(f"  {'' if sure else '# '}{line}  # {evidence(port)}")
-    if not live:
+            lines.append(f"  {'' if is_certain else '# '}{line}  # {evidence_text(port)}")
+    if not any_certain:
         lines[0] = "# cameras: none was found"
     return lines
 
 
-def _fresh(port: FoundPort, taken: set[str]) -> str:
-    """Return a name for a camera, made from its address."""
+def _unused_name(port: FoundPort, used_names: set[str]) -> str:
+    """Return a name made from a camera's address that is not used yet."""
     host = re.sub(r"[^a-z0-9]", "-", port.host.lower())
     base = f"found/{host}-{port.port}"
     names = itertools.chain((f"found/{host}", base), (f"{base}-{n}" for n in itertools.count(2)))
-    return next(name for name in names if name not in taken)
+    return next(name for name in names if name not in used_names)
 
 
 @contextlib.asynccontextmanager
-async def telling(search: CameraSearch) -> AsyncIterator[None]:
-    """Show a progress line on a terminal's stderr."""
+async def show_progress_line(search: CameraSearch) -> AsyncIterator[None]:
+    """Show a progress line on stderr while the block runs, if stderr is a terminal."""
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         yield
         return

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.fleet_certificates import certificates
-from smartcam._cli.options import OUTPUT, Options, from_hex, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, from_hex
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import exit_code, first
-from smartcam._cli.terminal import tinted
+from smartcam._cli.running import exit_code, run_until_first
+from smartcam._cli.terminal import coloured
 from smartcam._cli.texts import table_text
 from smartcam._cli.usage import ListedGroup, error_json
 from smartcam._extras import from_part
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from smartcam.models import Result
     from smartcam.streams import Subscription
 
-_EVENTS = {
+_EVENT_TEXTS = {
     "AgentJoined": "agent {agent}: is there",
     "AgentLeft": "agent {agent}: is gone",
     "CameraJoined": "{camera}: shared by agent {agent}",
@@ -37,7 +37,7 @@ _EVENTS = {
 }
 """The text for an event, by the name of its class."""
 
-_READING = ("--interpret-as", "--y-down", "--calibration", "--units")
+_READING_OPTIONS = ("--interpret-as", "--y-down", "--calibration", "--units")
 
 
 @click.group(
@@ -54,15 +54,18 @@ def fleet() -> None:
 fleet.add_command(certificates)
 
 
-def _opened(url: str, options: Options) -> Fleet:
+def _make_fleet(url: str, options: Options) -> Fleet:
     from smartcam.fleet import open
 
-    return open(url, connect_timeout=options.step(10.0), **options.reading(fleet=True))
+    return open(
+        url, connect_timeout=options.step_timeout(10.0), **options.reading_options(fleet=True)
+    )
 
 
-def _require_cameras(opened: Fleet) -> None:
-    if not len(opened):
-        raise ConnectFailedError(f"no agent of {opened.url} is there")
+def _require_cameras(fleet: Fleet) -> None:
+    """Raise ConnectFailedError if the fleet has no cameras."""
+    if not len(fleet):
+        raise ConnectFailedError(f"no agent of {fleet.url} is there")
 
 
 # ---------------------------------------------------------------------- list
@@ -71,15 +74,15 @@ def _require_cameras(opened: Fleet) -> None:
 @fleet.command(name="list", help="List the cameras, and which have no session with their agents.")
 @click.argument("url")
 @click.argument("pattern", default="**")
-@runs("--timeout", *OUTPUT)
+@async_command("--timeout", *OUTPUT_OPTIONS)
 async def list_(url: str, pattern: str, options: Options) -> None:
-    async with _opened(url, options) as opened:
-        _require_cameras(opened)
-        known = await opened.status(pattern)
-        cameras = [_camera(opened, name, known.get(name)) for name in opened.names(pattern)]
-        warning = opened.warning
+    async with _make_fleet(url, options) as fleet:
+        _require_cameras(fleet)
+        summaries = await fleet.status(pattern)
+        cameras = [_camera_data(fleet, name, summaries.get(name)) for name in fleet.names(pattern)]
+        warning = fleet.warning
     if warning:
-        click.echo(f"{tinted('error', 'warning:')} {warning}", err=True)
+        click.echo(f"{coloured('error', 'warning:')} {warning}", err=True)
     if options.as_json:
         for value in cameras:
             options.show(value, "")
@@ -88,35 +91,35 @@ async def list_(url: str, pattern: str, options: Options) -> None:
         click.echo(f"no camera of the fleet is {pattern}")
         return
     head = ("camera", "agent", "application", "status", "url")
-    click.echo(table_text(head, [_row(value) for value in cameras]))
+    click.echo(table_text(head, [_camera_row(value) for value in cameras]))
     for value in cameras:
         if value["reason"] is not None:
             click.echo(value["reason"])
 
 
-def _camera(opened: Fleet, name: str, known: CameraSummary | None) -> dict[str, Any]:
+def _camera_data(fleet: Fleet, name: str, summary: CameraSummary | None) -> dict[str, Any]:
     """Return the state of a fleet's camera as values for JSON."""
-    is_connected = known is not None and known.connected
+    is_connected = summary is not None and summary.connected
     return {
         "camera": name,
-        "agents": opened.agents(name) if known is None else [known.agent],
+        "agents": fleet.agents(name) if summary is None else [summary.agent],
         "connected": is_connected,
-        "application": known.application if known is not None and is_connected else None,
-        "status": known.status if known is not None and is_connected else None,
-        "url": opened.url_of(name),
-        "reason": _reason(name, known),
+        "application": summary.application if summary is not None and is_connected else None,
+        "status": summary.status if summary is not None and is_connected else None,
+        "url": fleet.url_of(name),
+        "reason": _missing_reason(name, summary),
     }
 
 
-def _reason(name: str, known: CameraSummary | None) -> str | None:
-    if known is None:
+def _missing_reason(name: str, summary: CameraSummary | None) -> str | None:
+    if summary is None:
         return f"{name}: its agent does not answer"
-    if known.reason is None:
+    if summary.reason is None:
         return None
-    return f"{name}: the agent has no session with the camera: {known.reason}"
+    return f"{name}: the agent has no session with the camera: {summary.reason}"
 
 
-def _row(value: dict[str, Any]) -> tuple[str, ...]:
+def _camera_row(value: dict[str, Any]) -> tuple[str, ...]:
     application, status = "", "not connected"
     if value["connected"]:
         application, status = str(value["application"]), str(value["status"])
@@ -132,20 +135,22 @@ def _row(value: dict[str, Any]) -> tuple[str, ...]:
 )
 @click.argument("url")
 @click.argument("pattern", default="**")
-@runs(*_READING, "--count", "--seconds", "--timeout", *OUTPUT, interrupted=0)
+@async_command(
+    *_READING_OPTIONS, "--count", "--seconds", "--timeout", *OUTPUT_OPTIONS, interrupt_code=0
+)
 async def watch(url: str, pattern: str, options: Options) -> None:
-    async with _opened(url, options) as opened:
-        results, events = opened.results(pattern), opened.events()
-        jobs = [_show_results(opened, results, options), _show_events(events, pattern, options)]
-        await first(jobs, options.seconds)
+    async with _make_fleet(url, options) as fleet:
+        results, events = fleet.results(pattern), fleet.events()
+        jobs = [_show_results(fleet, results, options), _show_events(events, pattern, options)]
+        await run_until_first(jobs, options.seconds)
 
 
-async def _show_results(opened: Fleet, results: FleetResults[Any], options: Options) -> None:
-    done, as_text = 0, options.result_text()
+async def _show_results(fleet: Fleet, results: FleetResults[Any], options: Options) -> None:
+    count, make_text = 0, options.result_text()
     async for result in results:
-        options.show(result, functools.partial(_named_text, opened, as_text))
-        done += 1
-        if done == options.count:
+        options.show(result, functools.partial(_camera_result_text, fleet, make_text))
+        count += 1
+        if count == options.count:
             return
 
 
@@ -157,11 +162,13 @@ async def _show_events(events: Subscription[FleetEvent], pattern: str, options: 
         fields: dict[str, Any] = jsonable(event)
         if meets(pattern, fields.get("camera", pattern)):
             kind = type(event).__name__
-            options.show({"event": kind, **fields}, _EVENTS[kind].format(**fields))
+            options.show({"event": kind, **fields}, _EVENT_TEXTS[kind].format(**fields))
 
 
-def _named_text(opened: Fleet, as_text: Callable[[Camera, Result], str], result: Result) -> str:
-    return f"{result.camera}: {as_text(opened[result.camera], result)}"
+def _camera_result_text(
+    fleet: Fleet, make_text: Callable[[Camera, Result], str], result: Result
+) -> str:
+    return f"{result.camera}: {make_text(fleet[result.camera], result)}"
 
 
 # ---------------------------------------------------------------------- reload
@@ -174,12 +181,12 @@ def _named_text(opened: Fleet, as_text: Callable[[Camera, Result], str], result:
 )
 @click.argument("url")
 @click.option("--agent", metavar="NAME", help="Only this agent.")
-@runs("--timeout", *OUTPUT)
+@async_command("--timeout", *OUTPUT_OPTIONS)
 async def reload(url: str, agent: str | None, options: Options) -> None:
-    async with _opened(url, options) as opened:
-        outcomes = await opened.reload(agent, timeout=options.step(30.0))
+    async with _make_fleet(url, options) as fleet:
+        outcomes = await fleet.reload(agent, timeout=options.step_timeout(30.0))
     if not outcomes:
-        raise ConnectFailedError(f"no agent of {opened.url} is there")
+        raise ConnectFailedError(f"no agent of {fleet.url} is there")
     codes: list[int] = []
     for name, outcome in outcomes.items():
         if isinstance(outcome, SmartCamError):
@@ -199,11 +206,11 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
     "fleet's URL, whose agents are asked, or a fleet file, whose spools are read, with or "
     "without a running agent."
 )
-@click.argument("place", metavar="URL|FLEET.yaml")
-@runs("--timeout", *OUTPUT)
-async def outlets(place: str, options: Options) -> None:
-    if "://" in place:
-        await _ask_outlets(place, options)
+@click.argument("url_or_file", metavar="URL|FLEET.yaml")
+@async_command("--timeout", *OUTPUT_OPTIONS)
+async def outlets(url_or_file: str, options: Options) -> None:
+    if "://" in url_or_file:
+        await _ask_outlets(url_or_file, options)
         return
     from pathlib import Path
 
@@ -212,9 +219,9 @@ async def outlets(place: str, options: Options) -> None:
     with from_part("mqtt", '"fleet outlets" needs'):
         from smartcam.outlets._inside import stored_accounts
 
-    section = load_fleet(place).outlets or {}
+    section = load_fleet(url_or_file).outlets or {}
     rows: list[tuple[str, ...]] = []
-    for name, account in stored_accounts(section, Path(place).parent).items():
+    for name, account in stored_accounts(section, Path(url_or_file).parent).items():
         fields = {} if account is None else account.fields()
         if options.as_json:
             options.show({"outlet": name, "account": fields or None}, "")
@@ -225,20 +232,20 @@ async def outlets(place: str, options: Options) -> None:
 
 
 def _account_row(fields: dict[str, Any]) -> tuple[str, ...]:
-    dropped = ", ".join(f"{count} {why}" for why, count in fields.get("dropped", {}).items())
+    dropped = ", ".join(f"{count} {reason}" for reason, count in fields.get("dropped", {}).items())
     numbers = [str(fields.get(key, "")) for key in ("results", "delivered", "spooled")]
     return (*numbers, dropped or "0" if fields else "no spool yet")
 
 
 async def _ask_outlets(url: str, options: Options) -> None:
-    """Show the counts of outlets that a fleet's agents report."""
-    async with _opened(url, options) as opened:
-        outlets = await opened.outlets(timeout=options.step(5.0))
+    """Ask a fleet's agents for the accounts of their outlets, and show them."""
+    async with _make_fleet(url, options) as fleet:
+        outlets = await fleet.outlets(timeout=options.step_timeout(5.0))
     if options.as_json:
         for outlet in outlets:
             account = outlet._asdict()
-            shown = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
-            options.show({**shown, "account": account}, "")
+            labels = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
+            options.show({**labels, "account": account}, "")
         return
     rows = [
         (outlet.agent, outlet.outlet, *_account_row(outlet._asdict()), outlet.trouble or "well")
@@ -258,10 +265,10 @@ async def _ask_outlets(url: str, options: Options) -> None:
 )
 @click.argument("url")
 @click.argument("camera")
-@runs("--timeout", *OUTPUT)
+@async_command("--timeout", *OUTPUT_OPTIONS)
 async def take_back(url: str, camera: str, options: Options) -> None:
-    async with _opened(url, options) as opened:
-        await opened[camera].take_back(timeout=options.step(10.0))
+    async with _make_fleet(url, options) as fleet:
+        await fleet[camera].take_back(timeout=options.step_timeout(10.0))
     options.show({"camera": camera, "connected": True}, f"{camera}: its agent has a session")
 
 
@@ -270,15 +277,17 @@ async def take_back(url: str, camera: str, options: Options) -> None:
 
 @fleet.command(
     help="Serve a page of all cameras until Ctrl-C: state, rate, last result, outcomes, errors, "
-    "and a page for each. The page's address goes to stdout. A fleet without a running agent "
-    'is awaited. Needs the extra "web", too.'
+    "and a page for each. The page's address goes to stdout. The command waits for a fleet whose "
+    'agents do not run. Needs the extra "web", too.'
 )
 @click.argument("url")
 @click.option(
     "--control", is_flag=True, help="The pages may trigger, start, stop and switch applications."
 )
 @page_options(always=True)
-@runs(*_READING, "--seconds", "--timeout", *OUTPUT, interrupted=0, terminated=0)
+@async_command(
+    *_READING_OPTIONS, "--seconds", "--timeout", *OUTPUT_OPTIONS, interrupt_code=0, terminate_code=0
+)
 async def page(url: str, control: bool, web: PageOptions, options: Options) -> None:
     from smartcam.web import FleetSite
 
@@ -288,30 +297,30 @@ async def page(url: str, control: bool, web: PageOptions, options: Options) -> N
             asyncio.timeout(options.seconds),
             contextlib.AsyncExitStack() as stack,
         ):
-            opened = await stack.enter_async_context(_awaited(url, options))
-            site = FleetSite(opened, control=control, units=units, **web.site_arguments)
+            fleet = await stack.enter_async_context(_wait_for_fleet(url, options))
+            site = FleetSite(fleet, control=control, units=units, **web.site_arguments)
             await stack.enter_async_context(site)
             options.show({"page": site.url}, f"page: {site.url}")
             await asyncio.Event().wait()
 
 
 @contextlib.asynccontextmanager
-async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
-    """Open the fleet, once it has an agent."""
+async def _wait_for_fleet(url: str, options: Options) -> AsyncGenerator[Fleet]:
+    """Try to open the fleet until one of its agents answers, then yield it."""
     warned = False
     for delay in Backoff(maximum=2.0).delays():
-        opened = _opened(url, options)
+        fleet = _make_fleet(url, options)
         try:
-            await opened.open()
+            await fleet.open()
         except ConnectFailedError as exc:
             if not warned:
-                click.echo(f"{exc}; it is awaited", err=True)
+                click.echo(f"{exc}; waiting for it", err=True)
             warned = True
         else:
             try:
-                yield opened
+                yield fleet
             finally:
-                await opened.close()
+                await fleet.close()
             return
         await asyncio.sleep(delay)
 
@@ -326,23 +335,23 @@ async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
 @click.argument("url")
 @click.argument("pattern", default="**")
 @click.option("--input", "input_hex", metavar="HEX", help="Input data for the inspections.")
-@runs(*_READING, "--timeout", *OUTPUT)
+@async_command(*_READING_OPTIONS, "--timeout", *OUTPUT_OPTIONS)
 async def trigger(url: str, pattern: str, input_hex: str | None, options: Options) -> None:
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
-    as_text = options.result_text()
+    make_text = options.result_text()
     data = None if input_hex is None else from_hex(input_hex, "--input")
-    timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
-    async with _opened(url, options) as opened:
-        _require_cameras(opened)
-        outcomes = await opened.trigger(pattern, timeout=timeout, input=data)
+    timeout = options.step_timeout(DEFAULT_TRIGGER_TIMEOUT)
+    async with _make_fleet(url, options) as fleet:
+        _require_cameras(fleet)
+        outcomes = await fleet.trigger(pattern, timeout=timeout, input=data)
         codes: list[int] = []
         for name, outcome in sorted(outcomes.items()):
             if isinstance(outcome, SmartCamError):
                 codes.append(exit_code(outcome))
                 _show_error(name, outcome, codes[-1], options)
             else:
-                options.show(outcome, functools.partial(_named_text, opened, as_text))
+                options.show(outcome, functools.partial(_camera_result_text, fleet, make_text))
     if codes:
         raise SystemExit(codes[0])
 
@@ -354,4 +363,4 @@ def _show_error(
     if options.as_json:
         click.echo(error_json(error, text, code, **{kind: name}))
     else:
-        click.echo(f"{name}: {tinted('error', 'error:')} {text.removeprefix(f'{name}: ')}")
+        click.echo(f"{name}: {coloured('error', 'error:')} {text.removeprefix(f'{name}: ')}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam._cli.texts import table_text
 from smartcam._cli.usage import JsonErrors
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound="Callable[..., Any]")
 
 
-def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
-    """Return an option with any number of names."""
+def _names_option(option: str, variable: str, text: str) -> Callable[[F], F]:
+    """Declare an option that can be given any number of times, each time with a name."""
     return click.option(option, variable, multiple=True, metavar="NAME", help=text)
 
 
@@ -34,10 +34,10 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
     'rest stays. Needs the extra "fleet".',
 )
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
-@_names("--agent", "agents", "An agent, by its name in fleet.yaml.")
-@_names("--viewer", "viewers", "A program that may read.")
-@_names("--operator", "operators", "A program that may command, too.")
-@_names("--router", "routers", "A Zenoh router, zenohd.")
+@_names_option("--agent", "agents", "An agent, by its name in fleet.yaml.")
+@_names_option("--viewer", "viewers", "A program that may read.")
+@_names_option("--operator", "operators", "A program that may command, too.")
+@_names_option("--router", "routers", "A Zenoh router, zenohd.")
 @click.option(
     "--host",
     "hosts",
@@ -53,7 +53,7 @@ def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
     show_default=True,
     help="Days that new certificates are valid.",
 )
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def certificates(
     folder: Path,
     agents: tuple[str, ...],
@@ -67,25 +67,33 @@ async def certificates(
     """Make certificates."""
     from smartcam.fleet._inside import make_certificates
 
-    wanted = {"agent": agents, "viewer": viewers, "operator": operators, "router": routers}
-    made = await asyncio.to_thread(
-        make_certificates, folder, wanted, hosts=hosts, lifetime=timedelta(days=days)
+    names_by_role = {"agent": agents, "viewer": viewers, "operator": operators, "router": routers}
+    made_certificates = await asyncio.to_thread(
+        make_certificates, folder, names_by_role, hosts=hosts, lifetime=timedelta(days=days)
     )
     if options.as_json:
-        for files in made:
-            options.show(files._asdict(), "")
+        for certificate in made_certificates:
+            options.show(certificate._asdict(), "")
         return
-    if not made:
+    if not made_certificates:
         click.echo(f"{folder} has an authority, and no certificates yet: --agent, --viewer, ...")
         return
     head = ("name", "role", "", "until", "how to use it")
-    click.echo(table_text(head, [_row(files) for files in made]))
-
-
-def _row(made: MadeCertificate) -> tuple[str, ...]:
-    until = (
-        f"{made.ends:%Y-%m-%d}"
-        if made.ends - datetime.now(UTC) > timedelta(days=2)
-        else (f"{made.ends:%Y-%m-%d %H:%M} UTC")
+    click.echo(
+        table_text(head, [_certificate_row(certificate) for certificate in made_certificates])
     )
-    return made.name, made.role, made.done, until, f"{made.folder}/how-to-use.txt"
+
+
+def _certificate_row(certificate: MadeCertificate) -> tuple[str, ...]:
+    end_text = (
+        f"{certificate.ends:%Y-%m-%d}"
+        if certificate.ends - datetime.now(UTC) > timedelta(days=2)
+        else (f"{certificate.ends:%Y-%m-%d %H:%M} UTC")
+    )
+    return (
+        certificate.name,
+        certificate.role,
+        certificate.done,
+        end_text,
+        f"{certificate.folder}/how-to-use.txt",
+    )

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, option
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import first
+from smartcam._cli.running import run_until_first
 from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.depth import ColourRange
     from smartcam.web import ColourSite
 
-LINGER: Final = 3.0
+LINGER_TIME: Final = 3.0
 """Seconds for which the device continues streaming after the last request of a page."""
 
 
@@ -31,26 +31,26 @@ LINGER: Final = 3.0
 @click.argument("url")
 @click.option(
     "--range",
-    "begin",
+    "initial_range",
     metavar="JSON",
     help="Range at the beginning, as the page copies it, such as '{\"value\": [0, 60]}'.",
 )
 @page_options(always=True)
 @option("--seconds")
 @option("--timeout", help="Longest wait for a frame.  [default: 5]")
-@runs(*OUTPUT)
-async def colours(url: str, begin: str | None, web: PageOptions, options: Options) -> None:
+@async_command(*OUTPUT_OPTIONS)
+async def colours(url: str, initial_range: str | None, web: PageOptions, options: Options) -> None:
     """Serve the page."""
     from smartcam.frames import open as open_frames
     from smartcam.frames._inside import FRAME_TIMEOUT
 
     with from_part("depth", "smartcam frames colours needs"):
         from smartcam.web import ColourSite
-    seconds = options.step(FRAME_TIMEOUT)
-    source = open_frames(url, timeout=seconds, stall=seconds, linger=LINGER)
-    site = ColourSite(source, colours=_range(begin), **web.site_arguments)
+    seconds = options.step_timeout(FRAME_TIMEOUT)
+    source = open_frames(url, timeout=seconds, stall=seconds, linger=LINGER_TIME)
+    site = ColourSite(source, colours=_parse_range(initial_range), **web.site_arguments)
     async with source:
-        await first([_serve(site, options)], options.seconds)
+        await run_until_first([_serve(site, options)], options.seconds)
 
 
 async def _serve(site: ColourSite, options: Options) -> None:
@@ -59,16 +59,16 @@ async def _serve(site: ColourSite, options: Options) -> None:
         await asyncio.Event().wait()
 
 
-def _range(text: str | None) -> ColourRange | None:
-    """Return a range from JSON; raise ConfigurationError if it is not valid."""
+def _parse_range(text: str | None) -> ColourRange | None:
+    """Return the range of a JSON text, None without a text; ConfigurationError: it is not valid."""
     with from_part("depth", "smartcam frames colours needs"):
         from smartcam.depth import ColourRange
 
     if text is None:
         return None
     try:
-        given: Any = json.loads(text)
-        return ColourRange(**given)
+        fields: Any = json.loads(text)
+        return ColourRange(**fields)
     except ConfigurationError as exc:
         raise ConfigurationError(f"--range: {exc}") from exc
     except (ValueError, TypeError) as exc:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.frame_sources import opened
-from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.frame_sources import make_source
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, option
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--execute", multiple=True, metavar="COMMAND", help="Execute a command.")
 @click.option("--save", metavar="SET", help="Have the device keep its features in a user set.")
 @option("--timeout", help="Longest time for each of these.  [default: 10]")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def features_command(
     url: str,
     features: Sequence[str],
@@ -39,15 +39,15 @@ async def features_command(
     from smartcam.frames._inside import FEATURE_TIMEOUT
     from smartcam.models import jsonable
 
-    seconds = options.step(FEATURE_TIMEOUT)
-    async with opened(url, options) as source:
-        for given in features:
-            name, equals, value = given.partition("=")
+    seconds = options.step_timeout(FEATURE_TIMEOUT)
+    async with make_source(url, options) as source:
+        for argument in features:
+            name, equals, value = argument.partition("=")
             feature = source.features[name]
             if equals:
                 await feature.set(value, timeout=seconds)
-            described = await feature.describe(timeout=seconds)
-            options.show(jsonable(described), str(described))
+            description = await feature.describe(timeout=seconds)
+            options.show(jsonable(description), str(description))
         if load is not None:
             await source.features.load(load, timeout=seconds)
         for command in execute:
@@ -55,8 +55,8 @@ async def features_command(
         if save is not None:
             await source.features.save(save, timeout=seconds)
         if not (features or load or execute or save):
-            for described in (await source.features.describe()).values():
-                options.show(jsonable(described), str(described))
+            for description in (await source.features.describe()).values():
+                options.show(jsonable(description), str(description))
 
 
 @click.command(
@@ -70,7 +70,7 @@ async def features_command(
 @click.argument("address")
 @click.option("--gateway", default="0.0.0.0", help="The camera's gateway.  [default: none]")  # noqa: S104
 @click.option("--yes", is_flag=True, help="Do not ask.")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def force_address_command(
     mac: str, address: str, gateway: str, yes: bool, options: Options
 ) -> None:

@@ -1,4 +1,4 @@
-"""Encode a frame as a file by its suffix; refuse a loss that the user did not ask for."""
+"""Encode a frame by its file's suffix; refuse a loss of bits that no option allows."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 MIN_NUMBER_DIGITS: Final = 4
-"""Least number of digits of the number in the name of one file of several."""
+"""Least number of digits of the numbers in the names of several files."""
 
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """The way frames become files.
+    """The options by which frames become files.
 
     Attributes:
         suffix: a key of :data:`SUFFIXES`.
         quality: quality of a JPEG, 1 to 100.
         grey: whether only the brightness is kept.
-        eight: True for the upper 8 bits of deeper pixels.
+        eight_bits: whether only the upper 8 bits of deeper pixels are kept.
     """
 
     suffix: str
     quality: int
     grey: bool = False
-    eight: bool = False
+    eight_bits: bool = False
 
     def encode(self, frame: Frame) -> bytes:
         """Return a file's bytes; this takes milliseconds, so call it in a thread.
 
         Raises:
-            ConfigurationError: bits would be lost without the user's consent.
+            ConfigurationError: the format would lose bits, and no option allows that.
             FrameFormatError: the frame's bytes are wrong.
             MissingExtraError: a codec is not installed.
         """
         return SUFFIXES[self.suffix](frame, self)
 
 
-def numbered(file: str, count: int) -> list[str]:
+def numbered_names(file: str, count: int) -> list[str]:
     """Return the names of ``count`` files: ``x-0001.png``; a single file keeps its name."""
     if count == 1:
         return [file]
@@ -56,65 +56,67 @@ def numbered(file: str, count: int) -> list[str]:
     return [str(path.with_stem(name)) for name in names]
 
 
-def _levels(frame: Frame, how: Encoding) -> NDArray[Any]:
+def _encoded_pixels(frame: Frame, encoding: Encoding) -> NDArray[Any]:
     import numpy as np
 
     from smartcam.web._inside import picture
 
-    seen = picture(frame, grey=how.grey)
-    if how.eight and seen.dtype != np.uint8:
-        seen = (seen >> (frame.format.depth - 8)).astype(np.uint8)
-    return seen
+    pixels = picture(frame, grey=encoding.grey)
+    if encoding.eight_bits and pixels.dtype != np.uint8:
+        pixels = (pixels >> (frame.format.depth - 8)).astype(np.uint8)
+    return pixels
 
 
-def _raw(frame: Frame, _how: Encoding) -> bytes:
+def _raw(frame: Frame, _encoding: Encoding) -> bytes:
     return bytes(frame.data)
 
 
-def _npy(frame: Frame, how: Encoding) -> bytes:
+def _npy(frame: Frame, encoding: Encoding) -> bytes:
     import numpy as np
 
-    levels = _levels(frame, how) if how.grey or how.eight else frame.array()
+    pixels = (
+        _encoded_pixels(frame, encoding) if encoding.grey or encoding.eight_bits else frame.array()
+    )
     stream = io.BytesIO()
-    np.save(stream, levels, allow_pickle=False)
+    np.save(stream, pixels, allow_pickle=False)
     return stream.getvalue()
 
 
-def _jpeg(frame: Frame, how: Encoding) -> bytes:
+def _jpeg(frame: Frame, encoding: Encoding) -> bytes:
     import numpy as np
 
     from smartcam.web._inside import encoded, is_whole_jpeg
 
-    if not how.grey and is_whole_jpeg(frame):
+    if not encoding.grey and is_whole_jpeg(frame):
         return bytes(frame.data)
-    levels = _levels(frame, how)
-    if levels.dtype != np.uint8:
+    pixels = _encoded_pixels(frame, encoding)
+    if pixels.dtype != np.uint8:
         raise ConfigurationError(
             f"{frame.source} sends {frame.format.name}, and a JPEG has 8 bits: expected a name "
             "that ends with .png, .jxl, .npy or .raw, which keep all bits, or --8-bit, which keeps "
             "the upper 8"
         )
-    return encoded(frame, levels, how.quality)
+    return encoded(frame, pixels, encoding.quality)
 
 
-def _png(frame: Frame, how: Encoding) -> bytes:
-    return _lossless(frame, how, "PNG", "png_encode")
+def _png(frame: Frame, encoding: Encoding) -> bytes:
+    return _lossless(frame, encoding, "PNG", "png_encode")
 
 
-def _jxl(frame: Frame, how: Encoding) -> bytes:
-    return _lossless(frame, how, "JPEGXL", "jpegxl_encode", lossless=True)
+def _jxl(frame: Frame, encoding: Encoding) -> bytes:
+    return _lossless(frame, encoding, "JPEGXL", "jpegxl_encode", lossless=True)
 
 
-def _lossless(frame: Frame, how: Encoding, format: str, encode: str, **options: Any) -> bytes:
+def _lossless(frame: Frame, encoding: Encoding, format: str, encode: str, **options: Any) -> bytes:
     import numpy as np
 
     from smartcam._extras import load
 
-    if frame.format.name == format and not (how.grey or how.eight):
+    if frame.format.name == format and not (encoding.grey or encoding.eight_bits):
         return bytes(frame.data)
-    levels = np.ascontiguousarray(_levels(frame, how))
-    made: bytes = getattr(load("imagecodecs"), encode)(levels, **options)
-    return made
+    pixels = np.ascontiguousarray(_encoded_pixels(frame, encoding))
+    data: bytes = getattr(load("imagecodecs"), encode)(pixels, **options)
+    return data
 
 
 SUFFIXES: Mapping[str, Callable[[Frame, Encoding], bytes]] = {
@@ -125,4 +127,4 @@ SUFFIXES: Mapping[str, Callable[[Frame, Encoding], bytes]] = {
     ".png": _png,
     ".raw": _raw,
 }
-"""The function that makes a file, by the suffix of its name in lower case."""
+"""The function that encodes a frame, by the suffix of the file's name in lower case."""

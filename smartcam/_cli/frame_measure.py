@@ -1,4 +1,4 @@
-"""Measure a source of frames: rate, jitter, age, latency, losses, processor."""
+"""Measure a source of frames: rate, jitter, age, latency, losses, load of the processor."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STAMP_ROWS: Final = 16
 """Number of rows of a picture that a stamp covers."""
 
 MAX_LATENCY: Final = 60.0
-"""Largest plausible latency, seconds; a larger or negative one shows another machine's clock."""
+"""Largest plausible latency, seconds; beyond it, or below 0, the stamp is of another clock."""
 
 
 async def measure(source: FrameSource, seconds: float) -> dict[str, Any]:
@@ -38,24 +38,24 @@ async def measure(source: FrameSource, seconds: float) -> dict[str, Any]:
             first = await anext(reader)
         except StopAsyncIteration:
             raise FrameSourceError(f"{source.name}: it ended before its first frame") from None
-        taken = _Taken(first)
-        begun, cpu = time.monotonic(), time.process_time()
+        received = _ReceivedFrames(first)
+        started_at, cpu_start = time.monotonic(), time.process_time()
         try:
             async with asyncio.timeout(seconds):
-                await taken.read(reader)
+                await received.read(reader)
         except TimeoutError as exc:
             if isinstance(exc, FrameSourceError):  # a FrameTimeoutError is a timeout, too
                 raise
         finally:
-            elapsed = time.monotonic() - begun
-            used = time.process_time() - cpu
-            await taken.stamps.settle()
+            elapsed = time.monotonic() - started_at
+            cpu_time = time.process_time() - cpu_start
+            await received.stamps.wait_for_search()
         return {
             "source": source.name,
             **_picture(first),
             "seconds": elapsed,
-            **taken.figures(),
-            "cpu_percent": 100 * used / elapsed if elapsed else None,
+            **received.figures(),
+            "cpu_percent": 100 * cpu_time / elapsed if elapsed else None,
         }
 
 
@@ -65,28 +65,31 @@ def _picture(frame: Frame) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Stamps:
-    """Latencies by the stamps in pictures, read in a thread of their own."""
+    """Measures latencies by the stamps in pictures, which a thread reads."""
 
     latencies: list[float] = field(default_factory=list[float])
     _last: float = -math.inf
     _task: asyncio.Task[None] | None = None
 
-    def offer(self, frame: Frame, now: float) -> None:
-        """Look for the stamp of some frames; ``now``: arrival of this frame."""
+    def look_for_stamp(self, frame: Frame, now: float) -> None:
+        """Look for a stamp in the frame, if the last search is over and not too recent.
+
+        ``now``: time of the frame's arrival.
+        """
         if now - self._last < STAMP_PERIOD or not (self._task is None or self._task.done()):
             return
         self._last = now
-        self._task = asyncio.create_task(self._look(frame, now))
+        self._task = asyncio.create_task(self._read_stamp(frame, now))
 
-    async def settle(self) -> None:
-        """Wait for the last search."""
+    async def wait_for_search(self) -> None:
+        """Wait until the running search for a stamp ends."""
         if self._task is not None:
             await asyncio.wait([self._task])
 
-    async def _look(self, frame: Frame, now: float) -> None:
+    async def _read_stamp(self, frame: Frame, arrived_at: float) -> None:
         stamp = await asyncio.to_thread(_stamp_of, frame)
-        if stamp is not None and 0 <= now - stamp < MAX_LATENCY:
-            self.latencies.append(now - stamp)
+        if stamp is not None and 0 <= arrived_at - stamp < MAX_LATENCY:
+            self.latencies.append(arrived_at - stamp)
 
 
 def _stamp_of(frame: Frame) -> float | None:
@@ -99,8 +102,11 @@ def _stamp_of(frame: Frame) -> float | None:
     return None if stamp is None else stamp[1] / 1e9
 
 
-class _Taken:
-    """The frames from a reader, including the first."""
+class _ReceivedFrames:
+    """Reads frames from a reader and keeps what the figures need.
+
+    ``first``: the frame that was read already.
+    """
 
     def __init__(self, first: Frame) -> None:
         self.stamps = _Stamps()
@@ -109,7 +115,7 @@ class _Taken:
         self._ages: list[float] = []
         self._frames_received = 1
         self._delivered = self._skipped = self._lost = 0
-        self._note(first)
+        self._note_frame(first)
 
     async def read(self, reader: FrameReader) -> None:
         """Read to the end of the source."""
@@ -123,15 +129,15 @@ class _Taken:
             self._delivered, self._skipped = account.delivered, account.skipped
             self._lost = account.lost - lost
             self._last = frame
-            self._note(frame)
+            self._note_frame(frame)
 
-    def _note(self, frame: Frame) -> None:
+    def _note_frame(self, frame: Frame) -> None:
         now = time.monotonic()
         self._ages.append(now - frame.captured)
-        self.stamps.offer(frame, now)
+        self.stamps.look_for_stamp(frame, now)
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures; None for those that need more frames."""
+        """Return the figures; None for a figure that needs more frames."""
         span = self._last.captured - self._first.captured
         return {
             "frames": self._delivered,
@@ -164,15 +170,15 @@ def _deviation(values: Sequence[float]) -> float | None:
 
 
 def _spread(seconds: Sequence[float]) -> dict[str, float | None] | None:
-    """Return median, 99th percentile and maximum; milliseconds."""
+    """Return the median, the 99th percentile and the maximum, in milliseconds."""
     if not seconds:
         return None
     ordered = sorted(seconds)
-    places = {"median": 0.5, "p99": 0.99, "worst": 1.0}
-    return {name: _ms(ordered[round(part * (len(ordered) - 1))]) for name, part in places.items()}
+    shares = {"median": 0.5, "p99": 0.99, "worst": 1.0}
+    return {name: _ms(ordered[round(part * (len(ordered) - 1))]) for name, part in shares.items()}
 
 
-def measured_text(value: dict[str, Any]) -> str:
+def measurement_text(value: dict[str, Any]) -> str:
     """Return the measured rates, ages and latencies as lines for people."""
     head = f"{value['source']}: {value['format']} {value['width']}x{value['height']}"
     rows = [

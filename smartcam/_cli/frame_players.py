@@ -1,4 +1,4 @@
-"""Streams for players and recorders, beside the page: by RTSP, and by RTP."""
+"""Streams for players and recorders, in addition to the page: by RTSP, and by RTP."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ CHECK_INTERVAL = 0.1
 """Seconds between two checks whether a source is open."""
 
 DESCRIPTION_TIMEOUT = 5.0
-"""Seconds to wait for the first frame, which completes the description."""
+"""Longest time to wait for the first frame, which completes the description, seconds."""
 
 
 class Players(NamedTuple):
-    """The streams that are served beside the page.
+    """The streams that are served in addition to the page.
 
     Attributes:
         rtsp: address to listen on for RTSP, None for none.
@@ -45,54 +45,54 @@ class Players(NamedTuple):
     sdp: str | None = None
 
 
-def address(_context: object, parameter: click.Parameter, text: str | None) -> Any:
-    """Return the host and port of ``HOST:PORT``, None for None."""
+def parse_address_option(_context: object, parameter: click.Parameter, text: str | None) -> Any:
+    """Return host and port of an option ``HOST:PORT``, None if it is not given."""
     if text is None:
         return None
     host, colon, port = text.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
-    plain = host[1:-1] if bracketed else host
-    is_full = colon and plain and (bracketed or ":" not in host)
+    bare_host = host[1:-1] if bracketed else host
+    is_full = colon and bare_host and (bracketed or ":" not in host)
     if not (is_full and re.fullmatch(r"[0-9]{1,5}", port) and int(port) <= 65535):
         raise click.BadParameter(
             f"{text!r}: expected HOST:PORT, such as 127.0.0.1:8554 or [::1]:8554", param=parameter
         )
-    return plain, int(port)
+    return bare_host, int(port)
 
 
-def names_of(sources: Sequence[FrameSource]) -> dict[str, FrameSource]:
-    """Return sources by unique names that fit into a URL."""
-    named: dict[str, FrameSource] = {}
+def unique_names(sources: Sequence[FrameSource]) -> dict[str, FrameSource]:
+    """Give each source a unique name that fits into a URL; return the sources by name."""
+    by_name: dict[str, FrameSource] = {}
     for source in sources:
-        plain = (
+        base_name = (
             re.sub(r"[^A-Za-z0-9._~-]+", "-", source.name)[:MAX_NAME_LETTERS].strip("-._~")
             or "camera"
         )
-        numbered = (f"{plain}-{number}" for number in range(2, len(sources) + 2))
-        named[next(name for name in (plain, *numbered) if name not in named)] = source
-    return named
+        numbered_names = (f"{base_name}-{number}" for number in range(2, len(sources) + 2))
+        by_name[next(name for name in (base_name, *numbered_names) if name not in by_name)] = source
+    return by_name
 
 
 # ---------------------------------------------------------------------- RTSP
 
 
 def rtsp_server(
-    sources: Sequence[FrameSource], place: tuple[str, int], token: str | None
+    sources: Sequence[FrameSource], listen_address: tuple[str, int], token: str | None
 ) -> tuple[RtspServer, str | None]:
-    """Return a server of sources, and its password, None for none.
+    """Return a server of sources, and its password, None if it needs none.
 
-    ``token``: the page's token, which is the password, too. If there is none, and other machines
-    can reach the server, one is made.
+    ``token``: the page's token, which is also the password. Without a token, a password is made if
+    other machines can reach the server.
     """
     from smartcam._accepting import is_loopback
     from smartcam.frames import RtspServer
     from smartcam.web._inside import new_token
 
-    host, port = place
+    host, port = listen_address
     password = token or (None if is_loopback(host) else new_token())
     user = None if password is None else RTSP_USER
-    named = names_of(sources)
-    return RtspServer(named, host=host, port=port, user=user, password=password), password
+    by_name = unique_names(sources)
+    return RtspServer(by_name, host=host, port=port, user=user, password=password), password
 
 
 def rtsp_urls(
@@ -100,56 +100,63 @@ def rtsp_urls(
 ) -> dict[str, str]:
     """Return the URLs for players, by name."""
     login = "" if password is None else f"{RTSP_USER}:{password}@"
-    return {name: server.url(name).replace("//", f"//{login}", 1) for name in names_of(sources)}
+    return {name: server.url(name).replace("//", f"//{login}", 1) for name in unique_names(sources)}
 
 
 # ---------------------------------------------------------------------- RTP
 
 
 async def send_rtp(source: FrameSource, players: Players, options: Options) -> None:
-    """Send a source by RTP whenever it is open, until cancelled; print the description for players.
+    """Send a source by RTP whenever it is open, until cancelled; publish its SDP description.
 
     Raises ConfigurationError: the address is not valid, or the file cannot be written.
     """
     from smartcam.frames import RtpSender
 
     host, port = players.rtp or ("", 0)
-    to = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-    described, noted, delays = "", "", Backoff().delays()
+    receiver = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    last_sdp, last_note, delays = "", "", Backoff().delays()
     while True:
         try:
-            async with RtpSender(source, to) as sender:
-                await _first_frame(sender)
-                if sender.sdp != described and (players.sdp is not None or not described):
-                    await _describe(to, sender.sdp, players.sdp, options, again=bool(described))
-                    described = sender.sdp
-                noted, delays = "", Backoff().delays()
+            async with RtpSender(source, receiver) as sender:
+                await _wait_for_frame(sender)
+                if sender.sdp != last_sdp and (players.sdp is not None or not last_sdp):
+                    await _describe(
+                        receiver, sender.sdp, players.sdp, options, is_update=bool(last_sdp)
+                    )
+                    last_sdp = sender.sdp
+                last_note, delays = "", Backoff().delays()
                 await sender.wait()
         except LocalProtocolError:  # the source is not open
             await asyncio.sleep(CHECK_INTERVAL)
             continue
         except FrameSourceError as exc:
-            if str(exc) != noted:
-                click.echo(f"note: {exc}; RTP is tried again", err=True)
-            noted = str(exc)
+            if str(exc) != last_note:
+                click.echo(f"note: {exc}; trying RTP again", err=True)
+            last_note = str(exc)
         await asyncio.sleep(next(delays))
 
 
-async def _first_frame(sender: RtpSender) -> None:
-    """Wait for the first frame, but not for long."""
+async def _wait_for_frame(sender: RtpSender) -> None:
+    """Wait for the first frame, at most :data:`DESCRIPTION_TIMEOUT` seconds."""
     for _ in range(round(DESCRIPTION_TIMEOUT / CHECK_INTERVAL)):
         if sender.statistics().frames:
             return
         await asyncio.sleep(CHECK_INTERVAL)
 
 
-async def _describe(to: str, sdp: str, file: str | None, options: Options, *, again: bool) -> None:
-    """Write the description to a file, or show it."""
+async def _describe(
+    receiver: str, sdp: str, file: str | None, options: Options, *, is_update: bool
+) -> None:
+    """Write the SDP description to the file, if there is one, and show it once.
+
+    ``is_update``: a description was shown before.
+    """
     if file is not None:
         try:
             await asyncio.to_thread(Path(file).write_text, sdp, "utf-8")
         except OSError as exc:
             raise ConfigurationError(f"--sdp {file}: {exc.strerror}") from exc
-    if not again:
-        text = f"rtp: {to}\n" + (f"sdp: {file}" if file is not None else sdp.strip())
-        options.show({"rtp": to, "sdp": sdp}, text.replace("\r", ""))
+    if not is_update:
+        text = f"rtp: {receiver}\n" + (f"sdp: {file}" if file is not None else sdp.strip())
+        options.show({"rtp": receiver, "sdp": sdp}, text.replace("\r", ""))

@@ -16,13 +16,13 @@ def is_source(text: str) -> bool:
     return "://" in text
 
 
-def opened(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
-    """Return an unopened source; without a frame for ``--timeout`` seconds it counts as stuck.
+def make_source(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
+    """Return an unopened source, which fails without a frame for ``--timeout`` seconds.
 
     Raises ConfigurationError: the URL is wrong.
     """
     from smartcam.frames import open as open_frames
     from smartcam.frames._inside import FRAME_TIMEOUT
 
-    seconds = options.step(FRAME_TIMEOUT)
+    seconds = options.step_timeout(FRAME_TIMEOUT)
     return open_frames(url, timeout=seconds, stall=seconds, linger=linger)

@@ -12,12 +12,12 @@ import click
 
 from smartcam._cli.frame_colours import colours
 from smartcam._cli.frame_features import features_command, force_address_command
-from smartcam._cli.frame_files import SUFFIXES, Encoding, numbered
-from smartcam._cli.frame_measure import measure, measured_text
-from smartcam._cli.frame_sources import TIMEOUT, opened
+from smartcam._cli.frame_files import SUFFIXES, Encoding, numbered_names
+from smartcam._cli.frame_measure import measure, measurement_text
+from smartcam._cli.frame_sources import TIMEOUT, make_source
 from smartcam._cli.frames_record import record
 from smartcam._cli.frames_serve import serve, show
-from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, option
 from smartcam._cli.usage import ListedGroup
 from smartcam.exceptions import (
     ConfigurationError,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames import FoundSource, Frame, FrameSource
 
-MAX_GRABBED = 100_000
+MAX_FILES = 100_000
 """Largest number of files that one command writes."""
 
 
@@ -62,30 +62,30 @@ frames.add_command(force_address_command)
 )
 @click.option("--scheme", metavar="SCHEME", help="Only search for this scheme, such as v4l2.")
 @option("--timeout", help="Longest time of the search.  [default: 5]")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def list_(scheme: str | None, options: Options) -> None:
     from smartcam.frames._inside import FRAME_TIMEOUT
     from smartcam.registry import FRAMES
 
-    known = [info.name for info in FRAMES.available()]
-    schemes = known if scheme is None else [scheme]
-    seconds = options.step(FRAME_TIMEOUT)
-    looks = await asyncio.gather(*(_look(name, seconds) for name in schemes))
-    shown: set[str] = set()
-    searched = [name for name, look in zip(schemes, looks, strict=True) if look is not None]
-    for name, look in zip(schemes, looks, strict=True):
-        if look is None:
+    all_schemes = [info.name for info in FRAMES.available()]
+    schemes = all_schemes if scheme is None else [scheme]
+    seconds = options.step_timeout(FRAME_TIMEOUT)
+    searches = await asyncio.gather(*(_search(name, seconds) for name in schemes))
+    shown_urls: set[str] = set()
+    searched = [name for name, search in zip(schemes, searches, strict=True) if search is not None]
+    for name, search in zip(schemes, searches, strict=True):
+        if search is None:
             continue
-        if isinstance(look, Exception):
-            if isinstance(look, ConfigurationError) and scheme is not None:
-                raise look
-            _show_broken(name, look, options)
+        if isinstance(search, Exception):
+            if isinstance(search, ConfigurationError) and scheme is not None:
+                raise search
+            _show_search_error(name, search, options)
             continue
-        for source in look:
-            if source.url not in shown:
-                shown.add(source.url)
-                options.show(_found(source), _found_text)
-    if not shown and not options.as_json:
+        for source in search:
+            if source.url not in shown_urls:
+                shown_urls.add(source.url)
+                options.show(_source_data(source), _source_text)
+    if not shown_urls and not options.as_json:
         click.echo(
             f"nothing found; looked for: {', '.join(searched)}"
             if searched
@@ -93,10 +93,10 @@ async def list_(scheme: str | None, options: Options) -> None:
         )
 
 
-async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
+async def _search(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
     """Return the sources that a scheme's driver finds, None if the driver has no search.
 
-    The error of a broken driver is returned, so that it affects only the line of its scheme.
+    The error of a failed search is returned and not raised, so that the other schemes are listed.
     """
     from smartcam.frames import discover
     from smartcam.registry import FRAMES
@@ -108,7 +108,7 @@ async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | 
             return await discover(scheme)
     except TimeoutError:
         return FrameSourceError(f"the search took longer than {seconds:g} s")
-    except Exception as exc:  # noqa: BLE001 - a plug-in's, whatever it is
+    except Exception as exc:  # noqa: BLE001 - a plug-in may raise anything
         return exc
 
 
@@ -118,35 +118,35 @@ def _has_no_search(driver: Any) -> bool:
     return next(kind for kind in driver.__mro__ if "discover" in vars(kind)) is FrameDriver
 
 
-def _show_broken(scheme: str, error: Exception, options: Options) -> None:
+def _show_search_error(scheme: str, error: Exception, options: Options) -> None:
     reason = str(error) if isinstance(error, (SmartCamError, OSError)) else repr(error)
     options.show({"scheme": scheme, "error": reason}, f"{scheme}: the search failed: {reason}")
 
 
-def _found(source: FoundSource) -> dict[str, Any]:
-    """Return the name, formats and remark of a found source, as values for JSON."""
+def _source_data(source: FoundSource) -> dict[str, Any]:
+    """Return the URL, name, formats and remark of a found source, as values for JSON."""
     return {
         "url": source.url,
         "name": source.name,
         "formats": [
             {
-                "format": each.format.name,
-                "width": each.width,
-                "height": each.height,
-                "rates": list(each.rates),
+                "format": stream_format.format.name,
+                "width": stream_format.width,
+                "height": stream_format.height,
+                "rates": list(stream_format.rates),
             }
-            for each in source.formats
+            for stream_format in source.formats
         ],
         "remark": source.remark,
     }
 
 
-def _found_text(value: dict[str, Any]) -> str:
+def _source_text(value: dict[str, Any]) -> str:
     lines = [f"{value['url']}  {value['name']}"]
-    for each in value["formats"]:
-        rates = ", ".join(f"{rate:g}" for rate in each["rates"])
+    for entry in value["formats"]:
+        rates = ", ".join(f"{rate:g}" for rate in entry["rates"])
         at = f" at {rates}/s" if rates else ""
-        lines.append(f"  {each['format']} {each['width']}x{each['height']}{at}")
+        lines.append(f"  {entry['format']} {entry['width']}x{entry['height']}{at}")
     if value["remark"]:
         lines.append(f"  {value['remark']}")
     return "\n".join(lines)
@@ -155,7 +155,7 @@ def _found_text(value: dict[str, Any]) -> str:
 # ---------------------------------------------------------------------- grab
 
 
-def _suffix(_context: object, _option: object, file: str) -> str:
+def _check_suffix(_context: object, _option: object, file: str) -> str:
     if Path(file).suffix.lower() not in SUFFIXES:
         raise click.BadParameter(f"{file}: expected a name that ends with {', '.join(SUFFIXES)}")
     return file
@@ -168,11 +168,11 @@ def _suffix(_context: object, _option: object, file: str) -> str:
     'are written unchanged. Needs the extra "frames", but for .npy and .raw.'
 )
 @click.argument("url")
-@option("--output", required=True, callback=_suffix)
+@option("--output", required=True, callback=_check_suffix)
 @option("--force")
 @option(
     "--count",
-    type=click.IntRange(1, MAX_GRABBED),
+    type=click.IntRange(1, MAX_FILES),
     help="Number of frames to write; with several, the names get numbers.",
 )
 @click.option(
@@ -187,7 +187,7 @@ def _suffix(_context: object, _option: object, file: str) -> str:
     "URL must set the device to triggers, such as gige://HOST?trigger=Software.",
 )
 @click.option("--grey", is_flag=True, help="Keep only the brightness.")
-@click.option("--8-bit", "eight", is_flag=True, help="Keep the upper 8 of more than 8 bits.")
+@click.option("--8-bit", "eight_bits", is_flag=True, help="Keep the upper 8 of more than 8 bits.")
 @click.option(
     "--quality",
     type=click.IntRange(1, 100),
@@ -196,7 +196,7 @@ def _suffix(_context: object, _option: object, file: str) -> str:
     help="Quality of a JPEG that is made here.",
 )
 @option("--timeout", help=TIMEOUT)
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def grab(
     url: str,
     output: str,
@@ -204,7 +204,7 @@ async def grab(
     after_now: bool,
     trigger: bool,
     grey: bool,
-    eight: bool,
+    eight_bits: bool,
     quality: int,
     options: Options,
 ) -> None:
@@ -213,41 +213,44 @@ async def grab(
     suffix = Path(output).suffix.lower()
     if trigger and after_now:
         raise click.UsageError("--trigger includes --after-now: leave --after-now out")
-    if suffix == ".raw" and (grey or eight):
+    if suffix == ".raw" and (grey or eight_bits):
         raise click.UsageError("a .raw file has the bytes as they came: no --grey or --8-bit")
-    files = numbered(output, options.count or 1)
-    _check_free(files, force)
-    encoding = Encoding(suffix, quality, grey, eight)
-    async with opened(url, options) as source, source.reader() as reader:
-        wait = options.step(FRAME_TIMEOUT)
+    files = numbered_names(output, options.count or 1)
+    _check_output_paths(files, force)
+    encoding = Encoding(suffix, quality, grey, eight_bits)
+    async with make_source(url, options) as source, source.reader() as reader:
+        timeout = options.step_timeout(FRAME_TIMEOUT)
         if trigger:
-            coming: Any = source.trigger(timeout=wait)
+            next_frame: Any = source.trigger(timeout=timeout)
         else:
-            coming = reader.after(time.monotonic(), timeout=wait) if after_now else anext(reader)
-        frame = await _next(coming, source, 0, len(files))
-        for done, file in enumerate(files, 1):
+            next_frame = (
+                reader.after(time.monotonic(), timeout=timeout) if after_now else anext(reader)
+            )
+        frame = await _await_frame(next_frame, source, 0, len(files))
+        for written_count, file in enumerate(files, 1):
             data = await asyncio.to_thread(encoding.encode, frame)
             await asyncio.to_thread(_write, file, data)
-            options.show(*_grabbed(file, len(data), frame))
-            if done < len(files):
-                coming = source.trigger(timeout=wait) if trigger else anext(reader)
-                frame = await _next(coming, source, done, len(files))
+            options.show(*_describe_file(file, len(data), frame))
+            if written_count < len(files):
+                next_frame = source.trigger(timeout=timeout) if trigger else anext(reader)
+                frame = await _await_frame(next_frame, source, written_count, len(files))
         account = reader.statistics()
     if len(files) > 1 and not trigger and (account.skipped or account.lost):
         click.echo(f"note: {account.skipped} skipped, {account.lost} lost", err=True)
 
 
-async def _next(coming: Any, source: FrameSource, done: int, wanted: int) -> Frame:
+async def _await_frame(next_frame: Any, source: FrameSource, count: int, expected: int) -> Frame:
+    """Return the next frame; if the source has ended, raise an error with the count so far."""
     try:
-        frame: Frame = await coming
+        frame: Frame = await next_frame
     except StopAsyncIteration:
         raise FrameSourceError(
-            f"{source.name}: it ended after {done} frames; expected {wanted}", source=source.name
+            f"{source.name}: it ended after {count} frames; expected {expected}", source=source.name
         ) from None
     return frame
 
 
-def _grabbed(file: str, size: int, frame: Frame) -> tuple[dict[str, Any], str]:
+def _describe_file(file: str, size: int, frame: Frame) -> tuple[dict[str, Any], str]:
     """Return the description of a written frame, as values for JSON and as text."""
     value = {
         "file": file,
@@ -271,7 +274,8 @@ def _grabbed(file: str, size: int, frame: Frame) -> tuple[dict[str, Any], str]:
     return value, text
 
 
-def _check_free(files: Sequence[str], force: bool) -> None:
+def _check_output_paths(files: Sequence[str], force: bool) -> None:
+    """Raise ConfigurationError if the folder is missing, or a file must not be replaced."""
     folder = Path(files[0]).parent
     if not folder.is_dir():
         raise ConfigurationError(f"{files[0]}: there is no folder {folder}")
@@ -300,13 +304,13 @@ def _write(file: str, data: bytes) -> None:
 @click.argument("url")
 @option("--seconds", default=5.0, show_default=True, help="Seconds from the first frame on.")
 @option("--timeout", help=TIMEOUT)
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def measure_command(url: str, options: Options) -> None:
     from smartcam.models import jsonable
 
-    async with opened(url, options) as source:
+    async with make_source(url, options) as source:
         value = await measure(source, options.seconds or 5.0)
-    options.show(jsonable(value), measured_text)
+    options.show(jsonable(value), measurement_text)
 
 
 frames.add_command(colours)

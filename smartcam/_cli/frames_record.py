@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.frame_sources import TIMEOUT, opened
-from smartcam._cli.options import OUTPUT, Options, option, runs
-from smartcam._cli.running import first
+from smartcam._cli.frame_sources import TIMEOUT, make_source
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, option
+from smartcam._cli.running import run_until_first
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -86,7 +86,7 @@ class _Amount(_AmountType):
     help="Size of all files of a folder; the oldest are deleted.  [default: 10 GB]",
 )
 @option("--timeout", help=TIMEOUT)
-@runs(*OUTPUT, interrupted=0)
+@async_command(*OUTPUT_OPTIONS, interrupt_code=0)
 async def record(
     url: str,
     output: str,
@@ -101,9 +101,9 @@ async def record(
     from smartcam.recording._inside import file_name
 
     bounds = {"size": size, "age": age, "keep": keep}
-    given = {name: bound for name, bound in bounds.items() if bound is not None}
-    recorder = _recorder(output, given, force=force)
-    async with opened(url, options) as source:
+    set_bounds = {name: bound for name, bound in bounds.items() if bound is not None}
+    recorder = _make_recorder(output, set_bounds, force=force)
+    async with make_source(url, options) as source:
         recorder.open()
         try:
             if isinstance(recorder, Recorder):
@@ -114,11 +114,13 @@ async def record(
             )
             await _record(source, recorder, options.name or file_name(source.name), options)
         finally:
-            await _end(recorder, source.statistics().lost, options)
+            await _close_and_report(recorder, source.statistics().lost, options)
 
 
-def _recorder(output: str, bounds: dict[str, float], *, force: bool) -> Recorder | RotatingRecorder:
-    """Return the recorder for a path: of a recording, a video, or a folder."""
+def _make_recorder(
+    output: str, bounds: dict[str, float], *, force: bool
+) -> Recorder | RotatingRecorder:
+    """Return the recorder for a file (a recording or a video), or for a folder."""
     from smartcam.recording import Recorder, RotatingRecorder
 
     suffix = Path(output).suffix.lower()
@@ -134,42 +136,46 @@ def _recorder(output: str, bounds: dict[str, float], *, force: bool) -> Recorder
             f"{output}: expected FILE.mcap, FILE.mkv, or a folder, whose name has no suffix",
             param_hint="'-o' / '--output'",
         )
-    return RotatingRecorder(output, on_trouble=_tell_trouble, **bounds)
+    return RotatingRecorder(output, on_trouble=_report_trouble, **bounds)
 
 
-def _tell_trouble(trouble: RecordingError | None) -> None:
-    text = "it is recorded again" if trouble is None else f"{trouble}; pictures are lost"
+def _report_trouble(trouble: RecordingError | None) -> None:
+    text = "recording again" if trouble is None else f"{trouble}; pictures are lost"
     click.echo(f"smartcam: note: {text}", err=True)
 
 
 async def _record(
     source: FrameSource, recorder: Recorder | RotatingRecorder, name: str, options: Options
 ) -> None:
-    """Record for the time or number that the options set."""
-    began = asyncio.Event()
+    """Record until the source ends, or the count or time of the options is reached."""
+    started = asyncio.Event()
 
-    async def pictures() -> None:
-        await recorder.record(source, camera=name, count=options.count, on_start=began.set)
+    async def record_pictures() -> None:
+        await recorder.record(source, camera=name, count=options.count, on_start=started.set)
 
-    async def bound(seconds: float) -> None:
-        await began.wait()
+    async def stop_after(seconds: float) -> None:
+        await started.wait()
         await asyncio.sleep(seconds)
 
-    jobs = [pictures()]
+    jobs = [record_pictures()]
     if options.seconds is not None:
-        jobs.append(bound(options.seconds))
-    await first(jobs, None)
+        jobs.append(stop_after(options.seconds))
+    await run_until_first(jobs, None)
 
 
-async def _end(recorder: Recorder | RotatingRecorder, lost: int, options: Options) -> None:
-    """End the recording and report its contents; a file without a picture is removed."""
+async def _close_and_report(
+    recorder: Recorder | RotatingRecorder, lost: int, options: Options
+) -> None:
+    """Close the recording and report its contents; remove a file without a picture."""
     from smartcam.recording import RotatingRecorder
 
     await asyncio.to_thread(recorder.close)
     if isinstance(recorder, RotatingRecorder):
         for name, account in recorder.accounts.items():
             value = {"camera": name, "pictures": account.written, "left_out": account.lost}
-            _show(f"{recorder.path}: {name}", {"file": str(recorder.path), **value}, lost, options)
+            _show_account(
+                f"{recorder.path}: {name}", {"file": str(recorder.path), **value}, lost, options
+            )
         return
     counts = recorder.counts
     if not counts.pictures:
@@ -178,10 +184,10 @@ async def _end(recorder: Recorder | RotatingRecorder, lost: int, options: Option
     for path in recorder.files:
         size = path.stat().st_size
         value = {"pictures": counts.pictures, "left_out": counts.left_out, "bytes": size}
-        _show(str(path), {"file": str(path), **value}, lost, options)
+        _show_account(str(path), {"file": str(path), **value}, lost, options)
 
 
-def _show(label: str, value: dict[str, Any], lost: int, options: Options) -> None:
+def _show_account(label: str, value: dict[str, Any], lost: int, options: Options) -> None:
     value["lost"] = lost
     counts = f"pictures {value['pictures']}, left out {value['left_out']}, lost {lost}"
     size = f"; {value['bytes']} bytes" if "bytes" in value else ""

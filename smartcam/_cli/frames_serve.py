@@ -1,4 +1,4 @@
-"""``smartcam frames serve`` and ``show``: pictures of some sources, for viewers and players."""
+"""``smartcam frames serve`` and ``show``: sources on a page, by RTSP and by RTP."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ import click
 from smartcam._cli.frame_players import (
     RTSP_USER,
     Players,
-    address,
-    names_of,
+    parse_address_option,
     rtsp_server,
     rtsp_urls,
     send_rtp,
+    unique_names,
 )
-from smartcam._cli.frame_sources import TIMEOUT, opened
-from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.frame_sources import TIMEOUT, make_source
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, option
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import first
+from smartcam._cli.running import run_until_first
 from smartcam.exceptions import (
     ConfigurationError,
     FrameFormatError,
@@ -40,17 +40,20 @@ MAX_SHOWN = 4
 """Largest number of sources side by side on a page."""
 
 PERMANENT_ERRORS = (ConfigurationError, FrameFormatError, UnsupportedError)
-"""Errors after which another try to open the source would fail, too."""
+"""Errors of a source after which every other try to open it would fail, too."""
 
 FIRST_TRY_TIMEOUT = 3.0
-"""Seconds to wait for the first try of each source, before the others are served."""
+"""Longest wait for the first try of each source, before the page is served, seconds."""
 
 PERIOD = 1.0
 """Seconds between two checks of the viewers."""
 
 
-def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Give a command the options of both commands; ``terminated``: exit code after SIGTERM."""
+def _serving_command(terminate_code: int) -> Callable[[Callable[..., Any]], Callable[..., None]]:
+    """Declare the options that ``serve`` and ``show`` share.
+
+    ``terminate_code``: exit code after SIGTERM.
+    """
     parts: list[Any] = [
         click.argument("urls", metavar="URL...", nargs=-1, required=True),
         click.option(
@@ -68,7 +71,7 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
         page_options(always=True),
         option("--seconds"),
         option("--timeout", help=TIMEOUT),
-        runs(*OUTPUT, terminated=terminated),
+        async_command(*OUTPUT_OPTIONS, terminate_code=terminate_code),
     ]
 
     def decorate(function: Callable[..., Any]) -> Callable[..., None]:
@@ -82,23 +85,23 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
 @click.command(
     help=f"Serve pictures of one source, or of up to {MAX_SHOWN}, until Ctrl-C or SIGTERM: a page "
     "with all of them side by side, and for players and recorders RTSP or RTP. The addresses "
-    "go to stdout, the readers, on a terminal, to stderr. A device streams while it has readers; "
-    'a missing device is awaited, and the others go on. Needs the extras "web" and "frames", '
-    'for RTSP and RTP "video".'
+    "go to stdout. On a terminal, stderr shows who is looking. A device streams while it has "
+    "readers. The command waits for a missing device and serves the others meanwhile. Needs the "
+    'extras "web" and "frames", for RTSP and RTP "video".'
 )
 @click.option(
     "--rtsp",
     metavar="HOST:PORT",
-    callback=address,
-    help="Serve them as H.264 by RTSP, too, as rtsp://HOST:PORT/NAME. The page's token is "
+    callback=parse_address_option,
+    help="Also serve them as H.264 by RTSP, at rtsp://HOST:PORT/NAME. The page's token is "
     f"the password of the user {RTSP_USER}; without a token, an address that other machines can "
     "reach gets a password.",
 )
 @click.option(
     "--rtp",
     metavar="HOST:PORT",
-    callback=address,
-    help="Send the one source as H.264 by RTP to this address, with or without a receiver.",
+    callback=parse_address_option,
+    help="Send a single source as H.264 by RTP to this address, with or without a receiver.",
 )
 @click.option(
     "--sdp",
@@ -106,7 +109,7 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
     type=click.Path(dir_okay=False),
     help="Write the description for players of --rtp to this file, not to stdout.",
 )
-@_serves(terminated=0)
+@_serving_command(terminate_code=0)
 async def serve(
     urls: tuple[str, ...],
     quality: int,
@@ -129,11 +132,11 @@ async def serve(
 
 @click.command(
     help=f"Show one source, or up to {MAX_SHOWN} side by side, on a page until Ctrl-C: the newest "
-    "frame of each, its age, rates, skipped and lost frames. It is serve, with only the page: its "
-    "address goes to stdout. A device streams while the page is open; a missing device is "
-    'awaited, and the page shows that. Needs the extras "web" and "frames".'
+    "frame of each, its age, rates, skipped and lost frames. This is frames serve with the page "
+    "only. The page's address goes to stdout. A device streams while the page is open. The page "
+    'shows which devices are missing. Needs the extras "web" and "frames".'
 )
-@_serves(terminated=143)
+@_serving_command(terminate_code=143)
 async def show(
     urls: tuple[str, ...], quality: int, changes: bool, web: PageOptions, options: Options
 ) -> None:
@@ -150,27 +153,30 @@ async def serve_sources(
     *,
     changes: bool,
 ) -> None:
-    """Serve sources until cancelled, or for ``--seconds``; one that fails affects no other.
+    """Serve sources until cancelled, or for ``--seconds``; a source that fails affects no other.
 
-    Raises ConfigurationError, FrameFormatError, UnsupportedError: every source has failed for good;
+    Raises ConfigurationError, FrameFormatError, UnsupportedError: no source can ever be opened;
     ConfigurationError: the site cannot listen.
     """
     if len(urls) > MAX_SHOWN:
         raise click.UsageError(f"expected {MAX_SHOWN} URLs at most, got {len(urls)}")
     from smartcam.web import FramesSite
 
-    sources = [opened(url, options) for url in urls]
+    sources = [make_source(url, options) for url in urls]
     site = FramesSite(sources, quality=quality, changes=changes, **web.site_arguments)
-    tries = _Tries(len(sources))
-    keeping = [site.pictures.keep_open(place, tries.of(place)) for place in range(len(sources))]
-    await first([_serve(site, tries, players, options), *keeping], None)
+    tries = _FirstTries(len(sources))
+    jobs = [_serve(site, tries, players, options)]
+    jobs += [
+        site.pictures.keep_open(index, tries.callback_for(index)) for index in range(len(sources))
+    ]
+    await run_until_first(jobs, None)
 
 
-async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Options) -> None:
-    """Serve, once each source was tried, or :data:`FIRST_TRY_TIMEOUT` seconds are over."""
+async def _serve(site: FramesSite, tries: _FirstTries, players: Players, options: Options) -> None:
+    """Wait for the first try of each source, at most :data:`FIRST_TRY_TIMEOUT`; then serve."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(FIRST_TRY_TIMEOUT):
-            await tries.check()
+            await tries.wait_for_all()
     async with contextlib.AsyncExitStack() as stack:
         server: RtspServer | None = None
         urls: dict[str, str] = {}
@@ -182,49 +188,53 @@ async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Opt
         lines = [f"page: {site.url}", *(f"rtsp: {url}" for url in urls.values())]
         value = {"page": site.url, **({"rtsp": urls} if urls else {})}
         options.show(value, "\n".join(lines))
-        jobs = [_show_viewers(site, server), tries.watch()]
+        jobs = [_show_viewers(site, server), tries.run()]
         if players.rtp is not None:
             jobs.append(send_rtp(site.sources[0], players, options))
-        await first(jobs, options.seconds)
+        await run_until_first(jobs, options.seconds)
 
 
-class _Tries:
-    """The outcomes of each source's first try; later failures are reported on stderr."""
+class _FirstTries:
+    """The outcome of the first try to open each source; reports failed tries on stderr."""
 
     def __init__(self, count: int) -> None:
-        self._done = asyncio.Event()  # set when every source was tried
+        self._all_tried = asyncio.Event()  # set when every source was tried
         self._count = count
         self._first: dict[int, SmartCamError | None] = {}
         self._reported: dict[int, str] = {}
 
-    def of(self, place: int) -> Callable[[SmartCamError | None], None]:
-        """Return the function that gets the outcome of each try to open a source."""
+    def callback_for(self, index: int) -> Callable[[SmartCamError | None], None]:
+        """Return the function to call with the outcome of each try to open a source."""
 
-        def tried(error: SmartCamError | None) -> None:
-            self._first.setdefault(place, error)
+        def on_try(error: SmartCamError | None) -> None:
+            self._first.setdefault(index, error)
             text = "" if error is None else str(error)
-            if text and self._reported.get(place, "") != text and not self._all_for_good():
-                click.echo(f"note: {text}; it is awaited", err=True)
-            self._reported[place] = text
+            if (
+                text
+                and self._reported.get(index, "") != text
+                and not self._all_failed_permanently()
+            ):
+                click.echo(f"note: {text}; waiting for it", err=True)
+            self._reported[index] = text
             if len(self._first) == self._count:
-                self._done.set()
+                self._all_tried.set()
 
-        return tried
+        return on_try
 
-    def _all_for_good(self) -> bool:
-        wrong = [isinstance(error, PERMANENT_ERRORS) for error in self._first.values()]
-        return len(wrong) == self._count and all(wrong)
+    def _all_failed_permanently(self) -> bool:
+        permanent = [isinstance(error, PERMANENT_ERRORS) for error in self._first.values()]
+        return len(permanent) == self._count and all(permanent)
 
-    async def check(self) -> None:
-        """Wait until every source was tried; raise the first error if all have failed for good."""
-        await self._done.wait()
+    async def wait_for_all(self) -> None:
+        """Wait until every source was tried; raise the first error if all failed permanently."""
+        await self._all_tried.wait()
         error = self._first[0]
-        if error is not None and self._all_for_good():
+        if error is not None and self._all_failed_permanently():
             raise error
 
-    async def watch(self) -> None:
-        """Report sources that fail, until cancelled."""
-        await self.check()
+    async def run(self) -> None:
+        """Raise the first error once all sources failed permanently; else wait until cancelled."""
+        await self.wait_for_all()
         await asyncio.Event().wait()
 
 
@@ -232,25 +242,25 @@ class _Tries:
 
 
 async def _show_viewers(site: FramesSite, server: RtspServer | None) -> None:
-    """Report the viewers on a terminal's stderr, whenever they change; until cancelled."""
+    """Print the viewers to stderr, if it is a terminal, whenever they change; until cancelled."""
     if not sys.stderr.isatty():
         await asyncio.Event().wait()
-    shown = viewers_text(site, server)
+    shown_text = viewers_text(site, server)
     while True:
         await asyncio.sleep(PERIOD)
         text = viewers_text(site, server)
-        if text != shown:
-            shown = text
+        if text != shown_text:
+            shown_text = text
             click.echo(f"{datetime.now().astimezone():%H:%M:%S} {text}", err=True)
 
 
 def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
-    """Return each source's viewers as a text: addresses at the page, their number by RTSP."""
-    played = {} if server is None else server.statistics()
+    """Return a text of each source's viewers: addresses of the page's, number of RTSP's."""
+    rtsp_statistics = {} if server is None else server.statistics()
     rows: list[str] = []
-    for place, (name, source) in enumerate(names_of(site.sources).items()):
-        addresses = sorted(viewer.address for viewer in site.viewers if viewer.place == place)
-        by_rtsp = played[name].viewers if name in played else 0
-        addresses += [f"{by_rtsp} by RTSP"] if by_rtsp else []
+    for index, (name, source) in enumerate(unique_names(site.sources).items()):
+        addresses = sorted(viewer.address for viewer in site.viewers if viewer.place == index)
+        rtsp_count = rtsp_statistics[name].viewers if name in rtsp_statistics else 0
+        addresses += [f"{rtsp_count} by RTSP"] if rtsp_count else []
         rows += [f"{source.name}: {', '.join(addresses)}"] if addresses else []
     return "; ".join(rows) or "nobody looks"

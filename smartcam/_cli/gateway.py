@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import CAMERA, CONNECTS, SECONDS, Options, runs
+from smartcam._cli.options import CAMERA_OPTIONS, CONNECT_WARNING, SECONDS, Options, async_command
 from smartcam.backoff import Backoff
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ DEMO_APPLICATION = 7
 
 def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options for the form of answers to the command."""
-    options = [
+    decorators = [
         click.option(
             "--listen",
             metavar="tcp/HOST:PORT",
@@ -59,7 +59,7 @@ def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--idle", type=SECONDS, help="Seconds until a silent robot is disconnected."),
         click.option("--clients", type=click.IntRange(1, 100), help="Most robots at a time."),
     ]
-    for option in reversed(options):
+    for option in reversed(decorators):
         command = option(command)
     return command
 
@@ -68,29 +68,29 @@ def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Answer robots and PLCs that ask for parts, line by line over TCP, until Ctrl-C. A "
     "controller sends TRIGGER, then NEXT for each further part; --timeout bounds each "
     "answer. CAMERA is a URL, or a YAML file with all the options. --demo uses an emulated "
-    f'camera. Needs the extra "calibration". {CONNECTS}'
+    f'camera. Needs the extra "calibration". {CONNECT_WARNING}'
 )
 @click.argument("camera", metavar="[URL|FILE.yaml]", required=False)
 @click.option("--demo", is_flag=True, help="Use an emulated camera instead of CAMERA.")
 @_style_options
-@runs(
+@async_command(
     *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--seconds"),
-    *CAMERA,
-    interrupted=0,
+    *CAMERA_OPTIONS,
+    interrupt_code=0,
 )
 async def gateway(camera: str | None, demo: bool, options: Options, **style: Any) -> None:
     """Answer robots."""
     from smartcam.gateway import Gateway
 
-    file = _file(camera, demo)
-    settings = _settings(file, style, options)
-    _fill(options, file)
+    file = _read_file(camera, demo)
+    settings = _make_settings(file, style, options)
+    _fill_missing_options(options, file)
     async with contextlib.AsyncExitStack() as stack:
         url = file.url
         if url is None:
-            url = await stack.enter_async_context(_emulated(options))
-        make = stack.enter_context(options.cameras(url, reconnect=Backoff()))
-        first = make()
+            url = await stack.enter_async_context(_emulated_camera(options))
+        make_camera = stack.enter_context(options.cameras(url, reconnect=Backoff()))
+        first = make_camera()
         server = await stack.enter_async_context(Gateway(first, settings))
         stack.callback(_print_account, server, options)
 
@@ -100,33 +100,33 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
 
         with contextlib.suppress(TimeoutError):  # --seconds are over
             async with asyncio.timeout(options.seconds):
-                await _ensure_open(server, make, show)
+                await _ensure_open(server, make_camera, show)
 
 
 async def _ensure_open(
-    server: Gateway, make: Callable[[], Camera], show: Callable[[], None]
+    server: Gateway, make_camera: Callable[[], Camera], show: Callable[[], None]
 ) -> None:
-    """Keep the camera open, and show the gateway once opening was tried for the first time."""
-    from smartcam._cli.live import have_open
+    """Keep the camera open; show the gateway after the first try to open it."""
+    from smartcam._cli.live import keep_open
 
-    first, shown = server.camera, False
+    first, was_shown = server.camera, False
 
-    def tried() -> None:
-        nonlocal shown
-        if not shown:
+    def on_first_try() -> None:
+        nonlocal was_shown
+        if not was_shown:
             show()
-        shown = True
+        was_shown = True
 
-    async def follow(camera: Camera, why: str) -> None:
+    async def replace_camera(camera: Camera, reason: str) -> None:
         if server.camera is first:
-            click.echo(f"note: {why}; it is tried on", err=True)
+            click.echo(f"note: {reason}; trying again", err=True)
         server.camera = camera
-        tried()
+        on_first_try()
 
-    await have_open(first, make, follow, tried)
+    await keep_open(first, make_camera, replace_camera, on_first_try)
 
 
-def _file(camera: str | None, demo: bool) -> GatewayFile:
+def _read_file(camera: str | None, demo: bool) -> GatewayFile:
     from smartcam.gateway._inside import GatewayFile
 
     if demo == (camera is not None):
@@ -138,24 +138,24 @@ def _file(camera: str | None, demo: bool) -> GatewayFile:
     return GatewayFile(url=camera) if "://" in camera else GatewayFile.load(camera)
 
 
-def _settings(file: GatewayFile, style: dict[str, Any], options: Options) -> GatewaySettings:
+def _make_settings(file: GatewayFile, style: dict[str, Any], options: Options) -> GatewaySettings:
     from pydantic import ValidationError
 
     from smartcam.exceptions import ConfigurationError
 
-    given = {name: value for name, value in style.items() if value not in (None, (), False)}
+    set_style = {name: value for name, value in style.items() if value not in (None, (), False)}
     if options.timeout is not None:
-        given["timeout"] = options.timeout
+        set_style["timeout"] = options.timeout
     try:
-        return file.settings(**given)
+        return file.settings(**set_style)
     except ValidationError as exc:
         (first, *_) = exc.errors()
-        where = "".join(f"--{option}: " for option in first["loc"][:1]).replace("_", "-")
-        raise ConfigurationError(where + first["msg"].removeprefix("Value error, ")) from exc
+        option_text = "".join(f"--{option}: " for option in first["loc"][:1]).replace("_", "-")
+        raise ConfigurationError(option_text + first["msg"].removeprefix("Value error, ")) from exc
 
 
-def _fill(options: Options, file: GatewayFile) -> None:
-    """Set options that the command line leaves out from the file."""
+def _fill_missing_options(options: Options, file: GatewayFile) -> None:
+    """Set the options that are missing on the command line to the values of the file."""
     from smartcam.settings import is_fleet
 
     for name in ("application", "interpret_as", "calibration", "name"):
@@ -167,7 +167,7 @@ def _fill(options: Options, file: GatewayFile) -> None:
 
 
 @contextlib.asynccontextmanager
-async def _emulated(options: Options) -> AsyncIterator[str]:
+async def _emulated_camera(options: Options) -> AsyncIterator[str]:
     """Yield the URL of an emulated camera, whose parts do not move."""
     from smartcam.emulator import EmulatedCamera
 

@@ -6,38 +6,38 @@ from pathlib import Path
 
 import click
 
-from smartcam._cli.options import CAMERA, CONNECTS, Options, option, runs
+from smartcam._cli.options import CAMERA_OPTIONS, CONNECT_WARNING, Options, async_command, option
 from smartcam.exceptions import ConfigurationError
 
 
 @click.command(
     help="Write a camera's last picture to a file, as the camera sends it (In-Sight: a bitmap), "
     "if its protocol has a request for it. A software camera begins with the command, so it is "
-    f"triggered first, and its picture is a PNG. {CONNECTS}"
+    f"triggered first, and its picture is a PNG. {CONNECT_WARNING}"
 )
 @click.argument("url")
 @option("--output", required=True)
 @option("--force")
-@runs(*CAMERA)
+@async_command(*CAMERA_OPTIONS)
 async def image(url: str, output: str, force: bool, options: Options) -> None:
     """Write a camera's last picture to a file."""
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
     from smartcam.settings import is_software
 
-    _check_free(output, force)
-    url = await options.located(url)
-    with options.camera(url) as unopened:
-        async with unopened as camera:
+    _check_output_path(output, force)
+    url = await options.locate_url(url)
+    with options.camera(url) as unopened_camera:
+        async with unopened_camera as camera:
             if is_software(url):
-                await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
-            data = await camera.read_image(timeout=options.step(10.0))
+                await camera.trigger(timeout=options.step_timeout(DEFAULT_TRIGGER_TIMEOUT))
+            data = await camera.read_image(timeout=options.step_timeout(10.0))
             name = camera.name
     _write(output, data)
     value = {"camera": name, "file": output, "size": len(data)}
     options.show(value, f"{output}: {len(data):,} bytes")
 
 
-def _check_free(file: str, force: bool) -> None:
+def _check_output_path(file: str, force: bool) -> None:
     path = Path(file)
     if path.exists() and not force:
         raise ConfigurationError(f"{file}: the file exists already; --force replaces it")

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, from_hex, naming, option, runs
+from smartcam._cli.options import (
+    OUTPUT_OPTIONS,
+    Options,
+    async_command,
+    from_hex,
+    naming_file_errors,
+    option,
+)
 from smartcam._cli.texts import value_text
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
@@ -22,7 +29,7 @@ if TYPE_CHECKING:
 SUFFIXES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 )
-"""Suffixes of the files in a folder that count as pictures, in lower case."""
+"""Suffixes, in lower case, of the files in a folder that are taken for pictures."""
 
 PAGE: Final = "index.html"
 
@@ -35,19 +42,19 @@ PAGE: Final = "index.html"
 )
 @click.argument("cell")
 @click.argument("camera")
-@click.argument("which", metavar="APPLICATION")
+@click.argument("application_name", metavar="APPLICATION")
 @click.argument("pictures", nargs=-1, required=True)
 @option("--output", help="Draw the findings into this folder: PNG files, and a page of them all.")
-@click.option("--input", "given", metavar="HEX", default="", help="Input data of each trigger.")
+@click.option("--input", "input_hex", metavar="HEX", default="", help="Input data of each trigger.")
 @option("--units")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def inspect(
     cell: str,
     camera: str,
-    which: str,
+    application_name: str,
     pictures: Sequence[str],
     output: str | None,
-    given: str,
+    input_hex: str,
     options: Options,
 ) -> None:
     """Inspect the pictures one by one, print the results, and draw the findings."""
@@ -56,40 +63,43 @@ async def inspect(
     from smartcam.layout._inside import ShownUnits
 
     units = ShownUnits([unit for unit in (options.units or "").split(",") if unit])
-    data = from_hex(given, "--input")
+    data = from_hex(input_hex, "--input")
     cameras = load_cell(cell)
     if camera not in cameras:
         raise ConfigurationError(
             f"{cell}: no software camera {camera!r:.80}; there are {', '.join(cameras)}"
             f"{did_you_mean(camera, cameras)}"
         )
-    program = cameras[camera].program(which)
+    program = cameras[camera].program(application_name)
     files = [file for picture in pictures for file in picture_files(Path(picture))]
     folder = None if output is None else Path(output)
     if folder is not None:
-        with naming(f"--output {output}"):
+        with naming_file_errors(f"--output {output}"):
             folder.mkdir(parents=True, exist_ok=True)
-    failed: FrameFormatError | None = None
-    rows: list[str] = []
+    error: FrameFormatError | None = None
+    figures: list[str] = []
     for number, file in enumerate(files, 1):
         try:
             inspection = await asyncio.to_thread(_inspect, program, file, data)
         except FrameFormatError as exc:
-            failed = exc
+            error = exc
             options.show({"file": str(file), "error": str(exc)}, f"{file}: {exc}")
             continue
-        drawn = None if folder is None else folder / f"{number:04}-{file.stem}.png"
-        if drawn is not None:
-            with naming(f"--output {output}"):
-                await asyncio.to_thread(_write, drawn, inspection)
-            rows.append(_row(file, inspection, drawn))
-        options.show(_fields(file, inspection, drawn), _text(file, inspection, units))
+        picture_path = None if folder is None else folder / f"{number:04}-{file.stem}.png"
+        if picture_path is not None:
+            with naming_file_errors(f"--output {output}"):
+                await asyncio.to_thread(_write_picture, picture_path, inspection)
+            figures.append(_figure(file, inspection, picture_path))
+        options.show(
+            _inspection_data(file, inspection, picture_path),
+            _inspection_text(file, inspection, units),
+        )
     if folder is not None:
         title = f"{camera}: {program.name}"
-        with naming(f"--output {output}"):
-            (folder / PAGE).write_text(_page(title, rows), encoding="utf-8")
-    if failed is not None:
-        raise failed
+        with naming_file_errors(f"--output {output}"):
+            (folder / PAGE).write_text(_page(title, figures), encoding="utf-8")
+    if error is not None:
+        raise error
 
 
 def picture_files(path: Path) -> Iterator[Path]:
@@ -113,39 +123,41 @@ def _inspect(program: Program, file: Path, data: bytes) -> Inspection:
     return program.inspect(Picture.read(file), input=data)
 
 
-def _write(path: Path, inspection: Inspection) -> None:
+def _write_picture(path: Path, inspection: Inspection) -> None:
     from smartcam._extras import load
 
     coded = load("cv2", "inspection needs").imencode(".png", inspection.drawn()[:, :, ::-1])[1]
     path.write_bytes(coded.tobytes())
 
 
-def _fields(file: Path, inspection: Inspection, drawn: Path | None) -> dict[str, Any]:
+def _inspection_data(
+    file: Path, inspection: Inspection, picture_path: Path | None
+) -> dict[str, Any]:
     return {
         "file": str(file),
         "ok": inspection.ok,
         "reason": inspection.reason,
         "value": inspection.value,
         "milliseconds": {name: 1e3 * seconds for name, seconds in inspection.seconds.items()},
-        **({} if drawn is None else {"drawn": str(drawn)}),
+        **({} if picture_path is None else {"drawn": str(picture_path)}),
     }
 
 
-def _text(file: Path, inspection: Inspection, units: ShownUnits) -> str:
+def _inspection_text(file: Path, inspection: Inspection, units: ShownUnits) -> str:
     verdict = "ok" if inspection.ok else "not ok"
     took = 1e3 * sum(inspection.seconds.values())
     text = value_text(inspection.value, units, inspection.layout)
     return f"{file}: {verdict}, {took:.1f} ms\n{text}"
 
 
-def _row(file: Path, inspection: Inspection, drawn: Path) -> str:
-    kind = "ok" if inspection.ok else "not-ok"
+def _figure(file: Path, inspection: Inspection, picture_path: Path) -> str:
+    style = "ok" if inspection.ok else "not-ok"
     text = html.escape(f"{file.name}: {inspection.reason or 'ok'}")
-    link = html.escape(drawn.name, quote=True)
-    return f'<figure class="{kind}"><img src="{link}" alt="{text}"><figcaption>{text}</figcaption>'
+    link = html.escape(picture_path.name, quote=True)
+    return f'<figure class="{style}"><img src="{link}" alt="{text}"><figcaption>{text}</figcaption>'
 
 
-def _page(title: str, rows: Sequence[str]) -> str:
+def _page(title: str, figures: Sequence[str]) -> str:
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         f"<title>{html.escape(title)}</title><style>"
@@ -153,6 +165,6 @@ def _page(title: str, rows: Sequence[str]) -> str:
         "h1{flex-basis:100%}figure{margin:0;max-width:30em}img{max-width:100%}"
         ".ok{border-top:4px solid #2ecc40}.not-ok{border-top:4px solid #ff4136}"
         f"</style><h1>{html.escape(title)}</h1>"
-        + "".join(f"{row}</figure>" for row in rows)
+        + "".join(f"{figure}</figure>" for figure in figures)
         + "</html>\n"
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam._cli.texts import table_text
 from smartcam.exceptions import PluginError, SmartCamError
 
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def protocols(options: Options) -> None:
     """List the protocols and their dialects."""
     from smartcam.registry import PROTOCOLS
 
     for info in PROTOCOLS.available():
         try:
-            value, text = _protocol(info)
-        except Exception as exc:  # noqa: BLE001 - a broken plug-in costs only its own line
-            value, text = _broken(info, exc)
+            value, text = _describe_protocol(info)
+        except Exception as exc:  # noqa: BLE001 - a broken plug-in affects only its own line
+            value, text = _describe_broken(info, exc)
         options.show(value, text)
 
 
-def _protocol(info: PluginInfo) -> tuple[object, str]:
+def _describe_protocol(info: PluginInfo) -> tuple[object, str]:
     """Describe a protocol, as JSON and as text."""
     from smartcam.protocols._inside import load_protocol
 
@@ -53,7 +53,7 @@ def _protocol(info: PluginInfo) -> tuple[object, str]:
     return value, head + table_text(("dialect", ""), rows)
 
 
-def _broken(info: PluginInfo, exc: Exception) -> tuple[object, str]:
+def _describe_broken(info: PluginInfo, exc: Exception) -> tuple[object, str]:
     """Describe a plug-in that cannot be used."""
     reason = str(exc) if isinstance(exc, SmartCamError) else repr(exc)
     value = {**info._asdict(), "error": reason}
@@ -61,16 +61,16 @@ def _broken(info: PluginInfo, exc: Exception) -> tuple[object, str]:
 
 
 @click.command()
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def interpreters(options: Options) -> None:
     """List the interpreters that --interpret-as knows."""
     from smartcam.registry import INTERPRETERS
 
     for info in INTERPRETERS.available():
-        options.show(*_interpreter(info))
+        options.show(*_describe_interpreter(info))
 
 
-def _interpreter(info: PluginInfo) -> tuple[object, str]:
+def _describe_interpreter(info: PluginInfo) -> tuple[object, str]:
     """Describe an interpreter, as JSON and as text."""
     from smartcam.interpreters import resolve
     from smartcam.registry import INTERPRETERS
@@ -80,11 +80,11 @@ def _interpreter(info: PluginInfo) -> tuple[object, str]:
         about = _first_line(INTERPRETERS.load(info.name))
         resolve(info.name)
     except PluginError as exc:
-        return _broken(info, exc)
+        return _describe_broken(info, exc)
     except SmartCamError:
         pass  # the interpreter needs a layout
-    where = "" if info.origin == "built-in" else f" ({info.origin}: {info.target})"
-    return {**info._asdict(), "about": about}, f"{info.name:14} {about}{where}"
+    origin_text = "" if info.origin == "built-in" else f" ({info.origin}: {info.target})"
+    return {**info._asdict(), "about": about}, f"{info.name:14} {about}{origin_text}"
 
 
 def _first_line(loaded: object) -> str:

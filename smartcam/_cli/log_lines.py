@@ -1,8 +1,8 @@
 """A log as lines of JSON, for programs that collect logs; ``docs/operations.md`` has the fields.
 
-Any thread may log. A line is put into a bounded queue, and a thread writes it: if the pipe is not
-read, only that thread waits. Lines without room are dropped and counted, and their number is logged
-as soon as there is room.
+Any thread may log. A line is put into a bounded queue, and a thread of its own writes it: if nobody
+reads the pipe, only that thread waits. Lines that find the queue full are dropped and counted, and
+their number is logged as soon as the thread writes again.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
 
-MAX_WAITING = 10_000
+MAX_WAITING_LINES = 10_000
 """Largest number of lines that may wait to be written."""
 
 MAX_TEXT_CHARACTERS = 1 << 16
 """Largest number of characters of a message, or of an exception's text; the rest is cut."""
 
-FAREWELL_TIMEOUT = 1.0
-"""Seconds that the last lines may take at the end."""
+CLOSE_TIMEOUT = 1.0
+"""Longest time to write the waiting lines at the end, seconds."""
 
 FIELDS = ("time", "level", "logger", "message", "agent", "camera", "exception", "dropped")
-"""The fields of a line, in this order; the last two are left out without a value."""
+"""The fields of a line, in this order; the last two only if they have a value."""
 
 
 class JsonLines(logging.Formatter):
@@ -49,15 +49,15 @@ class JsonLines(logging.Formatter):
         """Return the line."""
         try:
             message = record.getMessage()
-        except Exception as exc:  # noqa: BLE001 - arguments that do not fit are somebody's mistake
+        except Exception as exc:  # noqa: BLE001 - any error of arguments that do not fit the format
             message = f"{record.msg!r} {record.args!r} ({exc})"
         fields: dict[str, Any] = {
-            "time": _time(record.created),
+            "time": _iso_time(record.created),
             "level": record.levelname.lower(),
             "logger": record.name,
             "message": message[:MAX_TEXT_CHARACTERS],
             "agent": self._agent() or None,
-            "camera": self._camera(record),
+            "camera": self._find_camera(record),
         }
         if record.exc_info and record.exc_info[0] is not None:
             fields["exception"] = self.formatException(record.exc_info)[-MAX_TEXT_CHARACTERS:]
@@ -65,14 +65,14 @@ class JsonLines(logging.Formatter):
             fields["exception"] = record.exc_text[-MAX_TEXT_CHARACTERS:]
         return json.dumps(fields)
 
-    def _camera(self, record: logging.LogRecord) -> str | None:
-        """Return the camera whose name a record has as an argument, None without one."""
+    def _find_camera(self, record: logging.LogRecord) -> str | None:
+        """Return the name of the camera that a record is about, None if it names none."""
         camera = getattr(record, "camera", None)
         if isinstance(camera, str):
             return camera
         cameras = self._cameras()
-        given = record.args if isinstance(record.args, tuple) else ()
-        for argument in given[:2]:
+        arguments = record.args if isinstance(record.args, tuple) else ()
+        for argument in arguments[:2]:
             name = str(argument) if isinstance(argument, str | Exception) else ""
             for part in (name, name.partition(": ")[0]):
                 if part and part in cameras:
@@ -80,30 +80,30 @@ class JsonLines(logging.Formatter):
         return None
 
 
-def _time(seconds: float) -> str:
+def _iso_time(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
 
 
 class LineHandler(logging.Handler):
-    """Writes lines to a file in a thread, and never waits for it.
+    """Writes lines to a file in a thread; logging never waits for the file.
 
     Args:
         descriptor: descriptor of the file.
-        most: largest number of lines that wait.
+        max_lines: largest number of lines that wait.
 
     Attributes:
-        dropped: number of lines that found no room.
+        dropped_count: number of lines that found the queue full.
     """
 
-    def __init__(self, descriptor: int, most: int = MAX_WAITING) -> None:
+    def __init__(self, descriptor: int, max_lines: int = MAX_WAITING_LINES) -> None:
         super().__init__()
-        self.dropped: int = 0
-        self._reported = 0
+        self.dropped_count: int = 0
+        self._reported_count = 0
         self._descriptor = descriptor
-        self._lines: queue.Queue[str | None] = queue.Queue(most)
-        self._ending = threading.Event()
-        self._over = threading.Event()
-        # a daemon, since it may hang in a pipe at the end of the process
+        self._lines: queue.Queue[str | None] = queue.Queue(max_lines)
+        self._closing = threading.Event()
+        self._finished = threading.Event()
+        # a daemon thread, since a write to a full pipe may block it when the process ends
         self._thread = threading.Thread(target=self._write_all, name="smartcam.log", daemon=True)
         self._thread.start()
 
@@ -112,44 +112,45 @@ class LineHandler(logging.Handler):
         try:
             self._lines.put_nowait(self.format(record))
         except queue.Full:
-            self.dropped += 1  # the handler's lock is held
-        except Exception:  # noqa: BLE001 - the last place
+            self.dropped_count += 1  # the handler's lock is held
+        except Exception:  # noqa: BLE001 - as logging's own handlers do
             self.handleError(record)
 
     def close(self) -> None:
         """Write the waiting lines, in bounded time. Idempotent."""
-        if not self._ending.is_set():
-            self._ending.set()
+        if not self._closing.is_set():
+            self._closing.set()
             with contextlib.suppress(queue.Full):
                 self._lines.put_nowait(None)  # wakes the thread, if it waits
-            self._over.wait(FAREWELL_TIMEOUT)
+            self._finished.wait(CLOSE_TIMEOUT)
         super().close()
 
     def _write_all(self) -> None:
         try:
-            while not (self._ending.is_set() and self._lines.empty()):
+            while not (self._closing.is_set() and self._lines.empty()):
                 line = self._lines.get()
                 if line is not None:
                     self._write(line)
-                if (dropped := self.dropped) > self._reported:
-                    self._write(self._lost(dropped - self._reported))
-                    self._reported = dropped
+                if (dropped_count := self.dropped_count) > self._reported_count:
+                    self._write(self._dropped_line(dropped_count - self._reported_count))
+                    self._reported_count = dropped_count
         except OSError:
-            pass  # the reader is gone
+            pass  # nobody reads the pipe any more
         finally:
-            self._over.set()
+            self._finished.set()
 
-    def _lost(self, count: int) -> str:
-        made = {"name": "smartcam.log", "levelno": logging.WARNING, "levelname": "WARNING"}
+    def _dropped_line(self, count: int) -> str:
+        """Return the line that reports dropped lines."""
+        attributes = {"name": "smartcam.log", "levelno": logging.WARNING, "levelname": "WARNING"}
         text = f"{count} lines of this log were dropped: they were not read fast enough"
-        fields = json.loads(self.format(logging.makeLogRecord({**made, "msg": text})))
+        fields = json.loads(self.format(logging.makeLogRecord({**attributes, "msg": text})))
         return json.dumps({**fields, "dropped": count})
 
     def _write(self, line: str) -> None:
-        left = memoryview(f"{line}\n".encode())
-        while left:
+        unwritten = memoryview(f"{line}\n".encode())
+        while unwritten:
             try:
-                left = left[os.write(self._descriptor, left) :]
+                unwritten = unwritten[os.write(self._descriptor, unwritten) :]
             except BlockingIOError:  # another program has made the pipe non-blocking
                 select.select([], [self._descriptor], [], 1.0)
 
@@ -161,12 +162,12 @@ def json_log(
     cameras: Callable[[], Container[str]],
     *,
     descriptor: int = 2,
-    most: int = MAX_WAITING,
+    max_lines: int = MAX_WAITING_LINES,
 ) -> Iterator[LineHandler]:
     """Write all logs of this process as lines of JSON, while the block runs."""
     root = logging.getLogger()
-    handlers, before = root.handlers[:], root.level
-    handler = LineHandler(descriptor, most)
+    handlers, old_level = root.handlers[:], root.level
+    handler = LineHandler(descriptor, max_lines)
     handler.setFormatter(JsonLines(agent, cameras))
     for old_handler in handlers:
         root.removeHandler(old_handler)
@@ -178,7 +179,7 @@ def json_log(
     finally:
         logging.captureWarnings(False)
         root.removeHandler(handler)
-        root.setLevel(before)
+        root.setLevel(old_level)
         for old_handler in handlers:
             root.addHandler(old_handler)
         handler.close()

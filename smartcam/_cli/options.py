@@ -1,4 +1,4 @@
-"""Common options of commands, and the objects made of them."""
+"""Common options of commands, and the cameras and texts that commands make with them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from smartcam._cli.terminal import tinted
-from smartcam._cli.usage import INTERRUPTED, importing
+from smartcam._cli.terminal import coloured
+from smartcam._cli.usage import INTERRUPTED, exiting_on_interrupt
 from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError, UnsupportedError
 
@@ -28,14 +28,14 @@ DIALECTS = ("handbook", "thesis", "b16", "bid")
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
-CONNECTS = (
+CONNECT_WARNING = (
     "Connecting takes the camera from another client, if it serves one: the newcomer wins. A "
     "camera of a fleet is shared."
 )
 
 
 class _Seconds(click.FloatRange):
-    """Seconds; NaN, which no bound excludes, is refused, too."""
+    """Seconds within bounds; NaN is refused, too, since it passes every check of a bound."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         seconds = super().convert(value, param, ctx)
@@ -96,18 +96,18 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
 }
 """Options that several commands have."""
 
-OUTPUT = ("--json", "--debug")
+OUTPUT_OPTIONS = ("--json", "--debug")
 """Options of the commands that print."""
 
-CAMERA = ("--timeout", "--trace", *OUTPUT)
-"""Options of the commands that connect to a camera, including those for printing."""
+CAMERA_OPTIONS = ("--timeout", "--trace", *OUTPUT_OPTIONS)
+"""Options of the commands that connect to a camera and print."""
 
-RESULTS = (
+RESULT_OPTIONS = (
     *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--units"),
     *("--count", "--seconds"),
-    *CAMERA,
+    *CAMERA_OPTIONS,
 )
-"""Options of the commands that print results, including those for connecting."""
+"""Options of the commands that connect to a camera and print results."""
 
 
 def option(name: str, **changes: Any) -> Callable[[F], F]:
@@ -116,65 +116,70 @@ def option(name: str, **changes: Any) -> Callable[[F], F]:
     return click.option(*names, **{**_OPTIONS[name], **changes})
 
 
-def runs(
-    *names: str, program: str = "smartcam", interrupted: int = INTERRUPTED, terminated: int = 143
+def async_command(
+    *names: str,
+    program: str = "smartcam",
+    interrupt_code: int = INTERRUPTED,
+    terminate_code: int = 143,
 ) -> Callable[[Callable[..., Coroutine[Any, Any, None]]], Callable[..., None]]:
-    """Turn a coroutine function into a command; it gets the common options as ``options``.
+    """Make a coroutine function the function of a command; its ``options`` are the common options.
 
-    ``names``: common options of the command, beside those declared above. ``program``: its name for
-    the error line. ``interrupted``: exit code after Ctrl-C; 0 if that is the usual end, as for
-    a page. ``terminated``: exit code after SIGTERM.
+    ``names``: common options of the command, in addition to the decorators above it. ``program``:
+    name of the program in the error line. ``interrupt_code``: exit code after Ctrl-C; 0 if that is
+    the usual end, as for a page. ``terminate_code``: exit code after SIGTERM.
     """
 
     def decorate(main: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
         @functools.wraps(main)
-        def start(*args: Any, **given: Any) -> None:
-            with importing():
+        def run_command(*args: Any, **arguments: Any) -> None:
+            with exiting_on_interrupt():
                 from smartcam._cli.running import run
 
-            common = {field.name for field in fields(Options)} & given.keys()
-            options = Options(**{name: given.pop(name) for name in common})
-            has_page = "web" in given and given["web"].wanted
+            common = {field.name for field in fields(Options)} & arguments.keys()
+            options = Options(**{name: arguments.pop(name) for name in common})
+            has_page = "web" in arguments and arguments["web"].is_wanted
             run(
-                main(*args, options=options, **given),
+                main(*args, options=options, **arguments),
                 program=program,
                 debug=options.debug,
                 as_json=options.as_json,
-                interrupted=0 if has_page else interrupted,
-                terminated=terminated,
+                interrupt_code=0 if has_page else interrupt_code,
+                terminate_code=terminate_code,
             )
 
         for name in reversed(names):
-            start = option(name)(start)
-        return start
+            run_command = option(name)(run_command)
+        return run_command
 
     return decorate
 
 
 @contextmanager
-def naming(place: str) -> Iterator[None]:
-    """Turn errors of a file in the block into a ConfigurationError that names the file."""
+def naming_file_errors(label: str) -> Iterator[None]:
+    """Turn an OSError in the block into a ConfigurationError that begins with ``label``."""
     try:
         yield
     except OSError as exc:
-        raise ConfigurationError(f"{place}: {exc.strerror}") from exc
+        raise ConfigurationError(f"{label}: {exc.strerror}") from exc
 
 
-def from_hex(text: str, where: str) -> bytes:
-    """Return the bytes of hex text, which may have spaces; ConfigurationError: it is not hex."""
+def from_hex(text: str, label: str) -> bytes:
+    """Return the bytes of hex text, which may have spaces.
+
+    Raises ConfigurationError: it is not hex; the text begins with ``label``.
+    """
     try:
         return bytes.fromhex(text)
     except ValueError as exc:
         raise ConfigurationError(
-            f"{where}: {text[:64]!r} is no hex: expected two of 0-9 and a-f for each byte"
+            f"{label}: {text[:64]!r} is no hex: expected two of 0-9 and a-f for each byte"
         ) from exc
 
 
-def application(text: str) -> int | str:
-    """Return an application's id, or a text that is no number as the name of its file.
+def parse_application(text: str) -> int | str:
+    """Return the application's id if the text is a number, or the text, which is a file's name.
 
-    Raises click.BadParameter: no application can have this id; ValueError: signs and digits that
-    make no number.
+    Raises click.BadParameter: the number is out of range; ValueError: it has several signs.
     """
     if not text.lstrip("+-").isdecimal():
         return text
@@ -201,8 +206,8 @@ class Options:
     seconds: float | None = None
     units: str | None = None
 
-    def step(self, default: float) -> float:
-        """Return the bound of a step, seconds."""
+    def step_timeout(self, default: float) -> float:
+        """Return the longest time for a step, seconds: ``--timeout``, or ``default`` without it."""
         return default if self.timeout is None else self.timeout
 
     def check_y_down(self, calibration: AnyCalibration, option: str) -> None:
@@ -211,53 +216,53 @@ class Options:
         ``option``: the option that names the calibration.
         """
         if calibration.y_down is not None and calibration.y_down != self.y_down:
-            made, then = ("with", "give it") if calibration.y_down else ("without", "leave it out")
+            done, to_do = ("with", "give it") if calibration.y_down else ("without", "leave it out")
             raise ConfigurationError(
-                f"{option}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
+                f"{option}: it was made {done} --y-down: {to_do} here, too, or poses are mirrored"
             )
 
-    async def located(self, url: str) -> str:
-        """Return a URL; for a bare HOST[:PORT], the URL at which a camera answers there.
+    async def locate_url(self, url: str) -> str:
+        """Return the URL; for HOST[:PORT], search for a camera there and return its URL.
 
         Raises ConnectFailedError: no camera answers in any registered protocol; errors of
-        :meth:`reading`, before any camera is asked.
+        :meth:`reading_options`, before any camera is asked.
         """
         from smartcam.settings import is_software
 
         if "://" in url or is_software(url):
             return url
         if self.calibration is not None:
-            self._calibrated(f"--calibration {self.calibration}", check_y_down=True)
+            self._load_calibration(f"--calibration {self.calibration}", check_y_down=True)
         from smartcam.doctor._inside import locate
 
-        return await locate(url, timeout=self.step(10.0))
+        return await locate(url, timeout=self.step_timeout(10.0))
 
     @contextmanager
     def camera(self, url: str, **other: Any) -> Iterator[Camera]:
-        """Yield an unopened camera, as :meth:`cameras` makes them."""
-        with self.cameras(url, **other) as make:
-            yield make()
+        """Yield an unopened camera with these options; for the arguments see :meth:`cameras`."""
+        with self.cameras(url, **other) as make_camera:
+            yield make_camera()
 
     @contextmanager
     def cameras(self, url: str, **other: Any) -> Iterator[Callable[[], Camera]]:
-        """Yield a function that makes unopened cameras; the trace file is open meanwhile.
+        """Yield a function that makes unopened cameras; the block keeps the trace file open.
 
         ``other``: options of :func:`smartcam.connect` that the command line does not have. Raises
         CalibrationError: the calibration's file is damaged, newer, or of another kind;
-        ConfigurationError: a file cannot be opened, or an option cannot work.
+        ConfigurationError: a file cannot be opened, or an option is not possible.
         """
         from smartcam.connecting import connect
         from smartcam.settings import is_fleet
 
-        with self.tracing(url) as trace:
+        with self.open_trace(url) as trace:
             options: dict[str, Any] = {
-                **self.reading(fleet=is_fleet(url)),
+                **self.reading_options(fleet=is_fleet(url)),
                 "observers": self._observers(trace),
                 "reconnect": None,
                 "name": self.name or "",
                 "application": self.application,
-                "connect_timeout": self.step(10.0),
-                "switch_timeout": self.step(10.0),
+                "connect_timeout": self.step_timeout(10.0),
+                "switch_timeout": self.step_timeout(10.0),
             }
             yield functools.partial(connect, url, **{**options, **other})
 
@@ -269,7 +274,7 @@ class Options:
 
         return [FrameObserver(trace)]
 
-    def reading(self, *, fleet: bool) -> dict[str, Any]:
+    def reading_options(self, *, fleet: bool) -> dict[str, Any]:
         """Return the options for the interpretation of results.
 
         ``fleet``: the agent of a fleet may know missing options, such as ``y_down``. Raises
@@ -281,27 +286,27 @@ class Options:
             options["y_down"] = self.y_down
         if self.calibration is not None:
             option = f"--calibration {self.calibration}"
-            # without "y_down" the camera checks it, since it learns the agent's value
-            calibration, doubt = self._calibrated(option, check_y_down="y_down" in options)
+            # without "y_down" the camera gets the agent's value, and checks it then
+            calibration, doubt = self._load_calibration(option, check_y_down="y_down" in options)
             options["calibration"] = calibration
             if doubt:
-                click.echo(f"{tinted('error', 'warning:')} {option}: {doubt}", err=True)
+                click.echo(f"{coloured('error', 'warning:')} {option}: {doubt}", err=True)
         return options
 
-    def _calibrated(self, option: str, *, check_y_down: bool) -> tuple[AnyCalibration, str]:
-        """Return the calibration, and the reason to doubt it; "" means none."""
+    def _load_calibration(self, option: str, *, check_y_down: bool) -> tuple[AnyCalibration, str]:
+        """Return the calibration, and the reason to doubt it; "" if there is none."""
         with from_part("calibration", "--calibration needs"):
             from smartcam.calibration import load_calibration
             from smartcam.calibration._inside import doubt_of
-        with naming(option):
+        with naming_file_errors(option):
             calibration = load_calibration(self.calibration or "")
         if check_y_down:
             self.check_y_down(calibration, option)
         return calibration, doubt_of(calibration)
 
     @contextmanager
-    def tracing(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
-        """Yield the function that writes the trace file, None without ``--trace``.
+    def open_trace(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
+        """Open the trace file; yield the function that writes an entry, None without ``--trace``.
 
         Raises UnsupportedError: the camera at ``url`` is a camera of a fleet; ConfigurationError:
         the file cannot be written.
@@ -317,15 +322,15 @@ class Options:
 
         if is_fleet(url):
             raise UnsupportedError(
-                f"--trace: frames of {url} are between the camera and its agent; a trace wants the "
+                f"--trace: frames of {url} are between the camera and its agent; a trace needs the "
                 "camera's own address, such as bvs://HOST"
             )
-        with naming(f"--trace {self.trace}"):
+        with naming_file_errors(f"--trace {self.trace}"):
             stream = Path(self.trace).open("w", encoding="utf-8", buffering=1)  # noqa: SIM115
         failed: list[OSError] = []
 
         def write(entry: TraceEntry) -> None:
-            # called from the link, which would take an OSError for its own
+            # called from the link, which would handle an OSError as an error of the link
             if not failed:
                 try:
                     stream.write(json.dumps(jsonable(entry)) + "\n")
@@ -344,7 +349,7 @@ class Options:
 
     @property
     def unit_names(self) -> list[str] | None:
-        """Names of the units in which values are shown; None: in SI.
+        """Names of the units in which values are shown; None: SI units.
 
         Raises ConfigurationError: --units has an unknown unit.
         """
@@ -357,7 +362,7 @@ class Options:
         return names
 
     def result_text(self) -> Callable[[Camera, Result], str]:
-        """Return the function that formats a camera's result as text, with units.
+        """Return a function that formats a camera's result as text, with units.
 
         Raises ConfigurationError: --units has an unknown unit.
         """
@@ -367,12 +372,12 @@ class Options:
 
         units = ShownUnits(self.unit_names or ())
 
-        def as_text(camera: Camera, result: Result) -> str:
+        def make_text(camera: Camera, result: Result) -> str:
             interpreter = own_interpreter(camera, result.application)
             layout = None if interpreter is None else interpreter.layout
             return result_text(result, units, layout)
 
-        return as_text
+        return make_text
 
     def value_text(self, value: object) -> str:
         """Return the text of a value interpreted by --interpret-as, with units.
@@ -386,15 +391,18 @@ class Options:
         layout = None if self.interpret_as is None else resolve(self.interpret_as).layout
         return value_text(value, ShownUnits(self.unit_names or ()), layout)
 
-    def remark(self, camera: Camera) -> None:
-        """Print the dialect's remark for users of results on stderr, if there is one."""
+    def show_remarks(self, camera: Camera) -> None:
+        """Print on stderr what users of results should know about the camera's dialect, if any."""
         from smartcam._client._inside import remarks
 
         for text in remarks(camera.settings.address):
             click.echo(f"note: {text}", err=True)
 
     def show(self, value: object, text: str | Callable[[Any], str]) -> None:
-        """Print ``value`` as a line of JSON, or ``text`` (of it) for people; flushed."""
+        """Print ``value`` as a line of JSON with ``--json``, else ``text``; flush.
+
+        ``text``: the text, or a function that makes it of ``value``.
+        """
         if self.as_json:
             import json
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import CAMERA, CONNECTS, Options, runs
+from smartcam._cli.options import CAMERA_OPTIONS, CONNECT_WARNING, Options, async_command
 from smartcam.backoff import Backoff
 from smartcam.exceptions import SmartCamError
 
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
     help="Bring a camera's results to brokers and databases, as a YAML file says, until Ctrl-C. "
     "Undelivered results wait in a spool beside the file, also for the next start. The file "
     "has the section outlets: of a fleet file. Prints a line for each trouble, "
-    f"and the accounts at the end. {CONNECTS}"
+    f"and the accounts at the end. {CONNECT_WARNING}"
 )
 @click.argument("url")
 @click.argument("file", metavar="FILE.yaml")
-@runs(
+@async_command(
     *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--seconds"),
-    *CAMERA,
-    interrupted=0,
-    terminated=0,
+    *CAMERA_OPTIONS,
+    interrupt_code=0,
+    terminate_code=0,
 )
 async def outlet(url: str, file: str, options: Options) -> None:
     """Deliver results."""
-    from smartcam._cli.live import have_open
+    from smartcam._cli.live import keep_open
     from smartcam.outlets import Outlets
     from smartcam.outlets._inside import OutletsFile
 
@@ -49,20 +49,20 @@ async def outlet(url: str, file: str, options: Options) -> None:
         Path(file).parent,
         columns=source.columns,
         command=source.command,
-        on_trouble=source.tell,
+        on_trouble=source.report_trouble,
         cameras=source.cameras,
-        names=source.names,
+        names=source.application_names,
     )
-    url = await options.located(url)
-    with options.cameras(url, reconnect=Backoff()) as make:
+    url = await options.locate_url(url)
+    with options.cameras(url, reconnect=Backoff()) as make_camera:
         async with outlets:
             try:
                 with contextlib.suppress(TimeoutError):  # --seconds are over
                     async with asyncio.timeout(options.seconds):
-                        camera = make()
-                        await source.follow(camera, "", outlets)
-                        follow = source.follower(outlets)
-                        await have_open(camera, make, follow, source.opened)
+                        camera = make_camera()
+                        await source.use_camera(camera, "", outlets)
+                        replace_camera = source.make_replacer(outlets)
+                        await keep_open(camera, make_camera, replace_camera, source.show_open)
             finally:
                 await source.stop()
         for name, state in outlets.states.items():
@@ -70,33 +70,33 @@ async def outlet(url: str, file: str, options: Options) -> None:
 
 
 class _OutletSource:
-    """The source of the outlets: a camera's results, errors and states."""
+    """Feeds the outlets with a camera's results, errors and states."""
 
     def __init__(self, options: Options) -> None:
         self._options = options
         self.camera: Camera[Any] | None = None
         self._tasks: list[asyncio.Task[None]] = []
 
-    def follower(self, outlets: Outlets) -> Any:
-        async def follow(camera: Camera[Any], why: str) -> None:
-            await self.follow(camera, why, outlets)
+    def make_replacer(self, outlets: Outlets) -> Any:
+        async def replace_camera(camera: Camera[Any], reason: str) -> None:
+            await self.use_camera(camera, reason, outlets)
 
-        return follow
+        return replace_camera
 
-    async def follow(self, camera: Camera[Any], why: str, outlets: Outlets) -> None:
-        """Take results and events of this camera from now on."""
+    async def use_camera(self, camera: Camera[Any], reason: str, outlets: Outlets) -> None:
+        """Pass on the results and events of this camera instead of an earlier camera's."""
         await self.stop()
         self.camera = camera
-        if why:
-            click.echo(f"note: {why}; it is tried on", err=True)
+        if reason:
+            click.echo(f"note: {reason}; trying again", err=True)
         loop = asyncio.get_running_loop()
         results, events = camera.results(max_queue=100_000), camera.events()
         self._tasks = [
-            loop.create_task(_results(camera.name, results, outlets)),
-            loop.create_task(_events(events, outlets)),
+            loop.create_task(_pass_results(camera.name, results, outlets)),
+            loop.create_task(_pass_events(events, outlets)),
         ]
 
-    def opened(self) -> None:
+    def show_open(self) -> None:
         if self.camera is not None:
             self._options.show({"camera": self.camera.url}, f"camera: {self.camera.url}")
 
@@ -107,7 +107,7 @@ class _OutletSource:
         if tasks:
             await asyncio.wait(tasks)
 
-    def names(self, _camera: str) -> Mapping[str, int]:
+    def application_names(self, _camera: str) -> Mapping[str, int]:
         return {} if self.camera is None else self.camera.settings.application_names
 
     def columns(self, _camera: str, application: int) -> Any:
@@ -116,30 +116,30 @@ class _OutletSource:
 
         options = self._options
         spec = options.interpret_as or "raw"
-        if self.camera is not None:  # a camera with layouts of its own has them here
+        if self.camera is not None:  # its settings also have layouts of its own
             spec = self.camera.settings.interpret_as
         read = Interpretation(spec, lenient=False, y_down=options.y_down)
         return columns_of(read.interpreter(application))
 
-    async def command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    async def command(self, name: str, verb: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         from smartcam.exceptions import ConfigurationError
         from smartcam.outlets._inside import do_command
 
         if self.camera is None or name != self.camera.name:
             raise ConfigurationError(f"there is no camera {name!r:.120} here")
-        return await do_command(self.camera, verb, given)
+        return await do_command(self.camera, verb, arguments)
 
     def cameras(self) -> dict[str, bool | None]:
         return {} if self.camera is None else {self.camera.name: None}
 
-    def tell(self, name: str, why: str) -> None:
-        text = why or "delivers again"
+    def report_trouble(self, name: str, reason: str) -> None:
+        text = reason or "delivers again"
         click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} outlet {name}: {text}", err=True)
 
 
-async def _results(name: str, results: Any, outlets: Outlets) -> None:
-    """Pass on results; results that the subscription lost are reported as an error."""
-    reported = 0
+async def _pass_results(name: str, results: Any, outlets: Outlets) -> None:
+    """Pass results on to the outlets; report results that the subscription lost as an error."""
+    reported_count = 0
     while True:
         try:
             result = await anext(results)
@@ -152,14 +152,14 @@ async def _results(name: str, results: Any, outlets: Outlets) -> None:
         else:
             outlets.offer_result(result)
         account = results.statistics()
-        lost = account.dropped + account.missed
-        if lost > reported:
-            text = f"{lost - reported} results did not arrive"
+        lost_count = account.dropped + account.missed
+        if lost_count > reported_count:
+            text = f"{lost_count - reported_count} results did not arrive"
             outlets.offer_error(name, datetime.now(UTC), text, "Missed")
-            reported = lost
+            reported_count = lost_count
 
 
-async def _events(events: Any, outlets: Outlets) -> None:
+async def _pass_events(events: Any, outlets: Outlets) -> None:
     from smartcam.models import ApplicationChanged, Connected, Disconnected, Reconnected
 
     state: dict[str, Any] = {"connected": False, "application": None, "reason": None}

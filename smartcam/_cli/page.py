@@ -1,4 +1,4 @@
-"""Add ``--web`` to commands: its options, and a page that runs beside the command."""
+"""The options of commands that can serve a page: ``--web``, ``--web-host`` and others."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class PageOptions:
-    """The page of the options.
+    """The options of a page.
 
     Args:
         web: whether there is a page.
@@ -21,11 +21,11 @@ class PageOptions:
         web_token: the token, None for the site's own choice.
 
     Attributes:
-        wanted: whether there is a page.
-        site_arguments: address of the page, and its token, in the form for a site.
+        is_wanted: whether there is a page.
+        site_arguments: arguments of the site: host, port and token.
 
     Raises:
-        click.UsageError: options of a page are given without a page.
+        click.UsageError: an address is given without a page.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class PageOptions:
         needless = [name for name, value in values.items() if value is not None]
         if needless and not web:
             raise click.UsageError(f"{needless[0]} needs --web")
-        self.wanted: bool = web
+        self.is_wanted: bool = web
         self.site_arguments: dict[str, Any] = {
             "host": web_host or "127.0.0.1",
             "port": web_port or 0,
@@ -48,7 +48,7 @@ def page_options(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that gives a command the options of a page, as ``web``.
 
-    ``about``: help for ``--web``. ``always``: the command has a page anyway, and no ``--web``.
+    ``about``: help for ``--web``. ``always``: the command always has a page, and no ``--web``.
     """
     flag = click.option("--web", is_flag=True, help=f'{about} Needs the extra "web".')
     options = [
@@ -71,13 +71,13 @@ def page_options(
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(function)
-        def packed(*args: Any, **given: Any) -> None:
-            place = {name: given.pop(name) for name in ("web_host", "web_port", "web_token")}
-            wanted = always or given.pop("web")
-            function(*args, web=PageOptions(web=wanted, **place), **given)
+        def with_page(*args: Any, **arguments: Any) -> None:
+            site = {name: arguments.pop(name) for name in ("web_host", "web_port", "web_token")}
+            web = always or arguments.pop("web")
+            function(*args, web=PageOptions(web=web, **site), **arguments)
 
         for option in reversed(options):
-            packed = option(packed)
-        return packed
+            with_page = option(with_page)
+        return with_page
 
     return decorate

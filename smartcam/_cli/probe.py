@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import CONNECTS, OUTPUT, Options, option, runs
+from smartcam._cli.options import CONNECT_WARNING, OUTPUT_OPTIONS, Options, async_command, option
 
 if TYPE_CHECKING:
     from smartcam.doctor._inside import CameraAnswer, Trial
@@ -19,16 +19,16 @@ MAX_HEX_DIGITS = 128
 
 @click.command(
     help="Find out how a camera speaks; HOST or URL. Tries the URL's options, then every protocol, "
-    f"transport and dialect, the most probable first, until one is answered. {CONNECTS}"
+    f"transport and dialect, the most probable first, until one is answered. {CONNECT_WARNING}"
 )
 @click.argument("host_or_url")
-@click.option("--all", "go_on", is_flag=True, help="Try the rest, too, after one is answered.")
+@click.option("--all", "try_all", is_flag=True, help="Try the rest, too, after one is answered.")
 @option(
     "--timeout",
     help="Longest time of all tries together (default 10); each gets an equal share of the rest.",
 )
-@runs("--trace", *OUTPUT)
-async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
+@async_command("--trace", *OUTPUT_OPTIONS)
+async def probe(host_or_url: str, try_all: bool, options: Options) -> None:
     """Try protocols, transports and dialects, one after the other on fresh links.
 
     Raises ConnectFailedError: no try was answered; the error names each try.
@@ -38,24 +38,24 @@ async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
 
     address = parse_address(host_or_url)
     answers: list[CameraAnswer] = []
-    failed: list[Trial] = []
-    with options.tracing(host_or_url) as trace:
-        timeout = options.step(10.0)
-        tries = trials(address, timeout=timeout, trace=trace, go_on=go_on, every_protocol=True)
+    failed_trials: list[Trial] = []
+    with options.open_trace(host_or_url) as trace:
+        timeout = options.step_timeout(10.0)
+        tries = trials(address, timeout=timeout, trace=trace, go_on=try_all, every_protocol=True)
         async with aclosing(tries):
             async for trial in tries:
                 _show_trial(trial, options)
                 if trial.answer is not None:
                     answers.append(trial.answer)
                 else:
-                    failed.append(trial)
+                    failed_trials.append(trial)
     if not answers:
-        raise no_session(host_or_url, address, failed)
+        raise no_session(host_or_url, address, failed_trials)
     _show_answers(answers, options)
 
 
 def frame_text(entry: TraceEntry) -> str:
-    """Return an entry as a line: message, fields, bytes; broken bytes as text, too."""
+    """Return an entry as a line: message, fields, bytes; broken bytes also as characters."""
     data = entry.hex[:MAX_HEX_DIGITS] + ("..." if len(entry.hex) > MAX_HEX_DIGITS else "")
     if entry.direction != "!":
         fields = ", ".join(f"{name}={value}" for name, value in (entry.fields or {}).items())
@@ -79,10 +79,10 @@ def _show_trial(trial: Trial, options: Options) -> None:
 
 
 def _show_answers(answers: list[CameraAnswer], options: Options) -> None:
-    first, *more = answers
+    first, *others = answers
     lines = [
         f"status: {first.status}",
-        *(f"also: {answer.url}" for answer in more),
+        *(f"also: {answer.url}" for answer in others),
         f"use: {first.url}",
     ]
     value = {
@@ -90,6 +90,6 @@ def _show_answers(answers: list[CameraAnswer], options: Options) -> None:
         "status": first.status,
         "protocol_version": first.protocol_version,
         "application": first.application,
-        "also": [answer.url for answer in more],
+        "also": [answer.url for answer in others],
     }
     options.show(value, "\n".join(lines))

@@ -10,10 +10,17 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, cast
 
 import click
 
-from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, runs
-from smartcam._cli.running import first
-from smartcam._cli.terminal import counting
-from smartcam._cli.texts import camera_value, not_running
+from smartcam._cli.options import (
+    CONNECT_WARNING,
+    OUTPUT_OPTIONS,
+    SECONDS,
+    Options,
+    async_command,
+    option,
+)
+from smartcam._cli.running import run_until_first
+from smartcam._cli.terminal import counting_line
+from smartcam._cli.texts import camera_value, not_running_error
 from smartcam._extras import from_part
 from smartcam.backoff import Backoff
 from smartcam.exceptions import (
@@ -41,7 +48,7 @@ if TYPE_CHECKING:
     from smartcam.recording._inside import BagCounts, JudgedPictures
 
 
-def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
+def _parse_time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
     """Parse a time with its zone."""
     try:
         return None if value is None else datetime.fromisoformat(value).astimezone(UTC)
@@ -49,12 +56,12 @@ def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> da
         raise click.BadParameter(f"{value!r} is no time such as 2026-01-02T03:04:05Z") from exc
 
 
-JUDGED: Final = "judged"
-"""Value of --pictures for the pictures that results were made of."""
+JUDGED_PICTURES: Final = "judged"
+"""Value of --pictures: record the picture from which each result was made."""
 
 NO_PICTURES: Final = "none"
 
-_camera = click.option(
+_camera_option = click.option(
     "--camera", metavar="NAME", help="Camera of the recording; default all of them."
 )
 
@@ -64,7 +71,7 @@ _camera = click.option(
     "frames, results, events, errors; of a fleet's camera no frames, and the results of "
     "every program's triggers. --bag writes a rosbag2 for ROS 2, too, or instead. After a "
     "lost link the recording goes on. "
-    f"{CONNECTS}"
+    f"{CONNECT_WARNING}"
 )
 @click.argument("url")
 @option("--output")
@@ -93,7 +100,7 @@ _camera = click.option(
 @option("--name", help="The camera's name in the file; default HOST:PORT.")
 @option("--application")
 @option("--interpret-as", help="Interpretation of results; default raw: bytes, kept as hex.")
-@runs("--y-down", "--count", "--seconds", "--timeout", *OUTPUT, interrupted=0)
+@async_command("--y-down", "--count", "--seconds", "--timeout", *OUTPUT_OPTIONS, interrupt_code=0)
 async def record(
     url: str,
     output: str | None,
@@ -114,37 +121,37 @@ async def record(
         )
     if read_images and every is None:
         raise click.UsageError(
-            "--read-images needs --every: only of a trigger that is sent from "
-            "here the picture that is read is surely the result's"
+            "--read-images needs --every: the picture that is read is surely the result's only if "
+            "the trigger was sent from here"
         )
-    recorders = _recorders(output, bag, force=force, pictures=pictures != NO_PICTURES)
-    url = await options.located(url)
+    recorders = _make_recorders(output, bag, force=force, pictures=pictures != NO_PICTURES)
+    url = await options.locate_url(url)
     async with contextlib.AsyncExitStack() as stack:
         source = judged = None
         observers: list[Observer] = [*recorders]
-        if pictures == JUDGED:
+        if pictures == JUDGED_PICTURES:
             judged = _judged_pictures(url, recorders[0])
             observers += [] if judged is None else [judged]
         elif pictures is not None and pictures != NO_PICTURES:
             with from_part("frames", "pictures need"):
-                from smartcam._cli.frame_sources import opened
+                from smartcam._cli.frame_sources import make_source
 
-            source = await stack.enter_async_context(opened(pictures, options))
+            source = await stack.enter_async_context(make_source(pictures, options))
         camera = stack.enter_context(options.camera(url, observers=observers, reconnect=Backoff()))
         await _record(camera, recorders, _Plan(every, source, judged, read_images), options)
 
 
 class _Plan(NamedTuple):
-    """The triggers and pictures of a recording."""
+    """The triggers that a recording sends, and the pictures that it records."""
 
     every: float | None  # seconds between triggers; None: none are sent
     source: FrameSource | None  # source whose pictures are recorded, too
-    judged: JudgedPictures | None  # finds each result's picture among the camera's frames
+    judged: JudgedPictures | None  # finds the picture of each result among the camera's frames
     read_images: bool  # whether the camera's picture is read after each trigger
 
 
 def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
-    """Return the finder of each result's picture; None if the camera itself names the picture.
+    """Return the finder of results' pictures; None for a software camera, which sends them.
 
     Raises UnsupportedError: the pictures of the camera's results cannot be found.
     """
@@ -163,10 +170,10 @@ def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
     return JudgedPictures(recorder)
 
 
-def _recorders(
+def _make_recorders(
     output: str | None, bag: str | None, *, force: bool, pictures: bool
 ) -> list[Recorder]:
-    """Return the recorders of the file and of the bag that the options ask for."""
+    """Return the recorders of the options: of a file, of a bag, or of both."""
     from smartcam.recording import Recorder
 
     recorders: list[Recorder] = []
@@ -184,27 +191,31 @@ def _recorders(
 
 
 async def _record(
-    unopened: Camera, recorders: list[Recorder], plan: _Plan, options: Options
+    unopened_camera: Camera, recorders: list[Recorder], plan: _Plan, options: Options
 ) -> None:
     from smartcam.settings import is_fleet
 
-    opened: list[Recorder] = []
-    facts = {
-        "interpret_as": options.interpret_as or unopened.settings.interpret_as,
+    opened_recorders: list[Recorder] = []
+    settings = {
+        "interpret_as": options.interpret_as or unopened_camera.settings.interpret_as,
         "application": options.application,
         "y_down": options.y_down,
     }
     try:
         for recorder in recorders:
             recorder.open()
-            opened.append(recorder)
-        options.remark(unopened)
-        _describe(recorders, unopened.name, **{name: fact for name, fact in facts.items() if fact})
-        # subscribed, so that every container is interpreted
-        results = unopened.results(max_queue=1)
-        async with unopened as camera:
+            opened_recorders.append(recorder)
+        options.show_remarks(unopened_camera)
+        _describe(
+            recorders,
+            unopened_camera.name,
+            **{name: value for name, value in settings.items() if value},
+        )
+        # a container is interpreted only if there is a subscription
+        results = unopened_camera.results(max_queue=1)
+        async with unopened_camera as camera:
             if is_fleet(camera.url):
-                _describe_shared(recorders, cast("FleetCamera[Any]", camera))
+                _describe_fleet_camera(recorders, cast("FleetCamera[Any]", camera))
             elif plan.every is None and not camera.capabilities.unasked_results:
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some triggered "
@@ -215,23 +226,23 @@ async def _record(
                     f"{camera.name}: this camera cannot be asked for a picture; --pictures SOURCE "
                     "records those of a source of frames"
                 )
-            paths = {_word(recorder): str(recorder.path) for recorder in recorders}
+            paths = {_file_kind(recorder): str(recorder.path) for recorder in recorders}
             options.show(
                 {"url": camera.url, **paths},
                 f"recording {camera.url} to {' and '.join(paths.values())}, Ctrl-C to end",
             )
-            async with _judged_source(camera, plan) as source, counting(camera):
-                jobs = _jobs(camera, recorders, plan, results, options)
+            async with _judged_source(camera, plan) as source, counting_line(camera):
+                jobs = _recording_jobs(camera, recorders, plan, results, options)
                 if source is not None and plan.judged is not None:
                     jobs.insert(0, plan.judged.record(source, camera.name))
-                await first(jobs, options.seconds)
+                await run_until_first(jobs, options.seconds)
     finally:
-        await _end_all(opened, unopened, options)
+        await _close_all(opened_recorders, unopened_camera, options)
 
 
 @contextlib.asynccontextmanager
 async def _judged_source(camera: Camera, plan: _Plan) -> AsyncIterator[FrameSource | None]:
-    """Yield the open source of the frames among which results' pictures are searched."""
+    """Yield the open source of the camera's frames, if pictures of results are to be found."""
     if plan.judged is None:
         yield None
         return
@@ -239,47 +250,49 @@ async def _judged_source(camera: Camera, plan: _Plan) -> AsyncIterator[FrameSour
         yield source
 
 
-def _jobs(
+def _recording_jobs(
     camera: Camera, recorders: list[Recorder], plan: _Plan, results: Any, options: Options
 ) -> list[Coroutine[Any, Any, None]]:
-    """Return the jobs of a recording, which ends with the first of them."""
+    """Return the jobs of a recording; it ends when the first of them ends."""
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
     jobs: list[Coroutine[Any, Any, None]] = [*map(_watch_disk, recorders)]
     count = options.count
-    images = recorders[0] if plan.read_images else None  # so that the last picture is read, too
-    jobs.append(_count(results, recorders[0], plan.judged, count if images is None else None))
+    image_recorder = recorders[0] if plan.read_images else None
+    # with images, the triggers end it, so that the last picture is read, too
+    result_count = count if image_recorder is None else None
+    jobs.append(_wait_for_count(results, recorders[0], plan.judged, result_count))
     if plan.every is not None:
-        step = options.step(DEFAULT_TRIGGER_TIMEOUT)
-        jobs.append(_trigger(camera, plan.every, step, images, count, plan.judged))
+        timeout = options.step_timeout(DEFAULT_TRIGGER_TIMEOUT)
+        jobs.append(_send_triggers(camera, plan.every, timeout, image_recorder, count, plan.judged))
     if plan.source is not None:
         jobs.append(_record_pictures(plan.source, recorders[0], camera.name))
     return jobs
 
 
-def _describe_shared(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
-    """Record the agent's facts that a recording of frames would contain."""
+def _describe_fleet_camera(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
+    """Record the agent's settings, which a recording without frames would not contain."""
     from smartcam._client._inside import in_pixels, own_interpreter
 
     dialect = camera.capabilities.dialect
     _describe(recorders, camera.name, dialect=dialect, endian=camera.endian)
-    read = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
+    reading = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
     if in_pixels(own_interpreter(camera, camera.active_application)):
-        read["pixels"] = True
-    _describe(recorders, camera.name, **{name: on for name, on in read.items() if on})
+        reading["pixels"] = True
+    _describe(recorders, camera.name, **{name: value for name, value in reading.items() if value})
 
 
-def _describe(recorders: list[Recorder], camera: str, **facts: object) -> None:
+def _describe(recorders: list[Recorder], camera: str, **settings: object) -> None:
     for recorder in recorders:
-        recorder.describe(camera, **facts)
+        recorder.describe(camera, **settings)
 
 
-def _word(recorder: Recorder) -> str:
+def _file_kind(recorder: Recorder) -> str:
     return "file" if _as_bag(recorder) is None else "bag"
 
 
 def _as_bag(recorder: Recorder) -> BagRecorder | None:
-    """Return a recorder that writes a bag; None for one that writes a plain file."""
+    """Return the recorder if it writes a bag; None if it writes a file."""
     from smartcam.recording import Recorder as PlainRecorder
 
     if type(recorder) is PlainRecorder:
@@ -293,15 +306,15 @@ async def _watch_disk(recorder: Recorder) -> None:
     raise await recorder.wait_failed()
 
 
-async def _count(
+async def _wait_for_count(
     results: Any, recorder: Recorder, judged: JudgedPictures | None, count: int | None
 ) -> None:
-    """Return after so many results, with their pictures; or at the camera's end."""
+    """Wait until ``count`` results and their pictures are recorded, or the camera is closed."""
     while count is None or recorder.counts.results < count:
         try:
             await anext(results)
         except InterpretationError:
-            pass  # the loss is recorded as an error
+            pass  # it is recorded as an error
         except StopAsyncIteration:
             return
     if judged is not None:
@@ -309,48 +322,51 @@ async def _count(
 
 
 async def _record_pictures(source: FrameSource, recorder: Recorder, camera: str) -> None:
-    """Record a source's pictures as the camera's; the end of the source ends the recording."""
+    """Record a source's pictures under the camera's name, until the source ends."""
     await recorder.record(source, camera=camera)
 
 
-async def _read_image(camera: Camera, recorder: Recorder, result: Any, results: int) -> None:
-    """Record a result's picture, before another trigger replaces the picture."""
+async def _record_image(camera: Camera, recorder: Recorder, result: Any, results: int) -> None:
+    """Read and record a result's picture, unless a newer result has arrived meanwhile.
+
+    ``results``: number of results that were recorded before.
+    """
     try:
         image = await camera.read_image()
-    except CommandRejectedError:  # the camera has none, as the recorded frames show
+    except CommandRejectedError:  # the camera has no picture; the recorded frames show that
         return
     if recorder.counts.results == results:
         await asyncio.to_thread(recorder.add_image, camera.name, image, result=result)
 
 
-async def _trigger(
+async def _send_triggers(
     camera: Camera,
     every: float,
     timeout: float,
-    images: Recorder | None,
+    image_recorder: Recorder | None,
     count: int | None,
     judged: JudgedPictures | None,
 ) -> None:
-    """Send triggers; errors are recorded, once the first triggers have succeeded.
+    """Send a trigger every ``every`` seconds; after the first success, ignore failed triggers.
 
-    ``images``: the recorder that also gets the picture of each of ``count`` results.
-    ``judged``: finder of each result's picture; triggers wait until there are pictures.
+    ``image_recorder``: recorder for the picture of each of ``count`` results, None for no pictures.
+    ``judged``: finds each result's picture; the first trigger waits until frames arrive.
     """
     if judged is not None:
         await judged.wait_streaming()
     loop = asyncio.get_running_loop()
-    when, worked = loop.time(), False
+    next_at, has_succeeded = loop.time(), False
     while True:
         try:
             result = await camera.trigger(timeout=timeout)
-            worked = True
-            if images is not None:
-                await _read_image(camera, images, result, images.counts.results)
-                if count is not None and images.counts.results >= count:
+            has_succeeded = True
+            if image_recorder is not None:
+                await _record_image(camera, image_recorder, result, image_recorder.counts.results)
+                if count is not None and image_recorder.counts.results >= count:
                     return
         except NotRunningError as exc:
-            if not worked:
-                raise not_running(exc, camera, "record") from exc
+            if not has_succeeded:
+                raise not_running_error(exc, camera, "record") from exc
         except (TriggerError, CameraFaultError, InterpretationError, ResponseTimeoutError):
             pass
         except (ConnectionTakenError, ConnectionClosedError):
@@ -359,19 +375,19 @@ async def _trigger(
             with contextlib.suppress(ResponseTimeoutError):
                 await camera.wait_connected()
         # a trigger that took too long skips the next ones, instead of hurrying
-        when += every * max(1, -(-(loop.time() - when) // every))
-        await asyncio.sleep(when - loop.time())
+        next_at += every * max(1, -(-(loop.time() - next_at) // every))
+        await asyncio.sleep(next_at - loop.time())
 
 
-async def _end_all(recorders: list[Recorder], camera: Camera, options: Options) -> None:
-    """End each file, even if ending another has failed."""
+async def _close_all(recorders: list[Recorder], camera: Camera, options: Options) -> None:
+    """Close each recorder and report it, even if this fails for another one."""
     async with contextlib.AsyncExitStack() as stack:
         for recorder in reversed(recorders):
-            stack.push_async_callback(_end, recorder, camera, options)
+            stack.push_async_callback(_close_and_report, recorder, camera, options)
 
 
-async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
-    """End the file, and report its contents; without a session there is no file."""
+async def _close_and_report(recorder: Recorder, camera: Camera, options: Options) -> None:
+    """Close a recorder and report its contents; remove the file if there was no session."""
     path = recorder.path
     await asyncio.to_thread(recorder.close)
     bag = _as_bag(recorder)
@@ -382,11 +398,11 @@ async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
             bag.remove()
     elif camera.statistics().sessions:
         counts, size = recorder.counts._asdict(), path.stat().st_size
-        always = ("frames", "results", "events", "errors")
+        always_shown = ("frames", "results", "events", "errors")
         text = ", ".join(
             f"{kind.replace('_', ' ')} {number}"
             for kind, number in counts.items()
-            if number or kind in always
+            if number or kind in always_shown
         )
         options.show({"file": str(path), **counts, "bytes": size}, f"{path}: {text}; {size} bytes")
     elif path.is_file() and not path.is_symlink():
@@ -411,10 +427,16 @@ def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
 @click.option("--speed", type=float, default=1.0, show_default=True, help="How many times faster.")
 @click.option("--loop", is_flag=True, help="Begin again at the end of the recording.")
 @click.option(
-    "--from", "since", metavar="TIME", callback=_time, help="Begin at this time of the recording."
+    "--from",
+    "start",
+    metavar="TIME",
+    callback=_parse_time,
+    help="Begin at this time of the recording.",
 )
-@click.option("--until", metavar="TIME", callback=_time, help="End at this time of the recording.")
-@_camera
+@click.option(
+    "--until", metavar="TIME", callback=_parse_time, help="End at this time of the recording."
+)
+@_camera_option
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
     "--port",
@@ -426,7 +448,7 @@ def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
 @click.option(
     "--transport", type=click.Choice(("tcp", "udp")), help="Transport; default the recorded one."
 )
-@runs(*OUTPUT, interrupted=0, terminated=0)
+@async_command(*OUTPUT_OPTIONS, interrupt_code=0, terminate_code=0)
 async def replay(
     recording: str,
     speed: float,
@@ -435,30 +457,30 @@ async def replay(
     host: str,
     port: int,
     transport: Literal["tcp", "udp"] | None,
-    since: datetime | None,
+    start: datetime | None,
     until: datetime | None,
     options: Options,
 ) -> None:
     """Play a recording."""
     from smartcam.recording import replay as replay_camera
 
-    loaded = _loaded(recording, since, until)
+    loaded = _load(recording, start, until)
     if loaded.files != (loaded.path,):
         if transport is not None:
             raise click.UsageError("--transport is for a file: programs come to a folder's agent")
         cameras = None if camera is None else [camera]
-        place = f"[{host}]" if ":" in host else host
+        bracketed_host = f"[{host}]" if ":" in host else host
         with from_part("fleet", "a folder of a fleet's recordings needs"):
             from smartcam.recording import FleetReplay
-        played = FleetReplay(
+        fleet_replay = FleetReplay(
             loaded,
             cameras=cameras,
             speed=speed,
             loop=loop,
-            listen=f"tcp/{place}:{port}",
-            on_over=_camera_over,
+            listen=f"tcp/{bracketed_host}:{port}",
+            on_over=_report_camera_end,
         )
-        await _play_fleet(played, options)
+        await _play_fleet(fleet_replay, options)
         return
     names = list(loaded.cameras) if camera is None else [camera]
     async with contextlib.AsyncExitStack() as stack:
@@ -470,7 +492,7 @@ async def replay(
                 loop=loop,
                 host=host,
                 port=port + index if port else 0,
-                on_over=_over,
+                on_over=_report_end,
                 **({} if transport is None else {"transport": transport}),
             )
             await stack.enter_async_context(emulator)
@@ -478,22 +500,22 @@ async def replay(
         await asyncio.Event().wait()
 
 
-async def _play_fleet(played: FleetReplay, options: Options) -> None:
-    """Play a folder until cancelled."""
+async def _play_fleet(fleet_replay: FleetReplay, options: Options) -> None:
+    """Play the recordings of a fleet until cancelled."""
     with from_part("fleet", "a folder of a fleet's recordings needs"):
         from smartcam._cli.serve import share
 
-    for name, why in played.skipped.items():
-        click.echo(f"smartcam: note: {name} is not played: {why}", err=True)
-    async with played:
-        await share(played.server, options)
+    for name, reason in fleet_replay.skipped.items():
+        click.echo(f"smartcam: note: {name} is not played: {reason}", err=True)
+    async with fleet_replay:
+        await share(fleet_replay.server, options)
 
 
-def _camera_over(name: str) -> None:
+def _report_camera_end(name: str) -> None:
     click.echo(f"smartcam: note: {name}: the recording is over: nothing of it is left", err=True)
 
 
-def _over() -> None:
+def _report_end() -> None:
     click.echo("smartcam: note: the recording is over: triggers get no result any more", err=True)
 
 
@@ -504,15 +526,15 @@ def _over() -> None:
 @click.argument("recording", metavar="RUN.mcap", type=click.Path())
 @option("--output", required=True)
 @option("--force")
-@_camera
-@runs(*OUTPUT)
+@_camera_option
+@async_command(*OUTPUT_OPTIONS)
 async def pcap(
     recording: str, output: str, force: bool, camera: str | None, options: Options
 ) -> None:
     """Convert a recording for Wireshark."""
     from smartcam.recording import write_pcap
 
-    count = write_pcap(_loaded(recording), output, camera=camera, overwrite=force)
+    count = write_pcap(_load(recording), output, camera=camera, overwrite=force)
     options.show({"file": output, "packets": count}, f"{output}: {count} packets")
 
 
@@ -526,9 +548,9 @@ async def pcap(
     "-o", "--output", metavar="FOLDER", type=click.Path(), required=True, help="The bag's folder."
 )
 @option("--force", help="Replace an existing bag.")
-@_camera
+@_camera_option
 @option("--interpret-as", help="New interpretation of the results; default as recorded.")
-@runs("--y-down", "--calibration", *OUTPUT)
+@async_command("--y-down", "--calibration", *OUTPUT_OPTIONS)
 async def bag(
     recording: str, output: str, force: bool, camera: str | None, options: Options
 ) -> None:
@@ -536,8 +558,8 @@ async def bag(
     with from_part("ros2", "a bag needs"):
         from smartcam.recording._inside import BagConversion
 
-    loaded = _loaded(recording)
-    reading = options.reading(fleet=True) if options.calibration or options.y_down else {}
+    loaded = _load(recording)
+    reading = options.reading_options(fleet=True) if options.calibration or options.y_down else {}
     conversion = BagConversion(
         loaded,
         Path(output),
@@ -548,9 +570,9 @@ async def bag(
         overwrite=force,
     )
     with contextlib.closing(conversion.steps()) as steps:
-        for place, _ in enumerate(steps):
-            if not place % 32:
-                await asyncio.sleep(0)  # a place at which the task can be cancelled
+        for number, _ in enumerate(steps):
+            if not number % 32:
+                await asyncio.sleep(0)  # here the task can be cancelled
     counts = conversion.counts
     if counts.unread:
         click.echo(
@@ -561,11 +583,11 @@ async def bag(
     _show_bag(output, counts, options)
 
 
-def _loaded(path: str, since: datetime | None = None, until: datetime | None = None) -> Recording:
-    """Return a recording; report on stderr where it stops being readable."""
+def _load(path: str, start: datetime | None = None, until: datetime | None = None) -> Recording:
+    """Load a recording; print remarks on damaged parts to stderr."""
     from smartcam.recording import load_recording
 
-    loaded = load_recording(Path(path), since=since, until=until)
+    loaded = load_recording(Path(path), since=start, until=until)
     for remark in loaded.remark.splitlines():
         click.echo(f"smartcam: note: {path}: {remark}", err=True)
     return loaded

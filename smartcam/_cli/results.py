@@ -1,4 +1,4 @@
-"""``smartcam results``: show the contents of a store of results, in a file or beside agents."""
+"""``smartcam results``: show the results in a store: a file, or the stores of a fleet's agents."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 
@@ -20,7 +20,7 @@ DEFAULT_COUNT = 1000
 """Number of results that are shown without ``--count``."""
 
 
-def _since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
+def _parse_since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
     if text is None:
         return None
     age = _AGE.fullmatch(text)
@@ -41,34 +41,40 @@ def _since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
     "names of their truth values, with errors and gaps. The last line of a store counts all "
     "of the time."
 )
-@click.argument("place", metavar="FILE|URL")
-@click.option("--since", metavar="AGE|TIME", callback=_since, help="8h, 30min, 2d, or a time.")
+@click.argument("store", metavar="FILE|URL")
+@click.option(
+    "--since", metavar="AGE|TIME", callback=_parse_since, help="8h, 30min, 2d, or a time."
+)
 @click.option("--failed", is_flag=True, help="Errors, gaps, and results that did not pass.")
 @click.option("--camera", metavar="PATTERN", help="Only these cameras: line1/cam1, line1/**.")
-@runs("--count", "--timeout", *OUTPUT)
+@async_command("--count", "--timeout", *OUTPUT_OPTIONS)
 async def results(
-    place: str, since: datetime | None, failed: bool, camera: str | None, options: Options
+    store: str, since: datetime | None, failed: bool, camera: str | None, options: Options
 ) -> None:
     """Show results."""
-    most = DEFAULT_COUNT if options.count is None else options.count
-    if "://" in place:
-        await _ask(place, since, failed, camera or "**", most, options)
+    max_count = DEFAULT_COUNT if options.count is None else options.count
+    if "://" in store:
+        await _show_fleet_stores(store, since, failed, camera or "**", max_count, options)
         return
     from smartcam.outlets._inside import StoreQuestion, read_store
 
-    stored = read_store(Path(place), StoreQuestion(since, failed, camera or "**", most))
-    _show(stored.rows, stored.summary, "", options)
+    stored = read_store(Path(store), StoreQuestion(since, failed, camera or "**", max_count))
+    _show_rows(stored.rows, stored.summary, "", options)
 
 
-async def _ask(
-    url: str, since: datetime | None, failed: bool, camera: str, most: int, options: Options
+async def _show_fleet_stores(
+    url: str, since: datetime | None, failed: bool, camera: str, max_count: int, options: Options
 ) -> None:
     """Show the contents of the stores of a fleet's agents."""
     with from_part("fleet", "the results of a fleet need"):
         import smartcam.fleet
-    async with smartcam.fleet.open(url, connect_timeout=options.step(10.0)) as fleet:
+    async with smartcam.fleet.open(url, connect_timeout=options.step_timeout(10.0)) as fleet:
         stores = await fleet.stored_results(
-            camera, since=since, failed=failed, most=min(most, 1000), timeout=options.step(30.0)
+            camera,
+            since=since,
+            failed=failed,
+            most=min(max_count, 1000),
+            timeout=options.step_timeout(30.0),
         )
     if not stores:
         raise ResponseTimeoutError(f"results {url}: no agent has a store, or none answered in time")
@@ -76,16 +82,20 @@ async def _ask(
         name = f"{store.agent} {store.outlet}".rstrip()
         if store.error:
             raise ConfigurationError(f"results of the agent {name}: {store.error}")
-        summary = {key: value for key, value in store._asdict().items() if key not in _NO_COUNTS}
-        _show(store.rows, summary, name, options)
+        summary = {
+            key: value for key, value in store._asdict().items() if key not in _NO_COUNT_KEYS
+        }
+        _show_rows(store.rows, summary, name, options)
 
 
-_NO_COUNTS = ("rows", "error")
+_NO_COUNT_KEYS = ("rows", "error")
 
 
-def _show(rows: list[dict[str, Any]], summary: dict[str, Any], name: str, options: Options) -> None:
+def _show_rows(
+    rows: list[dict[str, Any]], summary: dict[str, Any], name: str, options: Options
+) -> None:
     for row in rows:
-        options.show(row, _text(row))
+        options.show(row, _row_text(row))
     least = "at least " if summary["at_least"] else ""
     text = (
         f"{f'{name}: ' if name else ''}{summary['total']} rows: {summary['failed']} failed, "
@@ -95,7 +105,7 @@ def _show(rows: list[dict[str, Any]], summary: dict[str, Any], name: str, option
     options.show(summary, text)
 
 
-def _text(row: dict[str, Any]) -> str:
+def _row_text(row: dict[str, Any]) -> str:
     at = datetime.fromisoformat(row["at"]).astimezone()
     content = row["error"] or row["value"] or ""
     lost = f" ({row['lost']} lost)" if row["lost"] else ""

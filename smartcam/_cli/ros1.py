@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     "tried again, which is reported on stderr, with --json as the same object on stdout. "
     'Needs the extras "ros2" and "web", and no ROS on this machine.'
 )
-@click.argument("place", metavar="FLEET")
+@click.argument("fleet", metavar="FLEET")
 @click.option(
     "--bridge",
     required=True,
@@ -36,37 +36,37 @@ if TYPE_CHECKING:
     help="The rosbridge, such as ws://192.168.0.5:9090.",
 )
 @click.option("--namespace", help="Prefix of the cameras' names, such as /plant.")
-@runs(*OUTPUT, interrupted=0, terminated=0)
-async def ros1(place: str, bridge: str, namespace: str | None, options: Options) -> None:
+@async_command(*OUTPUT_OPTIONS, interrupt_code=0, terminate_code=0)
+async def ros1(fleet: str, bridge: str, namespace: str | None, options: Options) -> None:
     """Make cameras nodes in ROS 1."""
     from smartcam.ros1._inside import checked_url
 
-    checked_url(bridge)  # fails before cameras are taken
-    begun: set[str] = set()
+    checked_url(bridge)  # raises before a camera is connected
+    reported_nodes: set[str] = set()
 
-    def tell(node: RosbridgeNode) -> None:
-        if node.full_name in begun:
-            _report(node, bridge, options)
+    def report_change(node: RosbridgeNode) -> None:
+        if node.full_name in reported_nodes:
+            _report_node(node, bridge, options)
 
     from smartcam.settings import is_fleet
 
-    has = _of_fleet if is_fleet(place) else _served
-    async with has(place, bridge, namespace, tell) as ros:
+    open_ros = _join_fleet if is_fleet(fleet) else _serve_file
+    async with open_ros(fleet, bridge, namespace, report_change) as ros:
         await ros.wait_first_attempts()
-        for node in ros.bridged:
-            why = "" if node.connected else f"  no rosbridge: {node.failure}"
-            options.show(_node(node, bridge), f"{node.full_name}{why}")
-            begun.add(node.full_name)
+        for node in ros.bridged_nodes:
+            failure_text = "" if node.connected else f"  no rosbridge: {node.failure}"
+            options.show(_node_data(node, bridge), f"{node.full_name}{failure_text}")
+            reported_nodes.add(node.full_name)
         await asyncio.Event().wait()
 
 
 @contextlib.asynccontextmanager
-async def _served(
+async def _serve_file(
     path: str, bridge: str, namespace: str | None, report: Any
 ) -> AsyncIterator[RosbridgeFleet]:
     from smartcam.fleet import FleetServer, load_fleet
     from smartcam.fleet._inside import RosSection
-    from smartcam.ros1._inside import bridged
+    from smartcam.ros1._inside import run_bridged_nodes
 
     file, folder = load_fleet(path), Path(path).parent
     sections = {planned.name: planned.entry.ros2 for planned in file.plan()}
@@ -75,14 +75,14 @@ async def _served(
     section = file.ros2 or RosSection.model_validate({})
     async with FleetServer(file, folder=folder, restore=section.autostart) as server:
         await server.wait_first_attempts()
-        async with bridged(
+        async with run_bridged_nodes(
             bridge,
             report,
             server.address,
-            _section(namespace or section.namespace, autostart=section.autostart),
+            _make_section(namespace or section.namespace, autostart=section.autostart),
             cameras=sections,
-            calibrations={name: made for name, made in calibrations.items() if made is not None},
-            hand_eyes={name: made for name, made in hand_eyes.items() if made is not None},
+            calibrations={name: value for name, value in calibrations.items() if value is not None},
+            hand_eyes={name: value for name, value in hand_eyes.items() if value is not None},
             wanted=lambda agent, _camera: agent == file.agent_name,
             desks=server.calibrations,
         ) as ros:
@@ -90,30 +90,30 @@ async def _served(
 
 
 @contextlib.asynccontextmanager
-async def _of_fleet(
+async def _join_fleet(
     url: str, bridge: str, namespace: str | None, report: Any
 ) -> AsyncIterator[RosbridgeFleet]:
     from smartcam.fleet._inside import FleetAddress
-    from smartcam.ros1._inside import bridged
+    from smartcam.ros1._inside import run_bridged_nodes
 
     address = FleetAddress.parse(url)
     if address.camera:
         raise ConfigurationError(
             f"fleet address {url!r} is a camera's: expected that of the fleet, fleet://HOST[:PORT]"
         )
-    async with bridged(bridge, report, address, _section(namespace or "/")) as ros:
+    async with run_bridged_nodes(bridge, report, address, _make_section(namespace or "/")) as ros:
         yield ros
 
 
-def _section(namespace: str, *, autostart: bool = True) -> Any:
+def _make_section(namespace: str, *, autostart: bool = True) -> Any:
     from smartcam._ros_names import check_namespace
     from smartcam.fleet._inside import RosSection
 
-    given = {"namespace": check_namespace(namespace), "autostart": autostart}
-    return RosSection.model_validate(given)
+    fields = {"namespace": check_namespace(namespace), "autostart": autostart}
+    return RosSection.model_validate(fields)
 
 
-def _node(node: RosbridgeNode, bridge: str) -> dict[str, Any]:
+def _node_data(node: RosbridgeNode, bridge: str) -> dict[str, Any]:
     return {
         "node": node.full_name,
         "bridge": bridge,
@@ -122,11 +122,11 @@ def _node(node: RosbridgeNode, bridge: str) -> dict[str, Any]:
     }
 
 
-def _report(node: RosbridgeNode, bridge: str, options: Options) -> None:
+def _report_node(node: RosbridgeNode, bridge: str, options: Options) -> None:
     """Report that a bridge is connected, or lost."""
     at = datetime.now(UTC)
     if options.as_json:
-        options.show({**_node(node, bridge), "at": at}, "")
+        options.show({**_node_data(node, bridge), "at": at}, "")
         return
     text = "connected" if node.connected else f"no rosbridge: {node.failure}"
     click.echo(f"{at.astimezone():%H:%M:%S} {node.full_name}: {text}", err=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
 
 
 ROS_ARGS = "--ros-args"
-"""The option after which all arguments are for ROS, as in any program of ROS."""
+"""The option after which all arguments are for ROS, as in every ROS program."""
 
-THROUGH = {"zenoh": "zenoh", "native": "rclpy"}
-"""Values of ``--rmw``, and their names in a fleet file."""
+RMW_NAMES = {"zenoh": "zenoh", "native": "rclpy"}
+"""Values of ``--rmw``, and the corresponding values in a fleet file."""
 
 
 class RosCommand(click.Command):
     """A command that leaves the arguments after ``--ros-args`` to ROS."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Keep the arguments for ROS, and parse the others."""
-        at = args.index(ROS_ARGS) if ROS_ARGS in args else len(args)
-        left = super().parse_args(ctx, args[:at])
-        ctx.params["ros_args"] = tuple(args[at:])
-        return left
+        """Put the arguments for ROS into ``ros_args``, and parse the others."""
+        index = args.index(ROS_ARGS) if ROS_ARGS in args else len(args)
+        unparsed = super().parse_args(ctx, args[:index])
+        ctx.params["ros_args"] = tuple(args[index:])
+        return unparsed
 
 
 @click.command(
@@ -42,7 +42,7 @@ class RosCommand(click.Command):
     'line per camera, with its node. Options win over "ros2" in a fleet file. Needs the '
     'extra "ros2", and ROS only for --rmw native.',
 )
-@click.argument("place", metavar="FLEET")
+@click.argument("fleet", metavar="FLEET")
 @click.option(
     "--domain",
     type=click.IntRange(0, 0xFFFFFFFF),
@@ -56,12 +56,12 @@ class RosCommand(click.Command):
 )
 @click.option(
     "--rmw",
-    type=click.Choice(list(THROUGH)),
+    type=click.Choice(list(RMW_NAMES)),
     help="zenoh: smartcam itself, like rmw_zenoh; native: the installed ROS.  [default: zenoh]",
 )
-@runs(*OUTPUT, interrupted=0, terminated=0)
+@async_command(*OUTPUT_OPTIONS, interrupt_code=0, terminate_code=0)
 async def ros2(
-    place: str,
+    fleet: str,
     domain: int | None,
     namespace: str | None,
     distribution: str | None,
@@ -70,35 +70,37 @@ async def ros2(
     options: Options,
 ) -> None:
     """Make cameras nodes in ROS 2."""
-    chosen: dict[str, object] = {
+    values: dict[str, object] = {
         "domain": domain,
         "namespace": namespace,
         "distribution": distribution,
-        "through": None if rmw is None else THROUGH[rmw],
+        "through": None if rmw is None else RMW_NAMES[rmw],
         "args": ros_args or None,
     }
-    given = {name: value for name, value in chosen.items() if value is not None}
+    settings = {name: value for name, value in values.items() if value is not None}
     from smartcam.settings import is_fleet
 
-    if is_fleet(place):
-        await _of_fleet(place, given, options)
+    if is_fleet(fleet):
+        await _join_fleet(fleet, settings, options)
     else:
-        await _served(place, given, options)
+        await _serve_file(fleet, settings, options)
 
 
-async def _served(path: str, given: dict[str, object], options: Options) -> None:
-    from smartcam._cli.serve import Serving
+async def _serve_file(path: str, settings: dict[str, object], options: Options) -> None:
+    from smartcam._cli.serve import AgentRunner
     from smartcam.fleet import FleetServer, load_fleet
 
     file = load_fleet(path)
-    already = {} if file.ros2 is None else file.ros2.model_dump(exclude_unset=True)
-    file = file.model_copy(update={"ros2": _section({**already, **given})})
+    file_settings = {} if file.ros2 is None else file.ros2.model_dump(exclude_unset=True)
+    file = file.model_copy(update={"ros2": _make_section({**file_settings, **settings})})
     server = FleetServer(file, folder=Path(path).parent)
     url = server.address.url
-    await Serving(server, options, False, lambda: _show(server.ros_nodes, url, options)).run()
+    await AgentRunner(
+        server, options, False, lambda: _show_nodes(server.ros_nodes, url, options)
+    ).run()
 
 
-async def _of_fleet(url: str, given: dict[str, object], options: Options) -> None:
+async def _join_fleet(url: str, settings: dict[str, object], options: Options) -> None:
     from smartcam.fleet._inside import FleetAddress, ros_of
 
     address = FleetAddress.parse(url)
@@ -106,25 +108,25 @@ async def _of_fleet(url: str, given: dict[str, object], options: Options) -> Non
         raise ConfigurationError(
             f"fleet address {url!r} is a camera's: expected that of the fleet, fleet://HOST[:PORT]"
         )
-    async with ros_of(address, _section(given)) as ros:
-        _show(ros.names, address.url, options)
+    async with ros_of(address, _make_section(settings)) as ros:
+        _show_nodes(ros.names, address.url, options)
         await asyncio.Event().wait()
 
 
-def _section(given: dict[str, object]) -> RosSection:
+def _make_section(settings: dict[str, object]) -> RosSection:
     from pydantic import ValidationError
 
     from smartcam.fleet._inside import RosSection
 
-    if given.get("args") and given.get("through") != THROUGH["native"]:
+    if settings.get("args") and settings.get("through") != RMW_NAMES["native"]:
         raise ConfigurationError(f"{ROS_ARGS}: expected --rmw native, which has them read by ROS")
     try:
-        return RosSection.model_validate(given)
+        return RosSection.model_validate(settings)
     except ValidationError as exc:
         (first, *_) = exc.errors()
         raise ConfigurationError(f"--{first['loc'][0]}: {first['msg']}") from exc
 
 
-def _show(names: list[str], url: str, options: Options) -> None:
+def _show_nodes(names: list[str], url: str, options: Options) -> None:
     for name in names:
         options.show({"node": name, "fleet": url}, name)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from smartcam._cli.terminal import tinted
+from smartcam._cli.terminal import coloured
 from smartcam._cli.usage import error_json
 from smartcam.exceptions import (
     CalibrationError,
@@ -54,11 +54,14 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (CameraFaultError, 5),
     (TriggerError, 5),
 )
-"""The first match decides. 0 done; 1 a fault of smartcam; 2 wrong usage; 3 no session or a broken
-one, or a source of frames that is missing, in use or gone; 4 a wait in a session, or for a frame,
-timed out; 5 the camera refused, is not running, or has no such pixels or feature; 6 a result is not
-interpretable; 7 ``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143:
-ended by Ctrl-C or SIGTERM."""
+"""Exit codes of errors; the first matching class counts.
+
+0: done. 1: a fault of smartcam. 2: wrong usage. 3: no session or a broken session, or a source of
+frames that is missing, in use or lost. 4: a time-out in a session, or while waiting for a frame.
+5: the camera refused, is not running, or has no such pixels or feature. 6: a result cannot be
+interpreted. 7: ``calibrate --check`` found a stale calibration, or ``calibrate compare`` found
+different ones. 130 and 143: ended by Ctrl-C or SIGTERM.
+"""
 
 
 TAKEN_ADVICE = (
@@ -79,26 +82,26 @@ def run(
     program: str,
     debug: bool,
     as_json: bool = False,
-    interrupted: int = 130,
-    terminated: int = 143,
+    interrupt_code: int = 130,
+    terminate_code: int = 143,
 ) -> NoReturn:
-    """Run a command's coroutine to its end and exit.
+    """Run a command's coroutine until it ends, then exit the process.
 
-    Ctrl-C and SIGTERM cancel it, so every ``async with`` in it closes in order (a camera gets its
-    Disconnect).
+    Ctrl-C and SIGTERM cancel the coroutine, so every ``async with`` in it is left in order (a
+    camera gets its Disconnect).
 
     Args:
         main: coroutine of the command.
         program: name of the program in the error line.
         debug: log to stderr and show tracebacks.
         as_json: print an error as a line of JSON.
-        interrupted: exit code after Ctrl-C; 0 if that is the usual end.
-        terminated: exit code after SIGTERM.
+        interrupt_code: exit code after Ctrl-C; 0 if that is the usual end.
+        terminate_code: exit code after SIGTERM.
     """
     if debug:
         logging.basicConfig(level=logging.DEBUG, stream=sys.stderr)
     else:
-        # without a handler Python would print warnings beside our one line
+        # without a handler Python would print warnings in addition to our line
         logging.getLogger("smartcam").addHandler(logging.NullHandler())
     if isinstance(sys.stdout, io.TextIOWrapper):
         # a camera's texts may have letters that the terminal's encoding lacks
@@ -107,9 +110,9 @@ def run(
     try:
         asyncio.run(_with_signals(main, ended_by))
     except (KeyboardInterrupt, asyncio.CancelledError):
-        sys.exit(terminated if signal.SIGTERM in ended_by else interrupted)
+        sys.exit(terminate_code if signal.SIGTERM in ended_by else interrupt_code)
     except BrokenPipeError:
-        # the reader has gone, as after `head`; nothing may be written at exit either
+        # nobody reads stdout any more, as after `head`; nothing may be written at exit either
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
@@ -119,15 +122,18 @@ def run(
         if debug:
             traceback.print_exc()
         text = _one_line(exc)
-        word = tinted("error", "error:")
+        word = coloured("error", "error:")
         line = error_json(exc, text, exit_code(exc)) if as_json else f"{program}: {word} {text}"
         click.echo(line, err=True)
         sys.exit(exit_code(exc))
     sys.exit(0)
 
 
-async def first(jobs: Iterable[Coroutine[Any, Any, None]], seconds: float | None) -> None:
-    """Run jobs until the first ends, or for so many seconds; raise its error."""
+async def run_until_first(jobs: Iterable[Coroutine[Any, Any, None]], seconds: float | None) -> None:
+    """Run jobs until one of them ends, at most ``seconds``, then cancel the others.
+
+    Raises the error of the job that ended first.
+    """
     tasks = [asyncio.create_task(job) for job in jobs]
     try:
         done, _ = await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
@@ -137,7 +143,7 @@ async def first(jobs: Iterable[Coroutine[Any, Any, None]], seconds: float | None
     finally:
         for task in tasks:
             task.cancel()
-        # the error of a second job is the same loss, and must not be reported again
+        # a second job fails by the same loss of the connection, which is reported already
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
@@ -149,19 +155,19 @@ def _one_line(error: Exception) -> str:
         del lines[1:]  # the layout with a mark; the first line has the position
     text = " ".join(line.strip() for line in lines)
     cause = error.__cause__
-    hung_up = (
+    is_hang_up = (
         isinstance(error, ConnectionLostError)
         and isinstance(cause, ConnectionError)
         and not isinstance(cause, LinkError)  # such as a lost agent
     )
-    return f"{text}. {TAKEN_ADVICE}" if hung_up else text
+    return f"{text}. {TAKEN_ADVICE}" if is_hang_up else text
 
 
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:
-    """Let the first SIGINT or SIGTERM cancel ``main``; a second one ends the program as usual.
+    """Run ``main``; the first SIGINT or SIGTERM cancels it, a second one ends the program as usual.
 
-    The handlers are set here and not left to asyncio, which sets none if SIGINT was ignored at
-    the start, as it is for a job in a shell script's background.
+    ``ended_by`` gets the signal. asyncio's own handler is not enough: it is not set if SIGINT was
+    ignored at the start, as in a background job of a shell script.
     """
     loop = asyncio.get_running_loop()
     task = asyncio.current_task()

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.log_lines import json_log
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam._cli.running import exit_code
 from smartcam._cli.systemd import Notifier
-from smartcam._cli.terminal import tinted
+from smartcam._cli.terminal import coloured
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.models import Connected, Disconnected, Reconnected
@@ -50,7 +50,7 @@ logger: logging.Logger = logging.getLogger("smartcam.serve")
     help="Form of the log on stderr; default: as the file says, or text. json: one object "
     "a line, and nothing else.",
 )
-@runs(*OUTPUT, interrupted=0, terminated=0)
+@async_command(*OUTPUT_OPTIONS, interrupt_code=0, terminate_code=0)
 async def serve(file: str | None, schema: bool, log: str | None, options: Options) -> None:
     """Share cameras."""
     import smartcam.fleet
@@ -63,19 +63,19 @@ async def serve(file: str | None, schema: bool, log: str | None, options: Option
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")
     raise_descriptor_limit()
     if log == "json":  # an error in the file is logged so, too
-        with _logged(None, options):
+        with _json_logs(None, options):
             server = smartcam.fleet.serve(file)
     else:
         server = smartcam.fleet.serve(file)
     section = server.file.operations
     as_lines = (log or (section and section.log)) == "json"
-    with _logged(server, options) if as_lines else contextlib.nullcontext():
-        await Serving(server, options, as_lines).run()
+    with _json_logs(server, options) if as_lines else contextlib.nullcontext():
+        await AgentRunner(server, options, as_lines).run()
 
 
 @contextlib.contextmanager
-def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
-    """Write all logs of the block as lines of JSON, and the error that ends it."""
+def _json_logs(server: FleetServer | None, options: Options) -> Iterator[None]:
+    """Write all logs of the block as lines of JSON, and also the error that ends the block."""
     section = None if server is None else server.file.operations
     level = logging.getLevelName(
         "DEBUG" if options.debug else section.level.upper() if section else "INFO"
@@ -92,14 +92,14 @@ def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
             raise SystemExit(exit_code(exc)) from exc
 
 
-class Serving:
-    """A server in its process: its output, and the signals that it handles.
+class AgentRunner:
+    """Runs an agent in this process: starts it, prints its events, and reloads it on SIGHUP.
 
     Args:
         server: the agent.
         options: options of the command.
-        as_lines: events are logged, and not printed for people.
-        show: function that reports the start; None: a line for each camera.
+        as_lines: whether events are logged as lines of JSON, and not printed for people.
+        show: function that reports the start; None: print a line for each camera.
     """
 
     def __init__(
@@ -112,50 +112,52 @@ class Serving:
         self._server, self._options, self._as_lines = server, options, as_lines
         self._show: Callable[[], None] = show or self._show_cameras
         self._notifier = Notifier()
-        self._ready = False
+        self._is_ready = False
 
     async def run(self) -> None:
         server, notifier = self._server, self._notifier
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(notifier.close)
-            wanted = stack.enter_context(_hangup())
-            await stack.enter_async_context(self._watched())
+            reload_requested = stack.enter_context(_reload_requests())
+            await stack.enter_async_context(self._operations_page())
             if server.file.record is not None:
-                recorder = _recorder(server, self._options, self._as_lines)
+                recorder = _make_recorder(server, self._options, self._as_lines)
                 await stack.enter_async_context(recorder)
             if server.file.outlets is not None:
                 from smartcam.fleet._inside import FleetOutlets
 
                 await stack.enter_async_context(FleetOutlets(server, self._notify_outlet))
-            await self._enter(stack)
-            stack.callback(notifier.stopping)
+            await self._start_agent(stack)
+            stack.callback(notifier.report_stopping)
             server.reloads.on_reload = self._on_reload
-            stack.enter_context(notifier.telling(self._status))
-            await stack.enter_async_context(_while_here(self._reload_when(wanted)))
+            stack.enter_context(notifier.reporting(self._status))
+            await stack.enter_async_context(
+                _background_task(self._reload_on_request(reload_requested))
+            )
             await server.wait_first_attempts()
-            self._ready = True
-            notifier.ready(self._status())
+            self._is_ready = True
+            notifier.report_ready(self._status())
             if server.warning:
                 self._warn(server.warning)
             events = server.events()
             self._show()
             async for event in events:
                 if self._as_lines:
-                    self._log(event)
+                    self._log_event(event)
                 if self._options.as_json or not self._as_lines:
                     report_event(server, event, self._options)
 
-    async def _enter(self, stack: contextlib.AsyncExitStack) -> None:
-        """Start the agent; try again while its router is away, like a camera."""
+    async def _start_agent(self, stack: contextlib.AsyncExitStack) -> None:
+        """Start the agent; while its router does not answer, try again."""
         policy, warned = Backoff(), False
         for delay in policy.delays():
             try:
                 await stack.enter_async_context(self._server)
             except ConnectFailedError as exc:
                 if self._server.file.endpoints[0] or not policy.transient(exc):
-                    raise  # the agent cannot listen, or would never be accepted
+                    raise  # the agent cannot listen, or another try would fail, too
                 if not warned:
-                    self._warn(f"{exc}; it is tried on")
+                    self._warn(f"{exc}; trying again")
                 warned = True
             else:
                 return
@@ -165,11 +167,11 @@ class Serving:
         if self._as_lines:
             logger.warning("%s", text)
         else:
-            click.echo(f"{tinted('error', 'warning:')} {text}", err=True)
+            click.echo(f"{coloured('error', 'warning:')} {text}", err=True)
 
-    def _notify_outlet(self, name: str, why: str) -> None:
+    def _notify_outlet(self, name: str, reason: str) -> None:
         if not self._as_lines:  # otherwise it was logged
-            text = why or "delivers again"
+            text = reason or "delivers again"
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} outlet {name}: {text}", err=True)
 
     def _show_cameras(self) -> None:
@@ -179,13 +181,13 @@ class Serving:
             router: dict[str, Any] = {"url": url, "router": True}
             self._print("", router, f"{url}  a router, without cameras", connected=True)
         for name in [*server.hosts]:
-            value = _camera(server, name)
-            why = "" if value["connected"] else f"  not connected: {value['reason']}"
-            self._print(name, value, f"{value['url']}{why}", connected=value["connected"])
+            value = _camera_data(server, name)
+            reason = "" if value["connected"] else f"  not connected: {value['reason']}"
+            self._print(name, value, f"{value['url']}{reason}", connected=value["connected"])
 
     @contextlib.asynccontextmanager
-    async def _watched(self) -> AsyncIterator[None]:
-        """Serve health and metrics while the block runs, if the file has ``operations``."""
+    async def _operations_page(self) -> AsyncIterator[None]:
+        """Serve health and metrics while the block runs, if the file asks for them."""
         section = self._server.file.operations
         if section is None or section.place is None:
             yield
@@ -203,10 +205,10 @@ class Serving:
         if self._options.as_json or not self._as_lines:
             self._options.show(value, text)
 
-    def _log(self, event: CameraEvent) -> None:
+    def _log_event(self, event: CameraEvent) -> None:
         extra = {"camera": event.camera}
         if event.camera not in self._server.hosts:
-            return  # ended on purpose
+            return  # the camera was removed from the file
         if isinstance(event, Disconnected):
             logger.warning("not connected: %s", event.reason, extra=extra)
         elif isinstance(event, (Connected, Reconnected)):
@@ -214,21 +216,21 @@ class Serving:
 
     # ------------------------------------------------------------------ reloads
 
-    async def _reload_when(self, wanted: asyncio.Event) -> None:
-        """Read the file again whenever it is wanted; several requests at a time count as one."""
+    async def _reload_on_request(self, reload_requested: asyncio.Event) -> None:
+        """Read the file again after each request; requests during a reload count as one."""
         while True:
-            await wanted.wait()
-            wanted.clear()
+            await reload_requested.wait()
+            reload_requested.clear()
             with contextlib.suppress(SmartCamError):  # the error was reported
                 await self._server.reload()
 
     def _on_reload(self, outcome: FleetChanges | SmartCamError | None) -> None:
         if outcome is None:
-            if self._ready:
-                self._notifier.reloading("reading the fleet file again")
+            if self._is_ready:
+                self._notifier.report_reloading("reading the fleet file again")
             return
-        if self._ready:
-            self._notifier.ready(self._status())
+        if self._is_ready:
+            self._notifier.report_ready(self._status())
         if not self._as_lines:  # otherwise it was logged
             failed = isinstance(outcome, Exception)
             text = (
@@ -250,17 +252,17 @@ class Serving:
 
 
 @contextlib.contextmanager
-def _hangup() -> Iterator[asyncio.Event]:
-    """Yield an event that SIGHUP sets. In a terminal SIGHUP ends the program instead."""
-    wanted, loop = asyncio.Event(), asyncio.get_running_loop()
+def _reload_requests() -> Iterator[asyncio.Event]:
+    """Yield an event that SIGHUP sets; if stdin is a terminal, SIGHUP ends the program instead."""
+    reload_requested, loop = asyncio.Event(), asyncio.get_running_loop()
     number = getattr(signal, "SIGHUP", None)
     if number is None or (sys.stdin is not None and sys.stdin.isatty()):
-        yield wanted
+        yield reload_requested
         return
     with contextlib.suppress(NotImplementedError):
-        loop.add_signal_handler(number, wanted.set)
+        loop.add_signal_handler(number, reload_requested.set)
     try:
-        yield wanted
+        yield reload_requested
     finally:
         with contextlib.suppress(NotImplementedError):
             loop.remove_signal_handler(number)
@@ -268,7 +270,7 @@ def _hangup() -> Iterator[asyncio.Event]:
 
 
 @contextlib.asynccontextmanager
-async def _while_here(work: Any) -> AsyncIterator[None]:
+async def _background_task(work: Any) -> AsyncIterator[None]:
     """Run a coroutine in a task while the block runs."""
     task = asyncio.get_running_loop().create_task(work)
     try:
@@ -278,8 +280,8 @@ async def _while_here(work: Any) -> AsyncIterator[None]:
         await asyncio.wait({task})
 
 
-def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRecorder:
-    """Return the recorder of the cameras, which prints a line when it cannot record."""
+def _make_recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRecorder:
+    """Return the recorder of the cameras; it prints a line when it fails and when it recovers."""
     from smartcam.recording import FleetRecorder
 
     def show_trouble(trouble: RecordingError | None) -> None:
@@ -311,15 +313,15 @@ async def share(server: FleetServer, options: Options) -> None:
     await server.wait_first_attempts()
     events = server.events()
     for name in server.hosts:
-        value = _camera(server, name)
-        why = "" if value["connected"] else f"  not connected: {value['reason']}"
-        options.show(value, f"{value['url']}{why}")
+        value = _camera_data(server, name)
+        reason = "" if value["connected"] else f"  not connected: {value['reason']}"
+        options.show(value, f"{value['url']}{reason}")
     async for event in events:
         report_event(server, event, options)
 
 
-def _camera(server: FleetServer, name: str) -> dict[str, Any]:
-    """Return the state of the agent's camera as values for JSON."""
+def _camera_data(server: FleetServer, name: str) -> dict[str, Any]:
+    """Return the state of one of the agent's cameras as values for JSON."""
     host = server.hosts[name]
     connected = host.connected
     failure = host.failure or "it is tried for the first time"
@@ -335,10 +337,10 @@ def _camera(server: FleetServer, name: str) -> dict[str, Any]:
 
 def report_event(server: FleetServer, event: CameraEvent, options: Options) -> None:
     """Report that a camera was connected, or lost."""
-    known = event.camera in server.hosts
-    if not (known and isinstance(event, (Connected, Disconnected, Reconnected))):
+    is_shared = event.camera in server.hosts
+    if not (is_shared and isinstance(event, (Connected, Disconnected, Reconnected))):
         return
-    value = _camera(server, event.camera)
+    value = _camera_data(server, event.camera)
     if isinstance(event, Disconnected):
         value |= {"connected": False, "application": None, "reason": event.reason}
         text = f"not connected: {event.reason}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, naming, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, naming_file_errors
 from smartcam._cli.usage import ListedGroup
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound="Callable[..., Any]")
 
 LENGTH_DECIMALS = 9
-"""Decimals of a length in metres, which is rounded to nanometres."""
+"""Number of decimals to which a length in metres is rounded."""
 
 
 @click.group(cls=ListedGroup)
@@ -29,28 +29,28 @@ def sheet() -> None:
     """
 
 
-def _metres(_context: object, _option: object, millimetres: float | None) -> float | None:
+def _to_metres(_context: object, _option: object, millimetres: float | None) -> float | None:
     return None if millimetres is None else round(millimetres / 1e3, LENGTH_DECIMALS)
 
 
-def _length(name: str, about: str, **more: Any) -> Callable[[F], F]:
+def _length_option(name: str, about: str, **settings: Any) -> Callable[[F], F]:
     kind = click.FloatRange(min=0, min_open=True, max=10_000)
-    return click.option(name, type=kind, metavar="MM", callback=_metres, help=about, **more)
+    return click.option(name, type=kind, metavar="MM", callback=_to_metres, help=about, **settings)
 
 
-def _count(name: str, about: str, least: int = 3) -> Callable[[F], F]:
+def _count_option(name: str, about: str, least: int = 3) -> Callable[[F], F]:
     return click.option(name, type=click.IntRange(least, 1000), required=True, help=about)
 
 
-def _makes(
+def _sheet_command(
     function: Callable[..., Coroutine[Any, Any, None]],
 ) -> Callable[..., None]:
-    """Turn a coroutine function into a sheet's command, with the options of all sheets."""
-    command = runs(*OUTPUT)(function)
+    """Make a coroutine function the function of a command, with the options of all sheets."""
+    command = async_command(*OUTPUT_OPTIONS)(function)
     for option in (
         click.option(
             "--measured-ruler",
-            "measured",
+            "measured_rulers",
             nargs=2,
             type=float,
             metavar="X Y",
@@ -86,26 +86,26 @@ def _makes(
 
 
 @sheet.command()
-@_count("--columns", "Inner corners along x.")
-@_count("--rows", "Inner corners along y.")
-@_length("--square", "Side of a square.", required=True)
+@_count_option("--columns", "Inner corners along x.")
+@_count_option("--rows", "Inner corners along y.")
+@_length_option("--square", "Side of a square.", required=True)
 @click.option(
     "--origin-mark/--no-origin-mark",
     default=True,
     show_default=True,
     help="A black dot outside of the corner at the origin.",
 )
-@_makes
-async def checkerboard(**given: Any) -> None:
+@_sheet_command
+async def checkerboard(**arguments: Any) -> None:
     """A checkerboard."""
-    await _make("checkerboard", **given)
+    await _write_sheet("checkerboard", **arguments)
 
 
 @sheet.command()
-@_count("--columns", "Squares along x.")
-@_count("--rows", "Squares along y.")
-@_length("--square", "Side of a square.", required=True)
-@_length("--marker", "Side of a marker.  [default: 0.75 of a square]")
+@_count_option("--columns", "Squares along x.")
+@_count_option("--rows", "Squares along y.")
+@_length_option("--square", "Side of a square.", required=True)
+@_length_option("--marker", "Side of a marker.  [default: 0.75 of a square]")
 @click.option(
     "--dictionary",
     metavar="NAME",
@@ -116,18 +116,18 @@ async def checkerboard(**given: Any) -> None:
 @click.option(
     "--legacy-pattern", is_flag=True, help="As in OpenCV before 4.6: differs with even rows."
 )
-@_makes
-async def charuco(square: float, marker: float | None, **given: Any) -> None:
+@_sheet_command
+async def charuco(square: float, marker: float | None, **arguments: Any) -> None:
     """A checkerboard with a marker in each white square: some of it may be hidden."""
     side = round(0.75 * square, LENGTH_DECIMALS) if marker is None else marker
-    await _make("charuco", square=square, marker=side, **given)
+    await _write_sheet("charuco", square=square, marker=side, **arguments)
 
 
 @sheet.command("marker_grid")
-@_count("--columns", "Markers along x.", least=1)
-@_count("--rows", "Markers along y.", least=1)
-@_length("--marker", "Side of a marker, with its black border.", required=True)
-@_length("--gap", "Distance between two markers.", required=True)
+@_count_option("--columns", "Markers along x.", least=1)
+@_count_option("--rows", "Markers along y.", least=1)
+@_length_option("--marker", "Side of a marker, with its black border.", required=True)
+@_length_option("--gap", "Distance between two markers.", required=True)
 @click.option(
     "--dictionary",
     metavar="NAME",
@@ -141,83 +141,92 @@ async def charuco(square: float, marker: float | None, **given: Any) -> None:
     help="An AprilGrid of Kalibr: tags of 36h11 with a border of two modules, numbered from "
     "the lower left, with squares between their corners.",
 )
-@_makes
-async def marker_grid(dictionary: str, kalibr: bool, **given: Any) -> None:
+@_sheet_command
+async def marker_grid(dictionary: str, kalibr: bool, **arguments: Any) -> None:
     """Markers in rows and columns: some of them may be hidden."""
     if kalibr:
-        given |= {"dictionary": "DICT_APRILTAG_36h11", "border": 2, "kalibr": True}
+        arguments |= {"dictionary": "DICT_APRILTAG_36h11", "border": 2, "kalibr": True}
     else:
-        given["dictionary"] = dictionary
-    await _make("marker_grid", **given)
+        arguments["dictionary"] = dictionary
+    await _write_sheet("marker_grid", **arguments)
 
 
 @sheet.command()
-@_count("--columns", "Dots of a row.")
-@_count("--rows", "Rows.")
-@_length("--spacing", "Distance of the centres of two neighbours in a row.", required=True)
-@_length("--diameter", "Diameter of a dot.  [default: half of the spacing, asymmetric: 0.4 of it]")
+@_count_option("--columns", "Dots of a row.")
+@_count_option("--rows", "Rows.")
+@_length_option("--spacing", "Distance of the centres of two neighbours in a row.", required=True)
+@_length_option(
+    "--diameter", "Diameter of a dot.  [default: half of the spacing, asymmetric: 0.4 of it]"
+)
 @click.option("--asymmetric", is_flag=True, help="Shift every other row, rows half as far apart.")
-@_length("--origin-diameter", "Diameter of the dot at the origin, if it is larger than the others.")
-@_makes
-async def circles(spacing: float, diameter: float | None, asymmetric: bool, **given: Any) -> None:
+@_length_option(
+    "--origin-diameter", "Diameter of the dot at the origin, if it is larger than the others."
+)
+@_sheet_command
+async def circles(
+    spacing: float, diameter: float | None, asymmetric: bool, **arguments: Any
+) -> None:
     """Dots in rows and columns."""
-    part = 0.4 if asymmetric else 0.5
-    dot = round(part * spacing, LENGTH_DECIMALS) if diameter is None else diameter
-    await _make("circles", spacing=spacing, diameter=dot, asymmetric=asymmetric, **given)
+    ratio = 0.4 if asymmetric else 0.5
+    dot = round(ratio * spacing, LENGTH_DECIMALS) if diameter is None else diameter
+    await _write_sheet("circles", spacing=spacing, diameter=dot, asymmetric=asymmetric, **arguments)
 
 
 @sheet.command()
-@_length("--diameter", "Diameter of the origin mark.", default=20.0, show_default=True)
-@_makes
-async def rays(**given: Any) -> None:
+@_length_option("--diameter", "Diameter of the origin mark.", default=20.0, show_default=True)
+@_sheet_command
+async def rays(**arguments: Any) -> None:
     """Rays A and B and an origin mark, which a smart camera can localize."""
-    await _make("rays", **given)
+    await _write_sheet("rays", **arguments)
 
 
-async def _make(
+async def _write_sheet(
     kind: str,
     *,
     page: str,
     outputs: tuple[str, ...],
     describe: str | None,
-    measured: tuple[float, float] | None,
+    measured_rulers: tuple[float, float] | None,
     options: Options,
-    **described: Any,
+    **target_settings: Any,
 ) -> None:
-    """Lay out a sheet with its target and write the files of the options."""
+    """Make a sheet with its target, and write the files that the options name."""
     if not outputs and describe is None:
         raise click.UsageError("nothing to write: give -o FILE.svg, -o FILE.pdf or --describe FILE")
-    if measured is not None and describe is None:
+    if measured_rulers is not None and describe is None:
         raise click.UsageError("--measured-ruler needs --describe")
     for path in outputs:
-        if _suffix(path) not in {".svg", ".pdf"}:
+        if _lower_suffix(path) not in {".svg", ".pdf"}:
             raise click.UsageError(f"-o {path}: expected a name that ends with .svg or .pdf")
     from smartcam.calibration import make_sheet, scaled
     from smartcam.calibration._inside import on_paper
 
-    made = make_sheet(on_paper({"kind": kind, **described}), page=page)
-    real = made.target if measured is None else scaled(made.target, measured)
-    data = replace(made, target=real).data
+    new_sheet = make_sheet(on_paper({"kind": kind, **target_settings}), page=page)
+    target = new_sheet.target
+    if measured_rulers is not None:
+        target = scaled(target, measured_rulers)
+    data = replace(new_sheet, target=target).data
     for path in outputs:
-        _write(path, made.pdf() if _suffix(path) == ".pdf" else made.svg().encode())
+        _write(path, new_sheet.pdf() if _lower_suffix(path) == ".pdf" else new_sheet.svg().encode())
     if describe is not None:
         _write(describe, (json.dumps(data) + "\n").encode())
-    written = [*outputs, *([] if describe is None else [describe])]
+    files = [*outputs, *([] if describe is None else [describe])]
     value = {
-        "id": made.id,
-        "files": written,
-        "page_mm": [made.width, made.height],
-        "origin_mm": list(made.origin),
+        "id": new_sheet.id,
+        "files": files,
+        "page_mm": [new_sheet.width, new_sheet.height],
+        "origin_mm": list(new_sheet.origin),
         "target": data,
     }
-    text = f"{made.title}\n  {made.width:g} x {made.height:g} mm: {', '.join(written)}"
+    size = f"{new_sheet.width:g} x {new_sheet.height:g} mm"
+    text = f"{new_sheet.title}\n  {size}: {', '.join(files)}"
     options.show(value, text)
 
 
-def _suffix(path: str) -> str:
+def _lower_suffix(path: str) -> str:
     return Path(path).suffix.lower()
 
 
 def _write(path: str, data: bytes) -> None:
-    with naming(path):
+    with naming_file_errors(path):
         Path(path).write_bytes(data)

@@ -1,7 +1,7 @@
-"""The ``smartcam`` command: the list of its commands, with their modules.
+"""The ``smartcam`` command: a table of its commands, with their modules.
 
-The modules of a command are imported when it is used. The list has each command's line of
-``--help``, so that showing it imports none of them.
+The module of a command is imported when the command is used. The table also has the commands'
+summaries, so that ``--help`` imports no module.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import click
 
 import smartcam
-from smartcam._cli.usage import ListedGroup, importing
+from smartcam._cli.usage import ListedGroup, exiting_on_interrupt
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -30,8 +30,8 @@ EPILOG = (
 )
 
 
-class Listed(NamedTuple):
-    """A command in the list.
+class ListedCommand(NamedTuple):
+    """A command in the table.
 
     Attributes:
         module: module of this package that has a function with the command's name.
@@ -44,57 +44,59 @@ class Listed(NamedTuple):
     extra: str = ""
 
 
-TOPICS: Mapping[str, Mapping[str, Listed]] = {
+TOPICS: Mapping[str, Mapping[str, ListedCommand]] = {
     "A camera": {
-        "trigger": Listed("camera", "Trigger and print the result."),
-        "watch": Listed(
+        "trigger": ListedCommand("camera", "Trigger and print the result."),
+        "watch": ListedCommand(
             "camera",
             "Print results as they come, until Ctrl-C, --count or --seconds.",
         ),
-        "live": Listed(
+        "live": ListedCommand(
             "live",
             "Serve a page of a camera until Ctrl-C: results as they come, status, account.",
         ),
-        "image": Listed(
+        "image": ListedCommand(
             "image",
             "Write a camera's last picture to a file, as the camera sends it (In-Sight: a "
             "bitmap), if its protocol has a request for it.",
         ),
-        "status": Listed("camera", "Show a camera's status; changes nothing on it."),
-        "start": Listed("camera", "Enter run mode; returns when the camera is ready."),
-        "stop": Listed("camera", "Leave run mode; returns when the camera has stopped."),
-        "outlet": Listed(
+        "status": ListedCommand("camera", "Show a camera's status; changes nothing on it."),
+        "start": ListedCommand("camera", "Enter run mode; returns when the camera is ready."),
+        "stop": ListedCommand("camera", "Leave run mode; returns when the camera has stopped."),
+        "outlet": ListedCommand(
             "outlet",
             "Bring a camera's results to brokers and databases, as a YAML file says, until Ctrl-C.",
             extra="mqtt",
         ),
-        "results": Listed(
+        "results": ListedCommand(
             "results",
             "Show the results in a store: those of a shift, those that failed.",
             extra="mqtt",
         ),
-        "switch": Listed(
+        "switch": ListedCommand(
             "camera",
             "Load another application by its id, or by its file's name if the camera can do "
             "that; returns when the camera is ready.",
         ),
     },
     "A fleet": {
-        "serve": Listed(
+        "serve": ListedCommand(
             "serve",
             "Connect to the cameras of a fleet file, and share them with any number of programs, "
             "until Ctrl-C or SIGTERM.",
             extra="fleet",
         ),
-        "fleet": Listed("fleet", "Show and use the cameras of a fleet together.", extra="fleet"),
-        "ros2": Listed(
+        "fleet": ListedCommand(
+            "fleet", "Show and use the cameras of a fleet together.", extra="fleet"
+        ),
+        "ros2": ListedCommand(
             "ros2",
             "Show cameras in ROS 2, as nodes for programs that use rmw_zenoh, until Ctrl-C or "
             "SIGTERM; with --rmw native through the installed rclpy, over any middleware, and "
             "options after --ros-args are those of ROS then.",
             extra="ros2",
         ),
-        "ros1": Listed(
+        "ros1": ListedCommand(
             "ros1",
             "Show cameras in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics and "
             'services of "smartcam ros2", without those that ROS 1 cannot have.',
@@ -102,94 +104,96 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         ),
     },
     "Pictures": {
-        "frames": Listed("frames", "Pictures of any camera.", extra="frames"),
-        "teach": Listed(
+        "frames": ListedCommand("frames", "Pictures of any camera.", extra="frames"),
+        "teach": ListedCommand(
             "teach",
             "Teach an application of a software camera, on a page or by options: draw regions, "
             "choose tools, see what they find, set tolerances, save.",
             extra="inspection",
         ),
-        "inspect": Listed(
+        "inspect": ListedCommand(
             "inspect",
             "Try an application of a software camera on pictures, and draw its findings.",
             extra="inspection",
         ),
-        "depth": Listed(
+        "depth": ListedCommand(
             "depth",
             "Clouds of points, as .ply and .pcd files: shown on a page, filtered, converted.",
             extra="depth",
         ),
     },
     "Finding out": {
-        "find": Listed(
+        "find": ListedCommand(
             "find",
             "Find cameras in networks: opens the protocols' ports, sends nothing, and shows "
             "greetings.",
         ),
-        "doctor": Listed(
+        "doctor": ListedCommand(
             "doctor",
             "Report each problem with its cure, in plain words: name, session, status, "
             "application, round trip, run state, results, clock.",
         ),
-        "probe": Listed("probe", "Find out how a camera speaks; HOST or URL."),
-        "protocols": Listed("listings", "List the protocols and their dialects."),
-        "interpreters": Listed("listings", "List the interpreters that --interpret-as knows."),
-        "decode": Listed(
+        "probe": ListedCommand("probe", "Find out how a camera speaks; HOST or URL."),
+        "protocols": ListedCommand("listings", "List the protocols and their dialects."),
+        "interpreters": ListedCommand(
+            "listings", "List the interpreters that --interpret-as knows."
+        ),
+        "decode": ListedCommand(
             "decode",
             "Decode DATA: hex, the name of a file (binary, hex or a dump of it), or - for standard "
             "input.",
         ),
     },
     "A robot": {
-        "calibrate": Listed(
+        "calibrate": ListedCommand(
             "calibrate",
             "Calibrate a camera against a robot: where its localizations lie in the robot's space.",
             extra="calibration",
         ),
-        "gateway": Listed(
+        "gateway": ListedCommand(
             "gateway",
             "Answer robots and PLCs that ask for parts, line by line over TCP, until Ctrl-C.",
             extra="calibration",
         ),
-        "sheet": Listed(
+        "sheet": ListedCommand(
             "sheet",
             "Make a sheet to print: a target to scale, rays A and B from its origin, rulers.",
             extra="calibration",
         ),
     },
     "Recordings": {
-        "record": Listed(
+        "record": ListedCommand(
             "record",
             "Record everything a camera says to an MCAP file, until Ctrl-C, --count or "
             "--seconds: frames, results, events, errors; of a fleet's camera no frames, and the "
             "results of every program's triggers.",
         ),
-        "replay": Listed(
+        "replay": ListedCommand(
             "record",
             "Emulate the recorded cameras: each trigger gets the recorded containers, byte for "
             "byte and after the same time, and unasked messages come again.",
         ),
-        "pcap": Listed(
+        "pcap": ListedCommand(
             "record",
             "Write a recording's frames as packets for Wireshark: Ethernet, IP, TCP or UDP, with "
             "the recorded times.",
         ),
-        "bag": Listed(
+        "bag": ListedCommand(
             "record",
             "Make a rosbag2 of a recording: an MCAP file with ROS 2 messages in a folder, in the "
             "recorded order and with the recorded times.",
         ),
-        "dissector": Listed(
+        "dissector": ListedCommand(
             "dissector",
             "Print the Wireshark dissector: one Lua file for every dialect of bvs.",
         ),
     },
     "Without a camera": {
-        "emulator": Listed(
+        "emulator": ListedCommand(
             "smartcam_emulator",
             "Emulate smart cameras, over real TCP or UDP, until Ctrl-C or SIGTERM.",
         ),
-        "demo": Listed(
+        "demo": ListedCommand(
             "demos",
             "Show smartcam's main job with an emulated camera over real TCP.",
         ),
@@ -201,24 +205,24 @@ LISTED = {name: listed for commands in TOPICS.values() for name, listed in comma
 """All commands by name."""
 
 ALIASES = {"emulate": "emulator"}
-"""Other names of commands, which no list shows."""
+"""Other names of commands, which ``--help`` does not show."""
 
 
 class CommandTable(MutableMapping[str, click.Command]):
-    """The commands by name, each imported when it is used.
+    """The commands by name; a command is imported when it is first looked up.
 
     Args:
         listed: modules and summaries of the commands.
     """
 
-    def __init__(self, listed: Mapping[str, Listed]) -> None:
-        self._commands: dict[str, Listed | click.Command] = {**listed}
+    def __init__(self, listed: Mapping[str, ListedCommand]) -> None:
+        self._commands: dict[str, ListedCommand | click.Command] = {**listed}
 
     def __getitem__(self, name: str) -> click.Command:
         command = self._commands[name]
-        if isinstance(command, Listed):
-            with importing():
-                module = _module(name, command)
+        if isinstance(command, ListedCommand):
+            with exiting_on_interrupt():
+                module = _load_module(name, command)
             command = self._commands[name] = cast("click.Command", getattr(module, name))
         return command
 
@@ -235,8 +239,8 @@ class CommandTable(MutableMapping[str, click.Command]):
         return len(self._commands)
 
 
-def _module(name: str, listed: Listed) -> ModuleType:
-    """Return the module of a command; raise a usage error if its extra is missing."""
+def _load_module(name: str, listed: ListedCommand) -> ModuleType:
+    """Import the module of a command; raise a usage error if its extra is missing."""
     from smartcam._extras import from_part
     from smartcam.exceptions import MissingExtraError
 
@@ -250,15 +254,15 @@ def _module(name: str, listed: Listed) -> ModuleType:
 class CommandsByTopic(ListedGroup):
     """The commands, listed by topic with whole summaries."""
 
-    def __init__(self, name: str | None = None, **given: Any) -> None:
-        super().__init__(name, commands=CommandTable(LISTED), **given)
+    def __init__(self, name: str | None = None, **settings: Any) -> None:
+        super().__init__(name, commands=CommandTable(LISTED), **settings)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command by one of its names."""
+        """Return the command with this name or alias."""
         return super().get_command(ctx, ALIASES.get(cmd_name, cmd_name))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list."""
+        """Write the commands by topic."""
         for topic, commands in TOPICS.items():
             with formatter.section(topic):
                 formatter.write_dl([(name, listed.summary) for name, listed in commands.items()])

@@ -8,7 +8,7 @@ import click
 from click.core import ParameterSource
 
 import smartcam
-from smartcam._cli.options import DIALECTS, OUTPUT, Options, runs
+from smartcam._cli.options import DIALECTS, OUTPUT_OPTIONS, Options, async_command
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.texts import camera_value
 from smartcam._cli.usage import JsonErrors
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 PROTOCOL = "bvs"
 """The default protocol of the emulated cameras."""
 
-ON_PAGE = 7
-"""The application that runs for a page without a scenario."""
+PAGE_APPLICATION = 7
+"""The application that runs at once if there is a page and no scenario."""
 
 _OPTION_NAMES = {
     "scenario": "scenario",
@@ -35,7 +35,7 @@ _OPTION_NAMES = {
     "seed": "--seed",
     "web": "--web",
 }
-"""Names, in errors, of the options that not every emulated camera accepts."""
+"""Options that not every emulated camera accepts, with their names in error texts."""
 
 
 @click.command("emulator", cls=JsonErrors, context_settings={"help_option_names": ["-h", "--help"]})
@@ -90,7 +90,7 @@ _OPTION_NAMES = {
     "--generators", is_flag=True, help="List the generators of applications' values, and end."
 )
 @page_options("Serve a page that shows and controls the cameras; its address goes to stderr.")
-@runs(*OUTPUT, program="smartcam-emulator", interrupted=0, terminated=0)
+@async_command(*OUTPUT_OPTIONS, program="smartcam-emulator", interrupt_code=0, terminate_code=0)
 @click.version_option(smartcam.__version__)
 @click.pass_context
 async def command(
@@ -134,12 +134,12 @@ async def command(
     from smartcam.emulator import WireCamera
     from smartcam.emulator._inside import emulated_class
 
-    chosen = dict(map(_quirk, quirks)) or None
-    place: dict[str, Any] = {
+    quirk_values = dict(map(_parse_quirk, quirks)) or None
+    camera_options: dict[str, Any] = {
         "host": host,
         "dialect": dialect,
         "transport": transport,
-        "quirks": chosen,
+        "quirks": quirk_values,
     }
     servers: list[WireCamera | SoftwareDevice]
     if program is not None:
@@ -147,17 +147,17 @@ async def command(
             raise click.UsageError(
                 "--program has the cameras of its file: no scenario, no --cameras"
             )
-        servers = [*_software(program, protocol or PROTOCOL, port, seed, place)]
+        servers = [*_software_cameras(program, protocol or PROTOCOL, port, seed, camera_options)]
     else:
-        plans = _scenarios(scenario, protocol, dialect, cameras, shown=web.wanted)
+        plans = _load_scenarios(scenario, protocol, dialect, cameras, has_page=web.is_wanted)
         for plan in plans:
-            _refuse_what_does_not_fit(context, plan)
+            _refuse_unsupported_options(context, plan)
         servers = [
             emulated_class(plan.protocol).from_scenario(
                 plan,
                 port=port + index if port else port,
                 seed=None if seed is None else seed + index,
-                **place,
+                **camera_options,
             )
             for index, plan in enumerate(plans)
         ]
@@ -168,9 +168,9 @@ async def command(
             server if isinstance(server, WireCamera) else server.emulator for server in servers
         ]
         address = await _open_page(web, stack, emulators)
-        named = scenario is not None or program is not None
+        show_name = scenario is not None or program is not None
         for emulator in emulators:
-            _announce(emulator, options, named=named, page=address)
+            _show_camera(emulator, options, show_name=show_name, page=address)
         await asyncio.Event().wait()
 
 
@@ -196,7 +196,7 @@ async def _open_page(
     web: PageOptions, stack: AsyncExitStack, cameras: Iterable[WireCamera]
 ) -> str | None:
     """Serve the page until the stack ends, print its address to stderr and return it."""
-    if not web.wanted:
+    if not web.is_wanted:
         return None
     from smartcam.web import EmulatorSite
 
@@ -206,8 +206,8 @@ async def _open_page(
     return site.url
 
 
-def _software(
-    path: str, protocol: str, port: int | None, seed: int | None, place: dict[str, Any]
+def _software_cameras(
+    path: str, protocol: str, port: int | None, seed: int | None, camera_options: dict[str, Any]
 ) -> Iterator[SoftwareDevice]:
     """Yield the software cameras of a cell file.
 
@@ -221,52 +221,59 @@ def _software(
             protocol=protocol,
             port=port + index if port else 0,
             seed=None if seed is None else seed + index,
-            **place,
+            **camera_options,
         )
 
 
-def _scenarios(
-    path: str | None, protocol: str | None, dialect: str | None, copies: int, *, shown: bool
+def _load_scenarios(
+    path: str | None,
+    protocol: str | None,
+    dialect: str | None,
+    camera_count: int,
+    *,
+    has_page: bool,
 ) -> tuple[Scenario, ...]:
     """Return a scenario for each camera.
 
-    Raises ConfigurationError: the file is wrong, or ``copies`` is given for several cameras;
+    Raises ConfigurationError: the file is wrong, or ``camera_count`` is given for several cameras;
     MissingExtraError: PyYAML is not installed.
     """
     from smartcam.emulator._inside import load_scenarios
 
-    plain = _plain(protocol or PROTOCOL, shown=shown)
-    loaded = (plain,) if path is None else load_scenarios(path, dialect=dialect)
+    default_scenario = _default_scenario(protocol or PROTOCOL, has_page=has_page)
+    loaded = (default_scenario,) if path is None else load_scenarios(path, dialect=dialect)
     for plan in loaded:
         if protocol not in {None, plan.protocol}:
             raise ConfigurationError(
                 f"--protocol {protocol}: the scenario {path} has a camera of {plan.protocol}"
             )
-    if copies == 1:
+    if camera_count == 1:
         return loaded
     first, *others = loaded
     if others:
         raise ConfigurationError(
-            f"--cameras {copies}: the scenario {path} has {len(loaded)} cameras already"
+            f"--cameras {camera_count}: the scenario {path} has {len(loaded)} cameras already"
         )
     return tuple(
         first.model_copy(update={"name": f"camera{index + 1}", "seed": first.seed + index})
-        for index in range(copies)
+        for index in range(camera_count)
     )
 
 
-def _plain(protocol: str, *, shown: bool) -> Scenario:
-    """Return a camera without a scenario; with a page, an application runs on it."""
+def _default_scenario(protocol: str, *, has_page: bool) -> Scenario:
+    """Return the scenario without a file; with a page, an application runs if that is possible."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
     camera = emulated_class(protocol)
-    running = Scenario(protocol=protocol, active=ON_PAGE, running=True)
-    able = shown and camera.state_options(ON_PAGE, running=True) and camera.mistake(running) is None
-    return running if able else Scenario(protocol=protocol)
+    running = Scenario(protocol=protocol, active=PAGE_APPLICATION, running=True)
+    idle = Scenario(protocol=protocol)
+    if not has_page or not camera.state_options(PAGE_APPLICATION, running=True):
+        return idle
+    return running if camera.mistake(running) is None else idle
 
 
-def _quirk(text: str) -> tuple[str, Any]:
+def _parse_quirk(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         return name, True
@@ -278,21 +285,25 @@ def _quirk(text: str) -> tuple[str, Any]:
         raise ConfigurationError(f"--quirk {text:.200}: {exc}") from exc
 
 
-def _refuse_what_does_not_fit(context: click.Context, plan: Scenario) -> None:
-    """Refuse options that a camera of this protocol does not take, with a list of the others."""
+def _refuse_unsupported_options(context: click.Context, plan: Scenario) -> None:
+    """Raise a usage error for an option that a camera of this protocol does not take."""
     from smartcam.emulator._inside import emulated_class
 
     takes = emulated_class(plan.protocol).takes
     for name, text in _OPTION_NAMES.items():
-        given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        if given and name not in takes:
-            able = ", ".join(text for name, text in _OPTION_NAMES.items() if name in takes)
-            raise click.UsageError(f"--protocol {plan.protocol} takes no {text}; it takes {able}")
+        is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if is_given and name not in takes:
+            supported = ", ".join(text for name, text in _OPTION_NAMES.items() if name in takes)
+            raise click.UsageError(
+                f"--protocol {plan.protocol} takes no {text}; it takes {supported}"
+            )
 
 
-def _announce(emulator: WireCamera, options: Options, *, named: bool, page: str | None) -> None:
+def _show_camera(
+    emulator: WireCamera, options: Options, *, show_name: bool, page: str | None
+) -> None:
     value = camera_value(emulator)
-    if named or page is not None:
+    if show_name or page is not None:
         value["name"] = emulator.name
     if page is not None:
         value["web"] = page

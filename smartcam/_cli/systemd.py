@@ -1,7 +1,7 @@
-"""Notify systemd: one datagram each to the socket that NOTIFY_SOCKET names; see sd_notify(3).
+"""Notify systemd by datagrams to the socket that NOTIFY_SOCKET names; see sd_notify(3).
 
-Without this variable, nothing is done. Nothing here blocks or raises, since a monitor must not be
-able to stop the program.
+Without this variable, nothing is done. No function here blocks or raises because of the socket,
+since the program must run on without it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ MAX_STATUS_CHARACTERS = 500
 """Largest number of characters of a status: one line in ``systemctl status``."""
 
 MAX_UNSENT = 32
+"""Largest number of datagrams that wait while the socket is full."""
+
 STATUS_PERIOD = 5.0
-"""Seconds between two checks of the status, unless a watchdog needs more."""
+"""Largest number of seconds between two checks of the status; a watchdog may need more checks."""
 
 
 class Notifier:
@@ -34,42 +36,43 @@ class Notifier:
         environment: environment with NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID.
 
     Attributes:
-        wanted: whether systemd wants reports.
-        watchdog: seconds within which systemd expects a sign of life; None: it expects none.
+        is_wanted: whether systemd wants reports.
+        watchdog: seconds within which systemd expects each watchdog report; None: it expects none.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        given = os.environ if environment is None else environment
-        self._address = _address(given.get("NOTIFY_SOCKET", ""))
-        self.wanted: bool = self._address is not None
-        self.watchdog: float | None = _watchdog(given)
+        if environment is None:
+            environment = os.environ
+        self._address = _socket_address(environment.get("NOTIFY_SOCKET", ""))
+        self.is_wanted: bool = self._address is not None
+        self.watchdog: float | None = _watchdog_time(environment)
         self._socket: socket.socket | None = None
         self._unsent: list[bytes] = []  # messages kept while the socket is full
-        self._failed = False
+        self._failure_logged = False
         self._status = ""
 
-    def ready(self, status: str) -> None:
+    def report_ready(self, status: str) -> None:
         """Report that the program is ready, or ready again after a reload."""
         self._send("READY=1", self._status_line(status), keep=True)
 
-    def reloading(self, status: str) -> None:
-        """Report that a reload has begun; :meth:`ready` reports its end."""
+    def report_reloading(self, status: str) -> None:
+        """Report that a reload has begun; :meth:`report_ready` reports its end."""
         now = time.monotonic_ns() // 1000
         self._send("RELOADING=1", f"MONOTONIC_USEC={now}", self._status_line(status), keep=True)
 
-    def stopping(self) -> None:
+    def report_stopping(self) -> None:
         """Report that the program ends."""
         self._send("STOPPING=1", self._status_line("stopping"), keep=True)
 
-    def status(self, status: str) -> None:
-        """Report the state as text, if it has changed."""
-        before = self._status
+    def report_status(self, status: str) -> None:
+        """Report the status, if it has changed."""
+        old_status = self._status
         line = self._status_line(status)
-        if self._status != before:
+        if self._status != old_status:
             self._send(line)
 
-    def alive(self) -> None:
-        """Report that the event loop runs."""
+    def report_alive(self) -> None:
+        """Report to the watchdog that the event loop runs."""
         self._send("WATCHDOG=1")
 
     def close(self) -> None:
@@ -94,23 +97,24 @@ class Notifier:
             while self._unsent:
                 self._socket.sendto(self._unsent[0], self._address)
                 del self._unsent[0]
-            self._failed = False
+            self._failure_logged = False
         except OSError as exc:
             if not keep:
                 del self._unsent[-1]
-                self._status = ""  # to be sent again
+                self._status = ""  # so that it is sent again
             del self._unsent[:-MAX_UNSENT]
-            if not self._failed:
+            if not self._failure_logged:
                 logger.warning("reports to systemd by NOTIFY_SOCKET fail: %s", exc)
-            self._failed = True
+            self._failure_logged = True
 
     @contextlib.contextmanager
-    def telling(self, status: Callable[[], str]) -> Iterator[None]:
-        """Make the event loop report periodically, while the block runs.
+    def reporting(self, status: Callable[[], str]) -> Iterator[None]:
+        """Report status and watchdog periodically from the event loop, while the block runs.
 
-        It reports at half of the watchdog's time. A loop that hangs does not, and is killed.
+        A period is at most half of the watchdog's time. A loop that hangs does not report, so
+        systemd kills the process.
         """
-        if not self.wanted:
+        if not self.is_wanted:
             yield
             return
         loop = asyncio.get_running_loop()
@@ -121,8 +125,8 @@ class Notifier:
             nonlocal timer
             timer = loop.call_later(period, tick)
             if self.watchdog is not None:
-                self.alive()
-            self.status(status())
+                self.report_alive()
+            self.report_status(status())
 
         tick()
         try:
@@ -132,20 +136,20 @@ class Notifier:
                 timer.cancel()
 
 
-def _address(given: str) -> str | None:
-    """Return the address of a socket; an abstract one begins with ``@``."""
-    if given.startswith("@") and len(given) > 1:
-        return "\0" + given[1:]
-    if given.startswith("/"):
-        return given
-    if given:
-        logger.warning("NOTIFY_SOCKET: expected /PATH or @NAME, got %r; nothing is reported", given)
+def _socket_address(text: str) -> str | None:
+    """Return the address of a socket; the text of an abstract address begins with ``@``."""
+    if text.startswith("@") and len(text) > 1:
+        return "\0" + text[1:]
+    if text.startswith("/"):
+        return text
+    if text:
+        logger.warning("NOTIFY_SOCKET: expected /PATH or @NAME, got %r; nothing is reported", text)
     return None
 
 
-def _watchdog(given: Mapping[str, str]) -> float | None:
-    """Return the seconds of systemd's watchdog, None if it is not for this process."""
-    text, process = given.get("WATCHDOG_USEC", ""), given.get("WATCHDOG_PID", "")
+def _watchdog_time(environment: Mapping[str, str]) -> float | None:
+    """Return the time of systemd's watchdog, seconds; None if this process has no watchdog."""
+    text, process = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
     if not text or (process and process != str(os.getpid())):
         return None
     if not text.isdecimal() or not int(text):

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from smartcam._cli.inspect import picture_files
-from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, option
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import first
+from smartcam._cli.running import run_until_first
 from smartcam._cli.texts import value_text
 from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from smartcam.inspection._inside import Teaching
     from smartcam.web._inside import TeachSite
 
-LINGER: Final = 3.0
-"""Seconds that the device continues streaming after a picture."""
+LINGER_TIME: Final = 3.0
+"""Seconds for which the device continues streaming after a picture."""
 
 
 @click.command(
@@ -41,7 +41,7 @@ LINGER: Final = 3.0
 )
 @click.argument("cell")
 @click.argument("camera")
-@click.argument("which", metavar="APPLICATION")
+@click.argument("application_name", metavar="APPLICATION")
 @click.argument("pictures", nargs=-1)
 @click.option(
     "--set",
@@ -59,11 +59,11 @@ LINGER: Final = 3.0
 @click.option("--save", is_flag=True, help="Write the file.")
 @page_options(always=True)
 @option("--seconds")
-@runs(*OUTPUT)
+@async_command(*OUTPUT_OPTIONS)
 async def teach(
     cell: str,
     camera: str,
-    which: str,
+    application_name: str,
     pictures: Sequence[str],
     changes: Sequence[str],
     learn: bool,
@@ -71,14 +71,14 @@ async def teach(
     web: PageOptions,
     options: Options,
 ) -> None:
-    """Serve the page, or carry out the options."""
+    """Serve the page, or change the tools by the options."""
     with from_part("inspection", "smartcam teach needs"):
         from smartcam.inspection._inside import Teaching
 
-    teaching = Teaching(cell, camera, which)
+    teaching = Teaching(cell, camera, application_name)
     files = [file for picture in pictures for file in picture_files(Path(picture))]
     if changes or learn or save:
-        await asyncio.to_thread(_change, teaching, files, changes, learn, save, options)
+        await asyncio.to_thread(_change_tools, teaching, files, changes, learn, save, options)
         return
     from smartcam.web._inside import TeachSite
 
@@ -87,9 +87,11 @@ async def teach(
         if not files:
             from smartcam import frames
 
-            source = await stack.enter_async_context(frames.open(teaching.frames, linger=LINGER))
+            source = await stack.enter_async_context(
+                frames.open(teaching.frames, linger=LINGER_TIME)
+            )
         site = TeachSite(teaching, files, source=source, **web.site_arguments)
-        await first([_serve(site, options)], options.seconds)
+        await run_until_first([_serve(site, options)], options.seconds)
 
 
 async def _serve(site: TeachSite, options: Options) -> None:
@@ -98,7 +100,7 @@ async def _serve(site: TeachSite, options: Options) -> None:
         await asyncio.Event().wait()
 
 
-def _change(
+def _change_tools(
     teaching: Teaching,
     files: Sequence[Path],
     changes: Sequence[str],
@@ -106,22 +108,22 @@ def _change(
     save: bool,
     options: Options,
 ) -> None:
-    """Change the tools, try them, and save them if that is asked for."""
+    """Change the tools, try them on the pictures, and save them if ``save``."""
     from smartcam.inspection import Picture
     from smartcam.inspection._inside import learn_tolerances
 
-    tools = _changed(teaching.tools, changes)
+    tools = _apply_changes(teaching.tools, changes)
     program = teaching.program(tools)
     pictures = [(file, Picture.read(file)) for file in files]
     remarks: list[str] = []
     if learn:
         if not pictures:
             raise click.UsageError("--learn: expected PICTURES of good parts, got none")
-        seen = {str(file): program.inspect(picture) for file, picture in pictures}
-        tools, remarks = learn_tolerances(tools, seen)
+        inspections = {str(file): program.inspect(picture) for file, picture in pictures}
+        tools, remarks = learn_tolerances(tools, inspections)
         program = teaching.program(tools)
     for file, picture in pictures:
-        _show(str(file), program.inspect(picture), options)
+        _show_inspection(str(file), program.inspect(picture), options)
     if save:
         teaching.save(tools)
     value = {"application": teaching.application, "tools": tools, "saved": save}
@@ -133,7 +135,7 @@ def _change(
     options.show(value, "\n".join(text))
 
 
-def _show(file: str, inspection: Inspection, options: Options) -> None:
+def _show_inspection(file: str, inspection: Inspection, options: Options) -> None:
     from smartcam.layout._inside import ShownUnits
 
     verdict = "ok" if inspection.ok else f"not ok: {inspection.reason}"
@@ -143,16 +145,18 @@ def _show(file: str, inspection: Inspection, options: Options) -> None:
     options.show(value, f"{file}: {verdict}\n{text}")
 
 
-def _changed(tools: dict[str, dict[str, Any]], changes: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the tools with changed settings.
+def _apply_changes(
+    tools: dict[str, dict[str, Any]], changes: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Change settings of the tools in place, and return the tools.
 
     Raises ConfigurationError: a change is not valid.
     """
     from smartcam.layout._inside import BadYamlError, load
 
     for change in changes:
-        place, equals, text = change.partition("=")
-        key, dot, name = place.strip().rpartition(".")
+        setting_path, equals, text = change.partition("=")
+        key, dot, name = setting_path.strip().rpartition(".")
         if not (equals and dot and key and name):
             raise ConfigurationError(f"--set: expected TOOL.SETTING=VALUE, got {change!r:.100}")
         settings = tools.setdefault(key, {})
@@ -160,7 +164,7 @@ def _changed(tools: dict[str, dict[str, Any]], changes: Sequence[str]) -> dict[s
             settings.pop(name, None)
             continue
         try:
-            settings[name] = load(text, label=f"--set {place}")
+            settings[name] = load(text, label=f"--set {setting_path}")
         except BadYamlError as exc:
-            raise ConfigurationError(f"--set {place}: {exc}") from exc
+            raise ConfigurationError(f"--set {setting_path}: {exc}") from exc
     return tools

@@ -1,4 +1,4 @@
-"""Colours, and a line that shows the progress of a wait, on terminals only."""
+"""Colours, and a line that counts results; both on terminals only."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ if TYPE_CHECKING:
     from smartcam.camera import Camera
 
 VERDICT_COLOURS = {"ok": "green", "hint": "cyan", "warning": "yellow", "error": "red"}
-"""The colour of each word of a verdict; the word alone has the full meaning."""
+"""The colour of each verdict; the word is shown, too, so no meaning depends on the colour."""
 
 PERIOD = 1.0
 """Seconds between two updates of the counting line."""
 
 
-def tinted(word: str, text: str | None = None) -> str:
-    """Return a word, or a text, in the word's colour; :func:`click.echo` removes it in files.
+def coloured(word: str, text: str | None = None) -> str:
+    """Return ``text`` in the colour of a verdict; without a text, the verdict itself.
 
-    The text is plain if NO_COLOR is set or the terminal is dumb.
+    There is no colour if NO_COLOR is set or the terminal is dumb, and :func:`click.echo` removes it
+    if the output is a file.
     """
     text = word if text is None else text
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
@@ -33,11 +34,11 @@ def tinted(word: str, text: str | None = None) -> str:
 
 
 class CountingLine:
-    """A line on the terminal's stderr that counts results, once a second; none without a terminal.
+    """A line on stderr that shows the number of results, updated once a second.
 
     ::
 
-        async with counting(camera) as line:
+        async with counting_line(camera) as line:  # shows it on terminals only
             result = await anext(results)
             line.clear()
             print(result)
@@ -59,18 +60,18 @@ class CountingLine:
         import asyncio
 
         loop = asyncio.get_running_loop()
-        seen, last = self._camera.statistics().received, loop.time()
+        last_count, last_change_at = self._camera.statistics().received, loop.time()
         while True:
             await asyncio.sleep(PERIOD)
-            received = self._camera.statistics().received
-            new, seen = received - seen, received
-            last = loop.time() if new else last
-            self._show(new, received, loop.time() - last)
+            count = self._camera.statistics().received
+            new_count, last_count = count - last_count, count
+            last_change_at = loop.time() if new_count else last_change_at
+            self._show(new_count, count, loop.time() - last_change_at)
 
-    def _show(self, new: int, received: int, silent: float) -> None:
-        rate = f"{new / PERIOD:.0f} a second" if new else f"nothing for {silent:.0f} s"
-        lost = "" if self._camera.connected else ", not connected"
-        text = f"{received} results, {rate}{lost}"
+    def _show(self, new_count: int, count: int, silence: float) -> None:
+        rate = f"{new_count / PERIOD:.0f} a second" if new_count else f"nothing for {silence:.0f} s"
+        connection = "" if self._camera.connected else ", not connected"
+        text = f"{count} results, {rate}{connection}"
         self.clear()
         sys.stderr.write(text)
         sys.stderr.flush()
@@ -78,7 +79,7 @@ class CountingLine:
 
 
 @contextlib.asynccontextmanager
-async def counting(camera: Camera[Any]) -> AsyncIterator[CountingLine]:
+async def counting_line(camera: Camera[Any]) -> AsyncIterator[CountingLine]:
     """Show a line that counts a camera's results, if stderr is a terminal."""
     line = CountingLine(camera)
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":

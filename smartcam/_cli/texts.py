@@ -22,7 +22,7 @@ MAX_SIGNIFICANT_DIGITS = 6
 """Number of significant digits of the largest number in a column."""
 
 MIN_ALIGNED, MAX_ALIGNED = 1e-3, 1e6
-"""Bounds of a column's largest number; beyond them decimal points are not aligned."""
+"""Range of a column's largest number within which the column's decimal points are aligned."""
 
 
 def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -67,7 +67,7 @@ def camera_value(emulator: WireCamera) -> dict[str, Any]:
 
 
 def application_text(application: int | None) -> str:
-    """Return the application in words; a camera's job may have no id."""
+    """Return the text of an application's id; some cameras' jobs have no id."""
     from smartcam.protocols.messages import UNNAMED_APPLICATION
 
     if application == UNNAMED_APPLICATION:
@@ -75,8 +75,8 @@ def application_text(application: int | None) -> str:
     return f"application {application}"
 
 
-def not_running(error: NotRunningError, camera: Camera, verb: str) -> NotRunningError:
-    """Return an error with its cure; ``verb`` is the command that raised it."""
+def not_running_error(error: NotRunningError, camera: Camera, verb: str) -> NotRunningError:
+    """Return the error with advice how to start the camera; ``verb``: the command that failed."""
     return NotRunningError(
         f"{error}. To start it: smartcam start {shlex.quote(camera.url)}, or {verb} with "
         f"--application {camera.active_application}"
@@ -86,7 +86,8 @@ def not_running(error: NotRunningError, camera: Camera, verb: str) -> NotRunning
 def result_text(result: Result, units: ShownUnits, layout: Layout | None) -> str:
     """Return a result: a line about it, then its value.
 
-    ``units``: units in which values are shown. ``layout``: layout of a table, which has no units.
+    ``units``: units in which values are shown. ``layout``: layout of the value, which has the units
+    of a table's columns.
     """
     latency = f", {1e3 * result.latency:.1f} ms after its trigger" if result.latency else ""
     sequence = f", sequence {result.sequence}" if result.sequence is not None else ""
@@ -128,7 +129,10 @@ def _field_text(
     units: ShownUnits,
     lists: Mapping[str, Mapping[str, str]],
 ) -> str:
-    """Return a field's line; for a list of records, a table. ``lists``: units of their fields."""
+    """Return a field's line; for a list of records, a table.
+
+    ``lists``: units of the records' fields, by the name of the list.
+    """
     if _is_table(value):
         return f"  {name}:\n{_records_text(value, lists[name], units)}"
     symbol = symbols.get(name, "")
@@ -137,20 +141,20 @@ def _field_text(
 
 
 def _records_text(rows: list[dict[str, Any]], symbols: Mapping[str, str], units: ShownUnits) -> str:
-    """Return a row for each record, with the units in the head."""
-    heads = [_head(name, symbols.get(name, ""), units) for name in rows[0]]
-    shown = [
+    """Return a table with a row for each record, and the units in the headings."""
+    heads = [_heading(name, symbols.get(name, ""), units) for name in rows[0]]
+    cells = [
         [units.shown(value, symbols.get(name, "")) for name, value in row.items()] for row in rows
     ]
-    return table_text(heads, shown)
+    return table_text(heads, cells)
 
 
-def _head(name: str, symbol: str, units: ShownUnits) -> str:
+def _heading(name: str, symbol: str, units: ShownUnits) -> str:
     return f"{name} [{units.of(symbol).name}]" if symbol else name
 
 
 def _localizations_text(parts: list[Localization], units: ShownUnits) -> str:
-    """Return a row for each part: in the plane if all of them lie in it, else in space."""
+    """Return a table of parts: x, y and theta in the plane; else position and quaternion."""
     head: tuple[str, ...]
     rows: list[tuple[object, ...]]
     if any(pose.position.z or any(pose.orientation[:2]) for *_, pose in parts):
@@ -160,9 +164,9 @@ def _localizations_text(parts: list[Localization], units: ShownUnits) -> str:
         head = ("x", "y", "theta")
         rows = [(*part.pose.position[:2], part.pose.orientation.theta) for part in parts]
     names = ("feature_id", "quality", *head)
-    named = [(*part[:2], *row) for part, row in zip(parts, rows, strict=True)]
+    all_rows = [(*part[:2], *row) for part, row in zip(parts, rows, strict=True)]
     symbols = {"x": "m", "y": "m", "z": "m", "theta": "rad"}
-    return _records_text([dict(zip(names, row, strict=True)) for row in named], symbols, units)
+    return _records_text([dict(zip(names, row, strict=True)) for row in all_rows], symbols, units)
 
 
 def _cell(value: object) -> str:

@@ -16,8 +16,8 @@ INTERRUPTED = 130
 
 
 @contextlib.contextmanager
-def importing() -> Iterator[None]:
-    """End the program after Ctrl-C during an import as it would end later."""
+def exiting_on_interrupt() -> Iterator[None]:
+    """Exit with the code for Ctrl-C if Ctrl-C is pressed during an import in the block."""
     try:
         yield
     except KeyboardInterrupt:
@@ -27,11 +27,11 @@ def importing() -> Iterator[None]:
 def error_json(error: Exception, text: str, code: int, **more: str) -> str:
     """Return an error as JSON: its class, its text, the exit code, and its public attributes.
 
-    ``more``: fields to put first.
+    ``more``: fields that come before them.
     """
     attributes = {name: value for name, value in vars(error).items() if not name.startswith("_")}
     if isinstance(error, click.ClickException):
-        attributes = {}  # click's own, with its context
+        attributes = {}  # they are click's own, such as its context
     import json
 
     from smartcam.models import jsonable
@@ -50,13 +50,13 @@ class JsonErrors(click.Command):
         parent: click.Context | None = None,
         **extra: Any,
     ) -> click.Context:
-        """Parse."""
-        with _reported_as_json("--json" in args):
+        """Parse the arguments."""
+        with _reporting_as_json("--json" in args):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run."""
-        with _reported_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
+        """Run the command."""
+        with _reporting_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
             return super().invoke(ctx)
 
 
@@ -74,13 +74,13 @@ class ListedGroup(JsonErrors, click.Group):
         if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
             from smartcam._suggestions import did_you_mean
 
-            end = did_you_mean(args[0], self.list_commands(ctx)) or "."
-            ctx.fail(f"No such command {args[0]!r}{end}")
+            hint = did_you_mean(args[0], self.list_commands(ctx)) or "."
+            ctx.fail(f"No such command {args[0]!r}{hint}")
         return super().resolve_command(ctx, args)
 
 
 MAX_SUMMARY_CHARACTERS = 400
-"""Largest number of characters of a command's first sentence that a list shows."""
+"""Largest number of characters of a command's first sentence in a list of commands."""
 
 
 def write_commands(group: click.Group, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -96,38 +96,39 @@ def write_commands(group: click.Group, ctx: click.Context, formatter: click.Help
 
 
 @contextlib.contextmanager
-def _reported_as_json(wanted: bool) -> Iterator[None]:
+def _reporting_as_json(as_json: bool) -> Iterator[None]:
+    """Improve the texts of wrong usage, and print them as JSON if ``as_json``."""
     try:
-        with _options_suggested(), _numbers_explained():
+        with _suggesting_options(), _explaining_numbers():
             yield
     except click.ClickException as exc:
-        if not wanted:
+        if not as_json:
             raise
         sys.stderr.write(error_json(exc, exc.format_message(), exc.exit_code) + "\n")
         raise click.exceptions.Exit(exc.exit_code) from exc
 
 
-_KINDS = {
+_TYPE_TEXTS = {
     "integer": "a whole number",
     "integer range": "a whole number",
     "float": "a number",
     "float range": "a number",
 }
-"""Words for the kind of an option's value, by click's names."""
+"""Words for the type of an option's value, by click's name of the type."""
 
 
 @contextlib.contextmanager
-def _numbers_explained() -> Iterator[None]:
-    """Explain in words, in the error for a wrong value, that a number is expected."""
+def _explaining_numbers() -> Iterator[None]:
+    """Say in the error for a wrong value that a number is expected."""
     try:
         yield
     except click.BadParameter as exc:
-        given, matched, kind = exc.message.partition(" is not a valid ")
-        words = _KINDS.get(kind.rstrip(".")) if matched else None
+        value, separator, type_name = exc.message.partition(" is not a valid ")
+        words = _TYPE_TEXTS.get(type_name.rstrip(".")) if separator else None
         if words is not None:
-            point = given.strip("'").replace(",", ".")
-            end = f"; did you mean {point}?" if _is_number(point) else "."
-            text = f"{given} is not {words}{end}"
+            with_point = value.strip("'").replace(",", ".")
+            hint = f"; did you mean {with_point}?" if _is_number(with_point) else "."
+            text = f"{value} is not {words}{hint}"
             raise click.BadParameter(
                 text, ctx=exc.ctx, param=exc.param, param_hint=exc.param_hint
             ) from exc
@@ -143,8 +144,8 @@ def _is_number(text: str) -> bool:
 
 
 @contextlib.contextmanager
-def _options_suggested() -> Iterator[None]:
-    """Suggest the option that was probably meant, in the error for an unknown one."""
+def _suggesting_options() -> Iterator[None]:
+    """Name a similar option in the error for an unknown option."""
     try:
         yield
     except click.NoSuchOption as exc:
@@ -153,8 +154,8 @@ def _options_suggested() -> Iterator[None]:
         from smartcam._suggestions import did_you_mean
 
         params = exc.ctx.command.params
-        known = [name for each in params for name in (*each.opts, *each.secondary_opts)]
-        names = [name for name in known if name.startswith("--")]
-        end = did_you_mean(exc.option_name, names) or "."
-        text = f"No such option {exc.option_name!r}{end}"
+        all_names = [name for each in params for name in (*each.opts, *each.secondary_opts)]
+        names = [name for name in all_names if name.startswith("--")]
+        hint = did_you_mean(exc.option_name, names) or "."
+        text = f"No such option {exc.option_name!r}{hint}"
         raise click.NoSuchOption(exc.option_name, text, ctx=exc.ctx) from exc

@@ -1,7 +1,7 @@
 """A Wireshark dissector for every dialect of ``bvs``, made from the message tables.
 
-The tables become Lua tables, with which ``engine.lua`` beside this file reads frames. So a new
-message in ``protocols/_bvs.py`` is known to Wireshark, too.
+The tables become Lua tables; ``engine.lua`` in this folder reads frames with them. So Wireshark
+also knows a new message of ``protocols/_bvs.py``.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ def lua_source() -> str:
         f"-- Wireshark dissector for Balluff BVS smart cameras, made by smartcam {__version__}.",
         "-- Do not edit: smartcam dissector > smartcam.lua makes it anew from the message tables.",
         "",
-        *(f"local {name} = {_lua(value)}" for name, value in lua_tables().items()),
+        *(f"local {name} = {_lua_expression(value)}" for name, value in lua_tables().items()),
         "",
     ]
     return "\n".join(lines) + engine
 
 
 def lua_tables() -> dict[str, Any]:
-    """Return the tables of the Lua code, as plain values by the names of its variables."""
+    """Return the tables of the Lua code, as plain values by the names of the Lua variables."""
     dialects = BVS.dialects
     rows = [row for dialect in dialects.values() for row in dialect.table]
     first_tries = BVS.detection[Transport.TCP]
@@ -50,16 +50,16 @@ def lua_tables() -> dict[str, Any]:
         "PORT": DEFAULT_PORT,
         "MAX_LENGTH": DEFAULT_MAX_LENGTH,
         "FIELDS": {name: wire.value for row in rows for name, wire in row.fields},
-        "STATUSES": [_name(member) for member in Status],
-        "IDS": _ids(rows),
-        "DIALECTS": [_dialect(dialect) for dialect in dialects.values()],
+        "STATUSES": [_status_name(member) for member in Status],
+        "IDS": _names_by_id(rows),
+        "DIALECTS": [_dialect_table(dialect) for dialect in dialects.values()],
         "KIN": [[dialect.name, *dialect.quirks] for group in first_tries for dialect in group],
     }
 
 
-def _dialect(dialect: FramedDialect) -> dict[str, Any]:
+def _dialect_table(dialect: FramedDialect) -> dict[str, Any]:
     header = dialect.header
-    plain = _rows(dialect)
+    rows_without_quirk = _dialect_rows(dialect)
     return {
         "name": dialect.name,
         "about": dialect.about,
@@ -69,35 +69,42 @@ def _dialect(dialect: FramedDialect) -> dict[str, Any]:
         "id_first": header.id_first,
         "length_includes": header.length_includes,
         "status_by_itself": dialect.status_by_itself,
-        "status": _status(dialect.status_bits),
-        "codes": _codes(dialect.codes),
-        "messages": plain,
-        "quirks": [_quirk(dialect.with_quirks([name]), plain) for name in dialect.wire_quirks],
+        "status": _status_table(dialect.status_bits),
+        "codes": _code_table(dialect.codes),
+        "messages": rows_without_quirk,
+        "quirks": [
+            _quirk_differences(dialect.with_quirks([name]), rows_without_quirk)
+            for name in dialect.wire_quirks
+        ],
     }
 
 
-def _quirk(variant: FramedDialect, plain: Rows) -> dict[str, Any]:
-    """Return the differences of a variant with one quirk."""
+def _quirk_differences(variant: FramedDialect, rows_without_quirk: Rows) -> dict[str, Any]:
+    """Return the differences of a dialect with one quirk from the dialect without it."""
     (name,) = variant.quirks
     return {
         "name": name,
         "about": variant.wire_quirks[name].about,
-        "codes": _codes(variant.codes) if variant.wire_quirks[name].codes is not None else {},
+        "codes": _code_table(variant.codes) if variant.wire_quirks[name].codes is not None else {},
         "messages": {
-            sender: {number: row for number, row in rows.items() if row != plain[sender][number]}
-            for sender, rows in _rows(variant).items()
+            sender: {
+                number: row
+                for number, row in rows.items()
+                if row != rows_without_quirk[sender][number]
+            }
+            for sender, rows in _dialect_rows(variant).items()
         },
     }
 
 
-def _rows(dialect: FramedDialect) -> Rows:
+def _dialect_rows(dialect: FramedDialect) -> Rows:
     rows: Rows = {sender.value: {} for sender in Sender}
     for row in dialect.table:
-        rows[row.type.sender.value][row.message_id] = _row(row, dialect)
+        rows[row.type.sender.value][row.message_id] = _row_table(row, dialect)
     return rows
 
 
-def _row(row: MessageRow, dialect: FramedDialect) -> dict[str, Any]:
+def _row_table(row: MessageRow, dialect: FramedDialect) -> dict[str, Any]:
     codec = dialect.encoder(row.type)
     return {
         "name": row.type.__name__,
@@ -112,41 +119,42 @@ def _row(row: MessageRow, dialect: FramedDialect) -> dict[str, Any]:
     }
 
 
-def _codes(codes: Mapping[int, CodeMeaning]) -> dict[int, list[str]]:
+def _code_table(codes: Mapping[int, CodeMeaning]) -> dict[int, list[str]]:
     return {int(number): [code.text, code.verdict.value] for number, code in codes.items()}
 
 
-def _name(status: Status) -> str:
+def _status_name(status: Status) -> str:
     return (status.name or "").lower()
 
 
-def _status(bits: StatusBits) -> dict[str, Any]:
-    """Return the status bits of the wire by the attributes of StatusBits.
+def _status_table(bits: StatusBits) -> dict[str, Any]:
+    """Return the statuses of the wire's bits; the keys are attributes of StatusBits.
 
-    Statuses without a place of their own are shifted up by ``others`` bits.
+    A bit of the wire that ``named`` does not have is the status with this value, shifted up by
+    ``others``.
     """
     if bits.others:
-        named = {member.value >> bits.others: member for member in Status}
-        named.update(bits.named)
-        named.pop(0, None)
+        status_by_bit = {member.value >> bits.others: member for member in Status}
+        status_by_bit.update(bits.named)
+        status_by_bit.pop(0, None)
     else:
-        named = {member.value: member for member in Status if member.value < 1 << 32}
+        status_by_bit = {member.value: member for member in Status if member.value < 1 << 32}
     return {
-        "named": [[wire, _name(named[wire])] for wire in sorted(named)],
-        "without": [[wire, _name(status)] for wire, status in bits.without.items()],
-        "always": [_name(member) for member in bits.always],
+        "named": [[wire, _status_name(status_by_bit[wire])] for wire in sorted(status_by_bit)],
+        "without": [[wire, _status_name(status)] for wire, status in bits.without.items()],
+        "always": [_status_name(member) for member in bits.always],
     }
 
 
-def _ids(rows: Sequence[MessageRow]) -> dict[int, str]:
-    """Return the names of the messages with each id, requests first."""
+def _names_by_id(rows: Sequence[MessageRow]) -> dict[int, str]:
+    """Return the names of the messages that have each id, requests first."""
     names: dict[int, dict[str, None]] = {}
     for row in sorted(rows, key=lambda row: row.type.sender is Sender.CAMERA):
         names.setdefault(row.message_id, {})[row.type.__name__] = None
     return {number: " / ".join(texts) for number, texts in sorted(names.items())}
 
 
-def _lua(value: Any, indent: str = "") -> str:
+def _lua_expression(value: Any, indent: str = "") -> str:
     """Return a value as a Lua expression; tables have a line for each entry."""
     match value:
         case bool():
@@ -156,11 +164,13 @@ def _lua(value: Any, indent: str = "") -> str:
         case str():
             return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
         case dict():
-            entries = [(f"[{_lua(key)}] = ", item) for key, item in value.items()]
+            entries = [(f"[{_lua_expression(key)}] = ", item) for key, item in value.items()]
         case _:
             entries = [("", item) for item in value]
     if not any(isinstance(item, (dict, list)) for _, item in entries):
-        return "{" + ", ".join(key + _lua(item) for key, item in entries) + "}"
-    deeper = indent + "  "
-    lines = [f"{deeper}{key}{_lua(item, deeper)},\n" for key, item in entries]
+        return "{" + ", ".join(key + _lua_expression(item) for key, item in entries) + "}"
+    inner_indent = indent + "  "
+    lines = [
+        f"{inner_indent}{key}{_lua_expression(item, inner_indent)},\n" for key, item in entries
+    ]
     return "{\n" + "".join(lines) + indent + "}"

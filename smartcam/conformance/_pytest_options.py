@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-PROPERTY = "smartcam-client-finding"
-"""Property of a test report that holds a finding, since reports pass between processes."""
+FINDING_PROPERTY = "smartcam-client-finding"
+"""Property of a test report that holds a finding; pytest-xdist passes it between processes."""
 
-CAMERA: Mapping[str, str] = {
+CAMERA_OPTIONS: Mapping[str, str] = {
     "--camera-url": (
         "the camera that smartcam.conformance.camera judges, such as bvs://192.168.0.10; "
         "it is taken from its client"
@@ -40,7 +40,7 @@ CAMERA: Mapping[str, str] = {
 }
 """Help text of each option about a camera."""
 
-CLIENT: Mapping[str, str] = {
+CLIENT_OPTIONS: Mapping[str, str] = {
     "--client-command": (
         "The client to judge: a command with {task}, and {url} or {host} and {port}. It does the "
         "task and prints each result's bytes as hex or JSON, one line each; exit code 0: done, 77: "
@@ -56,14 +56,14 @@ CLIENT: Mapping[str, str] = {
 def add_options(parser: Any) -> None:
     """Register the options with pytest's ``parser`` (``pytest_addoption``)."""
     for name, title, options in (
-        ("smartcam", "smartcam: is it a BVS camera?", CAMERA),
-        ("smartcam-client", "smartcam: how good is a client?", CLIENT),
+        ("smartcam", "smartcam: is it a BVS camera?", CAMERA_OPTIONS),
+        ("smartcam-client", "smartcam: how good is a client?", CLIENT_OPTIONS),
     ):
         group = parser.getgroup(name, title)
         for option, text in options.items():
             metavar = option.rpartition("-")[2].upper()
-            kind = float if option == "--client-timeout" else str
-            group.addoption(option, type=kind, default=None, metavar=metavar, help=text)
+            value_type = float if option == "--client-timeout" else str
+            group.addoption(option, type=value_type, default=None, metavar=metavar, help=text)
 
 
 def terminal_summary(reporter: Any) -> None:
@@ -74,7 +74,7 @@ def terminal_summary(reporter: Any) -> None:
         for report in reports
         if getattr(report, "when", None) == "call"
         for name, value in report.user_properties
-        if name == PROPERTY
+        if name == FINDING_PROPERTY
     ]
     if findings:
         from smartcam.conformance.client._report import ClientFinding, write_findings

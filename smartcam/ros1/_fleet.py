@@ -20,33 +20,33 @@ TIMEOUT = 10.0
 
 
 class RosbridgeFleet(RosFleet):
-    """A node of ROS 1 for each camera that a fleet has at the time.
+    """A node of ROS 1 for each present camera of a fleet.
 
     Args:
         bridge: the URL of the rosbridge.
         on_change: function called with a node whose bridge was connected or lost.
-        *given: arguments of :class:`RosFleet`.
+        *args: arguments of :class:`RosFleet`.
         **options: arguments of :class:`RosFleet` by name.
     """
 
     def __init__(
-        self, bridge: str, on_change: Callable[[RosbridgeNode], None], *given: Any, **options: Any
+        self, bridge: str, on_change: Callable[[RosbridgeNode], None], *args: Any, **options: Any
     ) -> None:
-        super().__init__(*given, **options)
+        super().__init__(*args, **options)
         self._bridge, self._on_change = bridge, on_change
 
     def _node(self, name: str) -> Any:
-        alike = super()._node(name)
+        ros2_node = super()._node(name)
         return RosbridgeNode(
-            alike.name,
-            namespace=alike.namespace,
+            ros2_node.name,
+            namespace=ros2_node.namespace,
             bridge=self._bridge,
-            types=alike.types,
+            types=ros2_node.types,
             on_change=self._on_change,
         )
 
     @property
-    def bridged(self) -> list[RosbridgeNode]:
+    def bridged_nodes(self) -> list[RosbridgeNode]:
         """The nodes, in the order of their names."""
         nodes = [camera.node for camera in self.nodes.values()]
         return sorted(nodes, key=lambda node: node.full_name)
@@ -55,12 +55,12 @@ class RosbridgeFleet(RosFleet):
         """Wait, for a bounded time, until every node is connected or has failed to connect."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TIMEOUT):
-                for node in self.bridged:
+                for node in self.bridged_nodes:
                     await node.wait_first_attempts()
 
 
 @contextlib.asynccontextmanager
-async def bridged(
+async def run_bridged_nodes(
     bridge: str,
     on_change: Callable[[RosbridgeNode], None],
     address: FleetAddress,
@@ -78,14 +78,14 @@ async def bridged(
 
     Raises:
         ConfigurationError: the URL is not valid.
-        ConnectFailedError: no bus, or no agent with a camera, within the time.
+        ConnectFailedError: no bus, or no agent with a camera, was found in time.
     """
     checked_url(bridge)
     bus = ZenohEnd(address.link)
     await bus.open(TIMEOUT)
     try:
-        given = (bus, address.fleet, address, section)
-        async with RosbridgeFleet(bridge, on_change, *given, **options) as ros:
+        args = (bus, address.fleet, address, section)
+        async with RosbridgeFleet(bridge, on_change, *args, **options) as ros:
             yield ros
     finally:
         await bus.close()

@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.ros1._fleet import RosbridgeFleet, bridged
+    from smartcam.ros1._fleet import RosbridgeFleet, run_bridged_nodes
     from smartcam.ros1._link import checked_url
 
 __all__ = [
     "RosbridgeFleet",
-    "bridged",
     "checked_url",
+    "run_bridged_nodes",
 ]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_fleet": "RosbridgeFleet bridged",
+            "_fleet": "RosbridgeFleet run_bridged_nodes",
             "_link": "checked_url",
         },
     )

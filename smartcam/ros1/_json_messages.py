@@ -1,6 +1,7 @@
 """Messages for a rosbridge: JSON with the fields of each type in ROS 1.
 
-The types are ROS 2's. The tables of this module have ROS 1's other names; bytes are base64.
+Types are those of ROS 2. Tables of this module have the fields and packages in which ROS 1 differs.
+Bytes are sent as base64.
 """
 
 from __future__ import annotations
@@ -18,40 +19,40 @@ if TYPE_CHECKING:
 
     from smartcam.ros2._inside import MessageField, MessageType
 
-Part: TypeAlias = "str | Raw"
+TextPart: TypeAlias = "str | RawBytes"
 
-RENAMED: Final[Mapping[str, Mapping[str, str]]] = {
+RENAMED_FIELDS: Final[Mapping[str, Mapping[str, str]]] = {
     "builtin_interfaces/msg/Time": {"sec": "secs", "nanosec": "nsecs"},
     "builtin_interfaces/msg/Duration": {"sec": "secs", "nanosec": "nsecs"},
     "sensor_msgs/msg/CameraInfo": {"d": "D", "k": "K", "r": "R", "p": "P"},
 }
 """Fields that have another name in ROS 1, by type."""
 
-ONLY_ROS1: Final[Mapping[str, Mapping[str, Any]]] = {"std_msgs/msg/Header": {"seq": 0}}
-"""Fields that only ROS 1 has, and their values; rospy counts a header's ``seq`` itself."""
+FIELDS_ONLY_IN_ROS1: Final[Mapping[str, Mapping[str, Any]]] = {"std_msgs/msg/Header": {"seq": 0}}
+"""Fields that only ROS 1 has, with the values to send; rospy replaces a header's ``seq``."""
 
-ONLY_ROS2: Final = frozenset(
+PACKAGES_ONLY_IN_ROS2: Final = frozenset(
     {"action_msgs", "composition_interfaces", "lifecycle_msgs", "rcl_interfaces", "rosgraph_msgs",
      "service_msgs", "statistics_msgs", "type_description_interfaces", "vision_msgs"}
 )  # fmt: skip
 """Packages that ROS 1 does not have, or has with other fields."""
 
-_ALLOWED: Final[Mapping[str, tuple[type, ...]]] = {
+_JSON_TYPES: Final[Mapping[str, tuple[type, ...]]] = {
     "bool": (bool,),
     "string": (str,),
     "float32": (int, float),
     "float64": (int, float),
 }
-"""Python types of a JSON value, by the field's type; all others are integers."""
+"""Python types that a JSON value may have, by the field's type; other fields are integers."""
 
-_BYTES: Final = ("uint8", "char")
-_MARK: Final = secrets.token_hex(12)
-_CHUNK: Final = 3 << 16  # a multiple of three, so that parts of base64 can be joined
-_MAX_LEVELS = 32
+_BYTE_TYPES: Final = ("uint8", "char")
+_PLACEHOLDER: Final = secrets.token_hex(12)
+_CHUNK_BYTES: Final = 3 << 16  # a multiple of three, so that parts of base64 can be joined
+_MAX_NESTING = 32
 
 
-class Raw:
-    """Bytes that are encoded as base64 only when sent: not for a picture that is dropped."""
+class RawBytes:
+    """Bytes that become base64 when they are sent, so that a dropped picture costs nothing."""
 
     __slots__ = ("data",)
 
@@ -62,45 +63,56 @@ class Raw:
         return (len(self.data) + 2) // 3 * 4
 
     def chunks(self) -> list[memoryview]:
-        """Return the bytes in parts, each of which is encoded in a short time."""
-        return [self.data[start : start + _CHUNK] for start in range(0, len(self.data), _CHUNK)]
+        """Return the bytes in parts that are short enough to be encoded in one turn of the loop."""
+        return [
+            self.data[start : start + _CHUNK_BYTES]
+            for start in range(0, len(self.data), _CHUNK_BYTES)
+        ]
 
 
 def ros1_name(name: str) -> str | None:
     """Return a type's name in ROS 1 (``std_msgs/String``); None if ROS 1 has no such type."""
     package, _, short_name = name.partition("/")
-    return None if package in ONLY_ROS2 else f"{package}/{short_name.rpartition('/')[2]}"
+    return (
+        None if package in PACKAGES_ONLY_IN_ROS2 else f"{package}/{short_name.rpartition('/')[2]}"
+    )
 
 
-def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
-    """Return a message, or the mapping of its fields, as JSON values, with :class:`Raw` for bytes.
+def to_json(message_type: MessageType, message: Any) -> dict[str, Any]:
+    """Return a message, or the mapping of its fields, as JSON values and :class:`RawBytes`.
 
     Raises:
         RosMessageError: the value does not fit the type.
     """
     # the decoded copy is valid, and independent of the publisher's buffers
-    return _fields(kind, kind.decode(kind.encode(message)))
+    return _to_json_fields(message_type, message_type.decode(message_type.encode(message)))
 
 
-def _fields(kind: MessageType, message: Any) -> dict[str, Any]:
-    names = RENAMED.get(kind.name, {})
-    made = dict(ONLY_ROS1.get(kind.name, {}))
-    for field in kind.fields:
+def _to_json_fields(message_type: MessageType, message: Any) -> dict[str, Any]:
+    names = RENAMED_FIELDS.get(message_type.name, {})
+    fields = dict(FIELDS_ONLY_IN_ROS1.get(message_type.name, {}))
+    for field in message_type.fields:
         value = getattr(message, field.attribute)
-        made[names.get(field.name, field.name)] = _value(kind, field, value)
-    if kind.name == "builtin_interfaces/msg/Time" and made["secs"] < 0:
-        raise RosMessageError(f"{kind.name}: sec: ROS 1 has no time before 1970, got {message!r}")
-    return made
+        fields[names.get(field.name, field.name)] = _to_json_value(message_type, field, value)
+    if message_type.name == "builtin_interfaces/msg/Time" and fields["secs"] < 0:
+        raise RosMessageError(
+            f"{message_type.name}: sec: ROS 1 has no time before 1970, got {message!r}"
+        )
+    return fields
 
 
-def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
+def _to_json_value(message_type: MessageType, field: MessageField, value: Any) -> Any:
     if field.nested:
-        inner = kind.nested[field.type]
-        return [_fields(inner, item) for item in value] if field.shape else _fields(inner, value)
+        nested_type = message_type.nested[field.type]
+        return (
+            [_to_json_fields(nested_type, item) for item in value]
+            if field.shape
+            else _to_json_fields(nested_type, value)
+        )
     if not field.shape:
         return _signed(value) if field.type == "byte" else value
-    if field.type in _BYTES:
-        return Raw(value)
+    if field.type in _BYTE_TYPES:
+        return RawBytes(value)
     items = value.tolist() if hasattr(value, "tolist") else list(value)
     return [_signed(item) for item in items] if field.type == "byte" else items
 
@@ -110,104 +122,119 @@ def _signed(value: int) -> int:
     return value - 256 if value > 127 else int(value)
 
 
-def from_json(kind: MessageType, data: Any) -> Any:
+def from_json(message_type: MessageType, data: Any) -> Any:
     """Return the message of a JSON value; missing fields are zero.
 
     Args:
-        kind: type of the message.
+        message_type: type of the message.
         data: object of the fields, or array of the first fields' values in order.
 
     Raises:
         RosMessageError: the type does not have a field, or a value does not fit.
     """
     if isinstance(data, list):
-        if len(data) > len(kind.fields):
+        if len(data) > len(message_type.fields):
             raise RosMessageError(
-                f"{kind.name}: expected up to {len(kind.fields)} values, got {len(data)}"
+                f"{message_type.name}: expected up to {len(message_type.fields)} values, "
+                f"got {len(data)}"
             )
-        names = RENAMED.get(kind.name, {})
-        ordered = [names.get(field.name, field.name) for field in kind.fields]
+        names = RENAMED_FIELDS.get(message_type.name, {})
+        ordered = [names.get(field.name, field.name) for field in message_type.fields]
         data = dict(zip(ordered, data, strict=False))
-    message = kind.new(**_checked_fields(kind, data, "", _MAX_LEVELS))
-    return kind.decode(kind.encode(message))  # makes numpy arrays and bytes, as in ROS 2
+    message = message_type.new(**_checked_fields(message_type, data, "", _MAX_NESTING))
+    return message_type.decode(
+        message_type.encode(message)
+    )  # makes numpy arrays and bytes, as in ROS 2
 
 
-def _checked_fields(kind: MessageType, data: Any, where: str, depth: int) -> dict[str, Any]:
-    """Return the fields of an object under their names in ROS 2; encoding checks the values."""
+def _checked_fields(message_type: MessageType, data: Any, path: str, depth: int) -> dict[str, Any]:
+    """Return the fields of an object by their names in ROS 2; encoding checks the values."""
     if not isinstance(data, dict):
         raise RosMessageError(
-            f"{kind.name}: {where or 'the whole'}: expected an object, got {data!r:.80}"
+            f"{message_type.name}: {path or 'the whole'}: expected an object, got {data!r:.80}"
         )
     if not depth:
-        raise RosMessageError(f"{kind.name}: {where}: nested too deep")
-    names, only = RENAMED.get(kind.name, {}), ONLY_ROS1.get(kind.name, {})
-    fields = {names.get(field.name, field.name): field for field in kind.fields}
+        raise RosMessageError(f"{message_type.name}: {path}: nested too deep")
+    names, ros1_fields = (
+        RENAMED_FIELDS.get(message_type.name, {}),
+        FIELDS_ONLY_IN_ROS1.get(message_type.name, {}),
+    )
+    fields = {names.get(field.name, field.name): field for field in message_type.fields}
     checked = dict[str, Any]()
     for name, value in data.items():
-        if name in only:
+        if name in ros1_fields:
             continue
         field = fields.get(name)
         if field is None:
-            expected = ", ".join((*fields, *only)) or "none"
-            raise RosMessageError(f"{kind.name}: {where}{name}: no such field, expected {expected}")
-        checked[field.attribute] = _checked_value(kind, field, value, f"{where}{name}", depth)
+            expected = ", ".join((*fields, *ros1_fields)) or "none"
+            raise RosMessageError(
+                f"{message_type.name}: {path}{name}: no such field, expected {expected}"
+            )
+        checked[field.attribute] = _checked_value(
+            message_type, field, value, f"{path}{name}", depth
+        )
     return checked
 
 
 def _checked_value(
-    kind: MessageType, field: MessageField, value: Any, where: str, depth: int
+    message_type: MessageType, field: MessageField, value: Any, path: str, depth: int
 ) -> Any:
-    if field.shape and field.type in _BYTES and isinstance(value, str):
+    if field.shape and field.type in _BYTE_TYPES and isinstance(value, str):
         try:
             return base64.b64decode(value, validate=True)
         except (binascii.Error, ValueError) as exc:
             raise RosMessageError(
-                f"{kind.name}: {where}: expected base64, got {value!r:.80} ({exc})"
+                f"{message_type.name}: {path}: expected base64, got {value!r:.80} ({exc})"
             ) from exc
     if field.shape and not isinstance(value, list):
-        raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {value!r:.80}")
+        raise RosMessageError(f"{message_type.name}: {path}: expected {field}, got {value!r:.80}")
     if not field.nested:
-        allowed = _ALLOWED.get(field.type, (int,))
+        allowed = _JSON_TYPES.get(field.type, (int,))
         values: list[Any] = value if field.shape else [value]
         for item in values:
             if type(item) not in allowed:
-                raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {item!r:.80}")
+                raise RosMessageError(
+                    f"{message_type.name}: {path}: expected {field}, got {item!r:.80}"
+                )
         if field.type == "byte":
             values = [item + 256 if -128 <= item < 0 else item for item in values]
         return values if field.shape else values[0]
-    inner = kind.nested[field.type]
+    nested_type = message_type.nested[field.type]
     if not field.shape:
-        return _checked_fields(inner, value, f"{where}.", depth - 1)
+        return _checked_fields(nested_type, value, f"{path}.", depth - 1)
     return [
-        _checked_fields(inner, item, f"{where}[{n}].", depth - 1) for n, item in enumerate(value)
+        _checked_fields(nested_type, item, f"{path}[{n}].", depth - 1)
+        for n, item in enumerate(value)
     ]
 
 
-def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:
-    """Return the parts of an operation's text.
+def encode_operation(operation: Mapping[str, Any]) -> tuple[TextPart, ...]:
+    """Return the text of an operation in parts: JSON, and bytes that become base64 later.
 
     Raises:
         RosMessageError: a number is not finite, which JSON cannot have.
     """
-    raws: list[Raw] = []
+    raw_bytes: list[RawBytes] = []
 
-    def place(value: Any) -> str:
-        if not isinstance(value, Raw):
+    def put_placeholder(value: Any) -> str:
+        if not isinstance(value, RawBytes):
             raise TypeError(f"no JSON: {value!r:.80}")
-        raws.append(value)
-        return _MARK
+        raw_bytes.append(value)
+        return _PLACEHOLDER
 
     try:
-        text = json.dumps(operation, default=place, allow_nan=False, separators=(",", ":"))
+        text = json.dumps(
+            operation, default=put_placeholder, allow_nan=False, separators=(",", ":")
+        )
     except ValueError as exc:
         raise RosMessageError(
             f"{operation.get('topic') or operation.get('service')}: expected finite numbers, JSON "
             "has no others"
         ) from exc
-    if not raws:
+    if not raw_bytes:
         return (text,)
-    first, *others = text.split(_MARK)  # the quotation marks remain
-    parts: list[Part] = [first]
-    for raw, after in zip(raws, others, strict=True):
+    start, *rest = text.split(_PLACEHOLDER)  # the quotation marks remain
+    parts: list[TextPart] = [start]
+    for raw, after in zip(raw_bytes, rest, strict=True):
         parts += (raw, after)
     return tuple(parts)

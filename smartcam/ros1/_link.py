@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import aiohttp
 
     from smartcam.backoff import Backoff
-    from smartcam.ros1._json_messages import Part
+    from smartcam.ros1._json_messages import TextPart
     from smartcam.ros1._outbox import Outbox
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
@@ -29,15 +29,15 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 CONNECT_TIMEOUT = 10.0
 """Seconds for a bridge to answer the handshake."""
 STALLED_TIMEOUT = 10.0
-"""Seconds for a bridge to read one message."""
+"""Seconds that a bridge may take to read one message."""
 GOODBYE_TIMEOUT = 1.0
 """Seconds for a bridge to answer a closing handshake."""
 SEND_BUFFER = 1 << 17
-"""Number of bytes of the system's send buffer: small, since waiting data become old."""
+"""Size of the system's send buffer in bytes: small, since data that wait there become old."""
 HEARTBEAT_INTERVAL = 10.0
-"""Seconds of silence after which the bridge gets a ping; half of them are the timeout."""
+"""Seconds of silence after which the bridge gets a ping; it has half of that time to answer."""
 MIN_LINK_SECONDS = 5.0
-"""Seconds that a link must have lasted for the next attempt to be immediate."""
+"""Shortest life of a link in seconds after which the next attempt follows at once."""
 MAX_MESSAGE_BYTES = 8 << 20
 """Largest number of bytes of a message from a bridge; a longer one ends the link."""
 
@@ -52,7 +52,7 @@ class LinkListener(Protocol):
         """Handle an operation; never wait."""
 
     async def on_lost(self, was: bool) -> None:
-        """Handle a lost connection, or a failed attempt if ``was`` is False."""
+        """Handle a lost connection; ``was``: it was connected, not only tried."""
 
 
 def checked_url(url: str) -> str:
@@ -64,10 +64,10 @@ def checked_url(url: str) -> str:
     example = "ws://192.168.0.5:9090"
     try:
         parts = urlsplit(url)
-        usable = parts.scheme in {"ws", "wss"} and parts.hostname and parts.port != 0
+        is_usable = parts.scheme in {"ws", "wss"} and parts.hostname and parts.port != 0
     except ValueError:
-        usable = False
-    if not usable:
+        is_usable = False
+    if not is_usable:
         raise ConfigurationError(f"no rosbridge: expected a URL such as {example}, got {url!r:.80}")
     return url
 
@@ -77,7 +77,7 @@ def _aiohttp() -> Any:
 
 
 def link_errors() -> tuple[type[Exception], ...]:
-    """Return the errors of a link that cannot be opened, or breaks."""
+    """Return the types of errors of a link that cannot be opened, or is lost."""
     return OSError, TimeoutError, _aiohttp().ClientError
 
 
@@ -89,16 +89,16 @@ async def _refuse_redirect(_session: object, _context: object, sent: Any) -> Non
 
 @contextlib.asynccontextmanager
 async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
-    """Open a WebSocket to a bridge; at the end drop data that the bridge has not read.
+    """Open a WebSocket to a bridge; when it is closed, data that the bridge has not read are lost.
 
     Raises:
         OSError, aiohttp.ClientError, TimeoutError: the bridge cannot be reached.
     """
     aiohttp = _aiohttp()
     timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE_TIMEOUT)
-    watching = aiohttp.TraceConfig()
-    watching.on_request_redirect.append(_refuse_redirect)
-    async with aiohttp.ClientSession(trace_configs=[watching]) as session:
+    trace_config = aiohttp.TraceConfig()
+    trace_config.on_request_redirect.append(_refuse_redirect)
+    async with aiohttp.ClientSession(trace_configs=[trace_config]) as session:
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
                 web = await session.ws_connect(
@@ -127,7 +127,7 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
                         peer.shutdown(socket.SHUT_RDWR)
 
 
-async def text_of(parts: tuple[Part, ...]) -> str:
+async def operation_text(parts: tuple[TextPart, ...]) -> str:
     """Return the text of an operation; for a long one, let the loop run in between."""
     pieces: list[str] = []
     for part in parts:
@@ -142,7 +142,7 @@ async def text_of(parts: tuple[Part, ...]) -> str:
 
 
 class BridgeLink:
-    """A link that :meth:`run` keeps.
+    """A link to a bridge that :meth:`run` opens, and opens again when it is lost.
 
     Attributes:
         url: URL of the bridge.
@@ -161,28 +161,28 @@ class BridgeLink:
         self._listener, self._backoff = listener, backoff
 
     async def run(self) -> None:
-        """Keep a link until this task is cancelled, or the last attempt has failed."""
+        """Keep the link open until this task is cancelled, or the last attempt has failed."""
         clock, short_lived = asyncio.get_running_loop().time, 0
         while True:
             for delay in self._backoff.delays(short_lived=short_lived):
-                began = clock()
-                reason = await self._try()
-                if await self._tell_lost(reason):
-                    short_lived = 0 if clock() - began > MIN_LINK_SECONDS else short_lived + 1
+                started_at = clock()
+                reason = await self._use_one_link()
+                if await self._report_lost(reason):
+                    short_lived = 0 if clock() - started_at > MIN_LINK_SECONDS else short_lived + 1
                     await asyncio.sleep(delay)
                     break
                 await asyncio.sleep(delay)
             else:
                 return
 
-    async def _try(self) -> str:
+    async def _use_one_link(self) -> str:
         """Open one link and use it until it is lost; return the reason."""
         try:
             async with web_socket(self.url) as web:
                 logger.info("%s: connected", self.url)
-                await self._set(connected=True)
+                await self._set_state(connected=True)
                 self._listener.on_connected()
-                await self._carry(web)
+                await self._read_and_write(web)
         except link_errors() as exc:
             return str(getattr(exc, "os_error", exc)) or type(exc).__name__
         except Exception as exc:  # a fault of smartcam: the next link may work
@@ -190,8 +190,8 @@ class BridgeLink:
             return f"{type(exc).__name__}: {exc}"
         return "it closed the link"
 
-    async def _carry(self, web: aiohttp.ClientWebSocketResponse) -> None:
-        """Read and write until either ends."""
+    async def _read_and_write(self, web: aiohttp.ClientWebSocketResponse) -> None:
+        """Read and write until one of both ends."""
         tasks = [asyncio.create_task(self._read(web)), asyncio.create_task(self._write(web))]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -202,30 +202,30 @@ class BridgeLink:
         for task in done:
             task.result()
 
-    async def _set(self, *, connected: bool, failure: str = "") -> None:
+    async def _set_state(self, *, connected: bool, failure: str = "") -> None:
         async with self.changed:
             self.connected, self.failure = connected, failure
             self.changed.notify_all()
 
-    async def _tell_lost(self, reason: str) -> bool:
+    async def _report_lost(self, reason: str) -> bool:
         """Log that the link is lost; return True if there was one."""
         previous_failure = self.failure
-        was = await self.end(f"{self.url}: {reason}")
+        was_connected = await self.end_link(f"{self.url}: {reason}")
         level = logging.DEBUG if previous_failure == self.failure else logging.WARNING
         logger.log(level, "%s: no rosbridge: %s", self.url, reason)
-        return was
+        return was_connected
 
-    async def end(self, failure: str = "") -> bool:
+    async def end_link(self, failure: str = "") -> bool:
         """End the link and drop its unsent data; return True if there was a link."""
-        was = self.connected
-        await self._set(connected=False, failure=failure)
+        was_connected = self.connected
+        await self._set_state(connected=False, failure=failure)
         self.outbox.clear()
-        await self._listener.on_lost(was)
-        return was
+        await self._listener.on_lost(was_connected)
+        return was_connected
 
     async def _write(self, web: aiohttp.ClientWebSocketResponse) -> None:
         while True:
-            text = await text_of(await self.outbox.take())
+            text = await operation_text(await self.outbox.take())
             try:
                 async with asyncio.timeout(STALLED_TIMEOUT):
                     await web.send_str(text)
@@ -235,21 +235,21 @@ class BridgeLink:
                 ) from None
 
     async def _read(self, web: aiohttp.ClientWebSocketResponse) -> None:
-        kinds = _aiohttp().WSMsgType
+        message_types = _aiohttp().WSMsgType
         while True:
             message = await web.receive()
-            if message.type is kinds.TEXT:
-                self._hear(message.data)
+            if message.type is message_types.TEXT:
+                self._handle_text(message.data)
                 await asyncio.sleep(0)  # let the loop run, if many operations came at once
-                await self.outbox.room()
-            elif message.type is kinds.ERROR:
+                await self.outbox.wait_for_room()
+            elif message.type is message_types.ERROR:
                 raise ConnectionError(str(web.exception() or message.data))
-            elif message.type in {kinds.CLOSE, kinds.CLOSING, kinds.CLOSED}:
+            elif message.type in {message_types.CLOSE, message_types.CLOSING, message_types.CLOSED}:
                 return
             else:
                 logger.warning("%s: expected text, got binary: is it in BSON mode?", self.url)
 
-    def _hear(self, text: str) -> None:
+    def _handle_text(self, text: str) -> None:
         try:
             operation = json.loads(text)
         except (ValueError, RecursionError):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import RosError, RosMessageError
-from smartcam.ros1._json_messages import encoded, ros1_name, to_json
-from smartcam.ros1._outbox import Lane
+from smartcam.ros1._json_messages import encode_operation, ros1_name, to_json
+from smartcam.ros1._outbox import TopicQueue
 
 if TYPE_CHECKING:
     from typing import Self
@@ -22,28 +22,28 @@ class RosbridgePublisher:
     Attributes:
         name: the topic's absolute name.
         type: type of the messages.
-        lane: messages that wait to be sent.
-        exists: whether ROS 1 has the type.
-        subscribed: whether the topic has subscribers; True if that is not known.
+        queue: messages that wait to be sent.
+        has_ros1_type: True if ROS 1 has the type; otherwise nothing is published.
+        may_have_subscribers: False if the topic is known to have no subscribers.
     """
 
-    def __init__(self, node: RosbridgeNode, name: str, kind: MessageType, qos: QoS) -> None:
+    def __init__(self, node: RosbridgeNode, name: str, message_type: MessageType, qos: QoS) -> None:
         self.name: str = name
-        self.type: MessageType = kind
-        self.lane: Lane = Lane(qos.kept, latched=qos.latched)
-        self.exists: bool = ros1_name(kind.name) is not None
-        self.subscribed = True  # also if it is not known
+        self.type: MessageType = message_type
+        self.queue: TopicQueue = TopicQueue(qos.kept, latched=qos.latched)
+        self.has_ros1_type: bool = ros1_name(message_type.name) is not None
+        self.may_have_subscribers = True
         self._node = node
 
     @property
     def published(self) -> int:
         """Number of messages that were sent; the bridge does not confirm them."""
-        return self.lane.sent
+        return self.queue.sent
 
     @property
     def dropped(self) -> int:
         """Number of messages that were not sent: there was no bridge, or newer ones came."""
-        return self.lane.dropped
+        return self.queue.dropped
 
     @property
     def has_subscribers(self) -> bool:
@@ -52,9 +52,9 @@ class RosbridgePublisher:
         For a topic with long messages, rosapi is asked for subscribers every two seconds, if it
         answers, as it does with most bridges.
         """
-        if not self.exists or self.lane.latched:
-            return self.exists
-        return self._node.connected and self.subscribed
+        if not self.has_ros1_type or self.queue.latched:
+            return self.has_ros1_type
+        return self._node.connected and self.may_have_subscribers
 
     def publish(self, message: object = None, /, **fields: Any) -> None:
         """Publish a message; never wait.
@@ -70,13 +70,13 @@ class RosbridgePublisher:
         if message is not None and fields:
             raise RosMessageError("expected a message or its fields, got both")
         operation: dict[str, Any] = {"op": "publish", "topic": self.name}
-        if self.lane.latched:
-            operation["latch"] = True  # otherwise the bridge takes this for another publisher
+        if self.queue.latched:
+            operation["latch"] = True  # without it, the bridge would make another publisher
         operation["msg"] = to_json(self.type, fields if message is None else message)
         if not self._node.has(self):
             raise RosError(f"{self.name}: this publisher is closed")
-        if self.exists:
-            self.lane.put(encoded(operation), connected=self._node.connected)
+        if self.has_ros1_type:
+            self.queue.put(encode_operation(operation), connected=self._node.connected)
             self._node.wake()
 
     def publish_encoded(self, data: bytes) -> None:
@@ -97,7 +97,7 @@ class RosbridgePublisher:
     async def __aexit__(self, *_: object) -> None:
         self.close()
 
-    def advertisement(self) -> dict[str, Any]:
+    def advertise_operation(self) -> dict[str, Any]:
         """Return the operation that advertises the topic to a bridge."""
         operation = {"op": "advertise", "topic": self.name, "type": ros1_name(self.type.name)}
-        return {**operation, "latch": self.lane.latched}
+        return {**operation, "latch": self.queue.latched}

@@ -26,21 +26,21 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 LINK_COUNT = 8
 """Largest number of links for the services of a node at a time."""
 SECONDS_PER_SERVICE = 2.0
-"""Seconds of the timeout for each service; the bridge takes one second to withdraw it."""
+"""Seconds of the timeout for each service; a bridge takes one second to withdraw a service."""
 SPARE_SECONDS = 5.0
-"""Seconds that the timeout allows for making the links, and for a busy bridge."""
+"""Further seconds of the timeout, for opening the links and for a busy bridge."""
 PROBED_SERVICE = "/rosout/get_loggers"
 """A service that every roscore has; its answer comes after the bridge has handled earlier calls."""
 
 
-def question(service: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return a call that a bridge answers when it has handled all earlier operations."""
-    mark = f"smartcam:{uuid.uuid4()}"
-    return {"op": "call_service", "service": service, "id": mark, "args": arguments}
+def make_call(service: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return a call of a service; its answer shows that all earlier operations were handled."""
+    call_id = f"smartcam:{uuid.uuid4()}"
+    return {"op": "call_service", "service": service, "id": call_id, "args": arguments}
 
 
-async def retire(url: str, services: Sequence[str]) -> None:
-    """Make a bridge withdraw services of any link; log failures."""
+async def withdraw_services(url: str, services: Sequence[str]) -> None:
+    """Make a bridge withdraw services, whichever link advertised them; log failures."""
     shares = [share for start in range(LINK_COUNT) if (share := services[start::LINK_COUNT])]
     try:
         async with (
@@ -48,28 +48,28 @@ async def retire(url: str, services: Sequence[str]) -> None:
             asyncio.TaskGroup() as group,
         ):
             for share in shares:
-                group.create_task(_retire(url, share))
+                group.create_task(_withdraw(url, share))
     except TimeoutError:
         logger.warning("%s: did not confirm that it has withdrawn services", url)
 
 
-async def _retire(url: str, services: Sequence[str]) -> None:
+async def _withdraw(url: str, services: Sequence[str]) -> None:
     try:
         async with web_socket(url) as web:
             for service in services:
                 await web.send_json({"op": "unadvertise_service", "service": service})
-            await _answered(web)
+            await _wait_until_handled(web)
     except link_errors() as exc:
         logger.warning("%s: has not withdrawn %s: %s", url, ", ".join(services), exc)
 
 
-async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
+async def _wait_until_handled(web: aiohttp.ClientWebSocketResponse) -> None:
     """Wait until a bridge has handled the earlier operations.
 
     Raises:
         ConnectionError: the bridge closed the link.
     """
-    request = question(PROBED_SERVICE, {})
+    request = make_call(PROBED_SERVICE, {})
     await web.send_json(request)
     async for message in web:
         try:

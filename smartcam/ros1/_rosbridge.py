@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError
-from smartcam.ros1._json_messages import encoded
+from smartcam.ros1._json_messages import encode_operation
 from smartcam.ros1._link import BridgeLink
 from smartcam.ros1._outbox import Outbox
 from smartcam.ros1._publishing import RosbridgePublisher
-from smartcam.ros1._retiring import PROBED_SERVICE, question, retire
+from smartcam.ros1._retiring import PROBED_SERVICE, make_call, withdraw_services
 from smartcam.ros1._serving import CLOSE_TIMEOUT, RosbridgeService
 from smartcam.ros1._subscribers import listen_for_subscribers
 from smartcam.ros1._subscribing import RosbridgeSubscription
@@ -24,14 +24,14 @@ from smartcam.ros2._inside import DEFAULT, HANDLER_TIMEOUT, SERVICES, NamedNode
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
 
-    from smartcam.ros1._json_messages import Part
+    from smartcam.ros1._json_messages import TextPart
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 FLUSH_TIMEOUT = 1.0
-"""Seconds to send waiting operations at the end."""
+"""Seconds to send waiting operations when the node is stopped."""
 ASK_TIMEOUT = 5.0
-"""Seconds that the bridge may take to answer a call by smartcam."""
+"""Seconds that the bridge may take to answer a call of smartcam."""
 REPEAT_INTERVAL = 10.0
 """Seconds between two repetitions of a latched message on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""
@@ -84,23 +84,23 @@ class RosbridgeNode(NamedNode):
         self._publishers: dict[str, RosbridgePublisher] = {}
         self._services: dict[str, RosbridgeService] = {}
         self._subscriptions: list[RosbridgeSubscription] = []
-        self._running: asyncio.Task[None] | None = None
+        self._link_task: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()  # tasks that end with the link
-        self._new: list[RosbridgeService] = []  # services to be advertised
-        self._leaving: list[RosbridgeService] = []  # services to be withdrawn
-        self._changing: asyncio.Task[None] | None = None
+        self._to_advertise: list[RosbridgeService] = []  # services to be advertised
+        self._to_withdraw: list[RosbridgeService] = []  # services to be withdrawn
+        self._change_task: asyncio.Task[None] | None = None
         self._pending_answers: dict[str, asyncio.Future[dict[str, Any]]] = {}
-        self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
-            "call_service": self._called,
-            "publish": self._published,
+        self._handlers: dict[str, Callable[[dict[str, Any]], None]] = {
+            "call_service": self._on_call,
+            "publish": self._on_publish,
             "status": self._log_status,
-            "service_response": self._answered,
+            "service_response": self._on_response,
         }
 
     @property
     def is_open(self) -> bool:
         """True from ``start()`` until ``stop()``, with or without a bridge."""
-        return self._running is not None
+        return self._link_task is not None
 
     @property
     def connected(self) -> bool:
@@ -124,44 +124,44 @@ class RosbridgeNode(NamedNode):
         """Wait until the bridge is connected, or an attempt has failed."""
         await self._wait(None, lambda: self._link.connected or bool(self._link.failure))
 
-    async def _wait(self, timeout: float | None, met: Callable[[], bool]) -> None:
+    async def _wait(self, timeout: float | None, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(timeout), self._link.changed:
-            await self._link.changed.wait_for(met)
+            await self._link.changed.wait_for(condition)
 
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
         """Open the node."""
-        if self._running is None:
-            self._running = asyncio.create_task(self._link.run())
+        if self._link_task is None:
+            self._link_task = asyncio.create_task(self._link.run())
 
     async def stop(self) -> None:
         """Withdraw everything from the bridge, which takes some seconds. Idempotent."""
-        running, self._running = self._running, None
-        if running is None:
+        link_task, self._link_task = self._link_task, None
+        if link_task is None:
             return
         try:
             if self.connected:
                 await self._withdraw_all()
         finally:
-            running.cancel()
-            await asyncio.wait((running,))
-            await self._link.end()
+            link_task.cancel()
+            await asyncio.wait((link_task,))
+            await self._link.end_link()
             for subscription in [*self._subscriptions]:
                 subscription.close()
             self._publishers.clear()
             self._services.clear()
-            self._leaving.clear()
+            self._to_withdraw.clear()
             self._outbox = self._link.outbox = Outbox()
 
     async def _withdraw_all(self) -> None:
         with contextlib.suppress(TimeoutError):  # the bridge does not read
             async with asyncio.timeout(FLUSH_TIMEOUT):
-                await self._outbox.flushed()
+                await self._outbox.wait_flushed()
         for service in tuple(self._services.values()):
             self.forget(service)
-        while self._changing is not None:
-            await asyncio.wait((self._changing,))
+        while self._change_task is not None:
+            await asyncio.wait((self._change_task,))
 
     # ------------------------------------------------------------------ topics and services
 
@@ -178,11 +178,14 @@ class RosbridgeNode(NamedNode):
             ConfigurationError: the topic is not valid, exists already, or there is no such type.
             RosError: the node is not open.
         """
-        kind, name = self.types.message(type), self._new_name(topic, "topic", self._publishers)
-        publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, qos)
-        if self._log_if_absent(publisher.exists, name, kind.name):
-            self._outbox.add(publisher.lane)
-            self.send(encoded(publisher.advertisement()))
+        message_type, name = (
+            self.types.message(type),
+            self._resolve_new_name(topic, "topic", self._publishers),
+        )
+        publisher = self._publishers[name] = RosbridgePublisher(self, name, message_type, qos)
+        if self._log_if_absent(publisher.has_ros1_type, name, message_type.name):
+            self._outbox.add_queue(publisher.queue)
+            self.send(encode_operation(publisher.advertise_operation()))
         return publisher
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgeSubscription:
@@ -197,11 +200,11 @@ class RosbridgeNode(NamedNode):
             ConfigurationError: the topic is not valid, or there is no such type.
             RosError: the node is not open.
         """
-        kind, name = self.types.message(type), self._resolved(topic, "topic")
-        subscription = RosbridgeSubscription(self, name, kind, qos)
-        if self._log_if_absent(subscription.exists, name, kind.name):
+        message_type, name = self.types.message(type), self._resolve_name(topic, "topic")
+        subscription = RosbridgeSubscription(self, name, message_type, qos)
+        if self._log_if_absent(subscription.has_ros1_type, name, message_type.name):
             self._subscriptions.append(subscription)
-            subscription.ask()
+            subscription.send_subscribe()
         return subscription
 
     def serve(
@@ -229,29 +232,34 @@ class RosbridgeNode(NamedNode):
             ConfigurationError: the name is not valid, exists already, or there is no such type.
             RosError: the node is not open.
         """
-        kind, name = self.types.service(type), self._new_name(service, "service", self._services)
-        served = RosbridgeService(self, name, kind, handler, timeout)
-        self._services[name] = served
-        if self._log_if_absent(served.exists, name, kind.name):
-            self._new.append(served)
-            self._change()
-        return served
+        service_type, name = (
+            self.types.service(type),
+            self._resolve_new_name(service, "service", self._services),
+        )
+        new_service = RosbridgeService(self, name, service_type, handler, timeout)
+        self._services[name] = new_service
+        if self._log_if_absent(new_service.has_ros1_type, name, service_type.name):
+            self._to_advertise.append(new_service)
+            self._schedule_changes()
+        return new_service
 
-    def _new_name(self, name: str, kind_text: str, existing: dict[str, Any]) -> str:
-        full = self._resolved(name, kind_text)
-        if full in existing:
-            raise ConfigurationError(f"{self.full_name}: the {kind_text} {full} is there already")
-        return full
+    def _resolve_new_name(self, name: str, kind_text: str, existing: dict[str, Any]) -> str:
+        absolute_name = self._resolve_name(name, kind_text)
+        if absolute_name in existing:
+            raise ConfigurationError(
+                f"{self.full_name}: the {kind_text} {absolute_name} is there already"
+            )
+        return absolute_name
 
-    def _log_if_absent(self, exists: bool, name: str, kind: str) -> bool:
-        if not exists:
-            logger.info("%s: left out, ROS 1 has no %s", name, kind)
-        return exists
+    def _log_if_absent(self, has_ros1_type: bool, name: str, type_name: str) -> bool:
+        if not has_ros1_type:
+            logger.info("%s: left out, ROS 1 has no %s", name, type_name)
+        return has_ros1_type
 
-    # ------------------------------------------------------------------ for its parts
+    # ------------------------------------------------------------------ for publishers and services
 
     def has(self, end: RosbridgePublisher | RosbridgeService) -> bool:
-        """Return True if the end is not closed."""
+        """Return True if a publisher or service is not closed."""
         return end in (self._publishers.get(end.name), self._services.get(end.name))
 
     def forget(self, end: RosbridgePublisher | RosbridgeService) -> None:
@@ -260,30 +268,30 @@ class RosbridgeNode(NamedNode):
             return
         if isinstance(end, RosbridgePublisher):
             del self._publishers[end.name]
-            if end.exists:
-                self._outbox.remove(end.lane)
-                self.send(encoded({"op": "unadvertise", "topic": end.name}))
+            if end.has_ros1_type:
+                self._outbox.remove_queue(end.queue)
+                self.send(encode_operation({"op": "unadvertise", "topic": end.name}))
             return
         del self._services[end.name]
-        end.end_turn()
-        if end.exists:
-            self._leaving.append(end)
-            self._change()
+        end.discard_calls()
+        if end.has_ros1_type:
+            self._to_withdraw.append(end)
+            self._schedule_changes()
 
     def forget_subscription(self, subscription: RosbridgeSubscription) -> None:
         """Remove a closed subscription."""
         if subscription in self._subscriptions:
             self._subscriptions.remove(subscription)
-            subscription.leave()
+            subscription.send_unsubscribe()
 
     def renew(self, service: RosbridgeService) -> None:
         """Withdraw a service and advertise it again, so that its calls fail at their callers."""
-        service.end_turn()
-        self._leaving.append(service)
-        self._new.append(service)
-        self._change()
+        service.discard_calls()
+        self._to_withdraw.append(service)
+        self._to_advertise.append(service)
+        self._schedule_changes()
 
-    def send(self, parts: tuple[Part, ...]) -> None:
+    def send(self, parts: tuple[TextPart, ...]) -> None:
         """Send an operation, if the bridge is connected; a later bridge gets all advertisements."""
         if self.connected:
             self._outbox.add_operation(parts)
@@ -305,15 +313,17 @@ class RosbridgeNode(NamedNode):
         """Advertise everything to a new bridge."""
         self._report_change()
         for publisher in self._publishers.values():
-            if publisher.exists:
-                self.send(encoded(publisher.advertisement()))
-                publisher.lane.repeat()
+            if publisher.has_ros1_type:
+                self.send(encode_operation(publisher.advertise_operation()))
+                publisher.queue.repeat_last()
         for subscription in self._subscriptions:
-            subscription.ask()
-        self.begin(self._repeat_shared())
+            subscription.send_subscribe()
+        self.begin(self._repeat_latched())
         self.begin(listen_for_subscribers(self, self._publishers))
-        self._new = [service for service in self._services.values() if service.exists]
-        self._change()
+        self._to_advertise = [
+            service for service in self._services.values() if service.has_ros1_type
+        ]
+        self._schedule_changes()
 
     def _report_change(self) -> None:
         try:
@@ -323,50 +333,54 @@ class RosbridgeNode(NamedNode):
         except BaseException:
             logger.exception("%s ! on_change failed", self.full_name)
 
-    async def _repeat_shared(self) -> None:
-        within = f"{self.full_name}/"
+    async def _repeat_latched(self) -> None:
+        own_prefix = f"{self.full_name}/"
         while True:
             await asyncio.sleep(REPEAT_INTERVAL)
             for publisher in self._publishers.values():
-                if publisher.exists and not publisher.name.startswith(within):
-                    publisher.lane.repeat()
+                if publisher.has_ros1_type and not publisher.name.startswith(own_prefix):
+                    publisher.queue.repeat_last()
                     self._outbox.wake()
 
-    def _change(self) -> None:
-        """Start to withdraw and advertise services, in one task for all of a turn of the loop."""
-        if self.connected and self._changing is None and (self._new or self._leaving):
-            self._changing = self.begin(self._change_services())
-            self._changing.add_done_callback(self._changed)
+    def _schedule_changes(self) -> None:
+        """Start a task that withdraws and advertises services, unless one is running."""
+        if (
+            self.connected
+            and self._change_task is None
+            and (self._to_advertise or self._to_withdraw)
+        ):
+            self._change_task = self.begin(self._change_services())
+            self._change_task.add_done_callback(self._on_changes_done)
 
-    def _changed(self, task: asyncio.Task[None]) -> None:
-        if self._changing is task:
-            self._changing = None
-            self._change()
+    def _on_changes_done(self, task: asyncio.Task[None]) -> None:
+        if self._change_task is task:
+            self._change_task = None
+            self._schedule_changes()
 
     async def _change_services(self) -> None:
         await asyncio.sleep(0)
-        new, leaving = self._new, [*self._leaving]
-        self._new = []
-        await asyncio.gather(*(service.still() for service in leaving))
-        names = dict.fromkeys(service.name for service in (*leaving, *new))
-        await retire(self._link.url, list(names))
-        if leaving:  # first handle calls that the bridge has aborted
+        to_advertise, to_withdraw = self._to_advertise, [*self._to_withdraw]
+        self._to_advertise = []
+        await asyncio.gather(*(service.stop_calls() for service in to_withdraw))
+        names = dict.fromkeys(service.name for service in (*to_withdraw, *to_advertise))
+        await withdraw_services(self._link.url, list(names))
+        if to_withdraw:  # first handle calls that the bridge has aborted
             await self.ask(PROBED_SERVICE, {})
-        self._leaving = self._leaving[len(leaving) :]
-        for service in new:
+        self._to_withdraw = self._to_withdraw[len(to_withdraw) :]
+        for service in to_advertise:
             service.advertise()
 
     async def ask(self, service: str, arguments: dict[str, Any]) -> dict[str, Any] | None:
-        """Call a service of ROS 1; return the bridge's answer, None without one in time.
+        """Call a service of ROS 1; return the bridge's answer, None if none came in time.
 
-        Earlier operations of the bridge have been handled by then.
+        An answer comes after all earlier operations of the bridge.
         """
-        request = question(service, arguments)
+        request = make_call(service, arguments)
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
         self._pending_answers[request["id"]] = answer
         try:
             async with asyncio.timeout(ASK_TIMEOUT):
-                self.send(encoded(request))
+                self.send(encode_operation(request))
                 return await answer
         except TimeoutError:
             logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
@@ -374,51 +388,51 @@ class RosbridgeNode(NamedNode):
         finally:
             del self._pending_answers[request["id"]]
 
-    def _answered(self, operation: dict[str, Any]) -> None:
+    def _on_response(self, operation: dict[str, Any]) -> None:
         answer = self._pending_answers.get(str(operation.get("id")))
         if answer is not None and not answer.done():
             answer.set_result(operation)
 
     def on_operation(self, operation: dict[str, Any]) -> None:
         """Handle an operation of the bridge."""
-        hear = self._hears.get(operation["op"])
-        if hear is None:
+        handle = self._handlers.get(operation["op"])
+        if handle is None:
             logger.debug("%s: from the bridge: %.200r", self.full_name, operation)
         else:
-            hear(operation)
+            handle(operation)
 
     async def on_lost(self, was: bool) -> None:
-        """End calls and tasks for a lost bridge."""
-        if self._running is not None and was:
+        """End the calls and tasks of the lost bridge."""
+        if self._link_task is not None and was:
             self._report_change()
         for service in self._services.values():
-            service.end_turn()
-        self._new, self._changing = [], None
+            service.discard_calls()
+        self._to_advertise, self._change_task = [], None
         tasks = [*self._tasks]
         for task in tasks:
             task.cancel()
         if tasks:
             await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
 
-    def _called(self, operation: dict[str, Any]) -> None:
+    def _on_call(self, operation: dict[str, Any]) -> None:
         name, identity = operation.get("service"), operation.get("id")
         if not isinstance(name, str) or not isinstance(identity, str | int | None):
             logger.warning("%s: no call: %.200r", self.full_name, operation)
             return
         service = self._services.get(name)
-        if any(left.name == name for left in self._leaving):
+        if any(service.name == name for service in self._to_withdraw):
             return  # the call fails at its caller
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
             refusal = {"op": "service_response", "service": name, "id": identity, "result": False}
-            self.send(encoded(refusal))
-        elif service.ready:  # otherwise the bridge aborts the call
-            service.call(identity, operation.get("args"))
+            self.send(encode_operation(refusal))
+        elif service.is_advertised:  # otherwise the bridge aborts the call
+            service.start_call(identity, operation.get("args"))
 
-    def _published(self, operation: dict[str, Any]) -> None:
+    def _on_publish(self, operation: dict[str, Any]) -> None:
         for subscription in self._subscriptions:
             if subscription.name == operation.get("topic"):
-                subscription.take(operation.get("msg"))
+                subscription.on_message(operation.get("msg"))
 
     def _log_status(self, operation: dict[str, Any]) -> None:
         level = _LEVELS.get(str(operation.get("level")), logging.DEBUG)

@@ -53,7 +53,7 @@ CHECK_INTERVAL = 0.005
 
 
 class CameraLog(Sequence["LogEntry"]):
-    """The log of an emulated camera's traffic, oldest first, which is read again for each use.
+    """The log of an emulated camera's traffic, oldest first; each use reads it from the camera.
 
     Args:
         read: function that returns the entries.
@@ -85,7 +85,7 @@ class CameraLog(Sequence["LogEntry"]):
     @overload
     def __getitem__(self, index: slice, /) -> list[LogEntry]: ...
     def __getitem__(self, index: int | slice, /) -> LogEntry | list[LogEntry]:
-        """Return an entry, or some as a list.
+        """Return an entry; for a slice, a list of entries.
 
         Raises:
             IndexError: there is no such entry.
@@ -99,7 +99,7 @@ class CameraLog(Sequence["LogEntry"]):
 
     @property
     def received(self) -> list[m.Message]:
-        """Messages that clients have sent; bytes that make no message are left out."""
+        """Messages that clients have sent; frames that the camera refused are left out."""
         return _messages(self._read(), "in")
 
     @property
@@ -114,9 +114,9 @@ class CameraLog(Sequence["LogEntry"]):
 
         Args:
             expected: messages of the client and of the camera; others may be between them.
-            only: whether the client sent no other message. The camera's messages are ignored
-                unless expected.
-            timeout: seconds to wait for them.
+            only: True if the client must have sent no other message. The camera may have sent
+                others.
+            timeout: seconds to wait for the messages.
 
         Raises:
             AssertionError: the messages did not arrive in time.
@@ -125,8 +125,12 @@ class CameraLog(Sequence["LogEntry"]):
         __tracebackhide__ = True
         only = check_flag(only, "only", "expect")
         timeout = check_seconds(timeout, "timeout", "expect")
-        wanted = [_checked_expectation(message) for message in expected]
-        self._until(lambda entries: _in_order(entries, wanted, only=only), timeout, whole=only)
+        expectations = [_checked_expectation(message) for message in expected]
+        self._expect_no_mistake(
+            lambda entries: _find_order_mistake(entries, expectations, only=only),
+            timeout,
+            needs_whole_log=only,
+        )
 
     def expect_nothing_while_busy(
         self, *also: type[m.Message], grace: float = 0.0, timeout: float = 0.0
@@ -139,7 +143,7 @@ class CameraLog(Sequence["LogEntry"]):
         Args:
             also: other types of messages that are allowed.
             grace: seconds after BUSY in which a message may have been on its way already.
-            timeout: seconds to wait until it is true; waiting rarely helps.
+            timeout: seconds to repeat a check that fails; a message in the log stays there.
 
         Raises:
             AssertionError: another message was sent.
@@ -151,7 +155,11 @@ class CameraLog(Sequence["LogEntry"]):
             if not (isinstance(kind, type) and issubclass(kind, m.Message)):
                 raise wrong_argument("also", "types of messages", kind)
         allowed = (*ALLOWED_WHILE_BUSY, *also)
-        self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
+        self._expect_no_mistake(
+            lambda entries: _find_message_while_busy(entries, allowed, grace),
+            timeout,
+            needs_whole_log=True,
+        )
 
     def expect_disconnect_before_close(self, *, timeout: float = 5.0) -> None:
         """Check that every client with a session ended it by Disconnect, and then its connection.
@@ -159,14 +167,14 @@ class CameraLog(Sequence["LogEntry"]):
         Over UDP there is no connection: Disconnect has to be the last message of each client.
 
         Args:
-            timeout: seconds to wait for that.
+            timeout: seconds to wait for the end of every session and connection.
 
         Raises:
             AssertionError: one of the clients did not, or is still connected.
         """
         __tracebackhide__ = True
         timeout = check_seconds(timeout, "timeout", "expect_disconnect_before_close")
-        self._until(self._unfinished, timeout, whole=True)
+        self._expect_no_mistake(self._find_unfinished_session, timeout, needs_whole_log=True)
 
     def expect_no_errors(self) -> None:
         """Check that the camera accepted all frames of clients.
@@ -175,9 +183,9 @@ class CameraLog(Sequence["LogEntry"]):
             AssertionError: a frame was ignored.
         """
         __tracebackhide__ = True
-        self._until(_refused, 0.0, whole=True)
+        self._expect_no_mistake(_find_refused_frame, 0.0, needs_whole_log=True)
 
-    def _unfinished(self, entries: list[LogEntry]) -> str | None:
+    def _find_unfinished_session(self, entries: list[LogEntry]) -> str | None:
         last: dict[str, LogEntry] = {}
         sessions: set[str] = set()
         for entry in entries:
@@ -187,28 +195,41 @@ class CameraLog(Sequence["LogEntry"]):
                     sessions.add(entry.peer)
         for peer in sorted(sessions):
             if not isinstance(last[peer].message, m.Disconnect):
-                ended = next((v for v in self._visits() if v.peer == peer), None)
-                how = "" if ended is None else f", and {_end_text(ended)}"
-                return f"the last message of {peer} was {_text(last[peer])}, not Disconnect{how}"
-        still = sorted(sessions.intersection(self._links()))
-        return f"still connected: {', '.join(still)}" if still else None
+                visit = next((v for v in self._visits() if v.peer == peer), None)
+                how = "" if visit is None else f", and {_end_text(visit)}"
+                return (
+                    f"the last message of {peer} was {_entry_text(last[peer])}, not Disconnect{how}"
+                )
+        connected = sorted(sessions.intersection(self._links()))
+        return f"still connected: {', '.join(connected)}" if connected else None
 
-    def _until(
-        self, finding: Callable[[list[LogEntry]], str | None], timeout: float, *, whole: bool
+    def _expect_no_mistake(
+        self,
+        find_mistake: Callable[[list[LogEntry]], str | None],
+        timeout: float,
+        *,
+        needs_whole_log: bool,
     ) -> None:
-        """Look until nothing is found; with ``whole`` the log must be complete."""
+        """Repeat a check until it finds no mistake, or until the timeout.
+
+        With ``needs_whole_log`` the check also fails if the log has dropped entries.
+        """
         __tracebackhide__ = True
-        end = time.monotonic() + timeout
+        deadline = time.monotonic() + timeout
         while True:
             entries = self._read()
-            failure = finding(entries)
-            gone = self._pushed_out()
-            missing = f"{gone} older entries were pushed out of the full log" if gone else None
-            if failure is None and not (missing and whole):
+            failure = find_mistake(entries)
+            dropped_count = self._pushed_out()
+            missing = (
+                f"{dropped_count} older entries were pushed out of the full log"
+                if dropped_count
+                else None
+            )
+            if failure is None and not (missing and needs_whole_log):
                 return
-            if time.monotonic() >= end or failure is None:
+            if time.monotonic() >= deadline or failure is None:
                 reasons = [text for text in (failure, missing) if text]
-                raise AssertionError("\n".join([*reasons, _shown(entries)]))
+                raise AssertionError("\n".join([*reasons, _log_text(entries)]))
             time.sleep(CHECK_INTERVAL)
 
 
@@ -234,7 +255,7 @@ def _checked_expectation(expected: Expected) -> Expected:
         raise ConfigurationError(str(exc)) from exc
 
 
-def _fits(entry: LogEntry, expected: Expected) -> bool:
+def _matches(entry: LogEntry, expected: Expected) -> bool:
     if isinstance(expected, int):
         return entry.message_id == expected
     if isinstance(expected, type):
@@ -242,26 +263,30 @@ def _fits(entry: LogEntry, expected: Expected) -> bool:
     return entry.message == expected
 
 
-def _in_order(entries: list[LogEntry], wanted: list[Expected], *, only: bool) -> str | None:
+def _find_order_mistake(
+    entries: list[LogEntry], expectations: list[Expected], *, only: bool
+) -> str | None:
     """Return the mistake as text, None without one."""
     frames = [entry for entry in entries if entry.error is None]
-    place = 0
+    matched_count = 0
     for entry in frames:
-        if place < len(wanted) and _fits(entry, wanted[place]):
-            place += 1
+        if matched_count < len(expectations) and _matches(entry, expectations[matched_count]):
+            matched_count += 1
         elif only and entry.direction == "in":
-            return f"the client also sent {_text(entry)}, {_place_text(wanted, place)}"
-    if place == len(wanted):
+            position = _position_text(expectations, matched_count)
+            return f"the client also sent {_entry_text(entry)}, {position}"
+    if matched_count == len(expectations):
         return None
-    return f"expected {_name(wanted[place])}, {_place_text(wanted, place)}; it did not come"
+    missing = _expectation_name(expectations[matched_count])
+    return f"expected {missing}, {_position_text(expectations, matched_count)}; it did not come"
 
 
-def _place_text(wanted: list[Expected], place: int) -> str:
-    done = ", ".join(_name(message) for message in wanted[:place])
+def _position_text(expectations: list[Expected], matched_count: int) -> str:
+    done = ", ".join(_expectation_name(message) for message in expectations[:matched_count])
     return f"after {done}" if done else "at first"
 
 
-def _busy_talk(
+def _find_message_while_busy(
     entries: list[LogEntry], allowed: tuple[type[m.Message], ...], grace: float
 ) -> str | None:
     busy: dict[str, float] = {}
@@ -275,47 +300,48 @@ def _busy_talk(
         elif isinstance(message, m.Connect):
             busy.pop(entry.peer, None)
         elif entry.direction == "in" and entry.error is None and entry.peer in busy:
-            since = entry.time - busy[entry.peer]
-            if not isinstance(message, allowed) and since >= grace:
-                return f"the client sent {_text(entry)} while the camera was BUSY, for {since:g} s"
+            busy_seconds = entry.time - busy[entry.peer]
+            if not isinstance(message, allowed) and busy_seconds >= grace:
+                text = _entry_text(entry)
+                return f"the client sent {text} while the camera was BUSY, for {busy_seconds:g} s"
     return None
 
 
-def _refused(entries: list[LogEntry]) -> str | None:
-    wrong = next((entry for entry in entries if entry.direction == "in" and entry.error), None)
-    return None if wrong is None else f"the client sent what the camera refuses: {wrong.error}"
+def _find_refused_frame(entries: list[LogEntry]) -> str | None:
+    refused = next((entry for entry in entries if entry.direction == "in" and entry.error), None)
+    return None if refused is None else f"the client sent what the camera refuses: {refused.error}"
 
 
 def _end_text(visit: Visit) -> str:
-    how = "reset" if visit.reset else "closed"
-    return f"the {visit.ended_by} {how} the connection"
+    manner = "reset" if visit.reset else "closed"
+    return f"the {visit.ended_by} {manner} the connection"
 
 
-def _name(expected: Expected) -> str:
+def _expectation_name(expected: Expected) -> str:
     if isinstance(expected, type):
         return expected.__name__
     return f"message {expected:#04x}" if isinstance(expected, int) else str(expected)
 
 
-def _text(entry: LogEntry) -> str:
+def _entry_text(entry: LogEntry) -> str:
     if entry.message is not None:
         return str(entry.message)
     return f"message {entry.message_id:#04x}" if entry.message_id is not None else "no frame"
 
 
-def _shown(entries: list[LogEntry]) -> str:
+def _log_text(entries: list[LogEntry]) -> str:
     """Return the log as text for a failure."""
     lines = (
         [f"  ... {len(entries) - MAX_SHOWN_ENTRIES} before"]
         if len(entries) > MAX_SHOWN_ENTRIES
         else []
     )
-    begin = entries[0].time if entries else 0.0
+    start_time = entries[0].time if entries else 0.0
     for entry in entries[-MAX_SHOWN_ENTRIES:]:
         mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
-        text = entry.error or _text(entry)
+        text = entry.error or _entry_text(entry)
         fault = f"  ({entry.fault})" if entry.fault else ""
-        lines.append(f"  {entry.time - begin:9.4f} s {mark} {entry.peer}  {text}{fault}")
+        lines.append(f"  {entry.time - start_time:9.4f} s {mark} {entry.peer}  {text}{fault}")
     return "\n".join(
         ["what went over the wire (< from a client, > to it):", *(lines or ["  nothing"])]
     )

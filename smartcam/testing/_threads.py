@@ -1,7 +1,7 @@
 """Emulated cameras in a thread with an event loop of its own.
 
-So they serve any test and any program: synchronous, with asyncio, with trio, in another
-language. All methods are synchronous and may be called in any thread::
+Any test or program can use them: synchronous, with asyncio, with trio, or in another language. All
+methods except one are synchronous and may be called in any thread::
 
     with ThreadedCamera(active=21, running=True) as emulator:
         socket.create_connection((emulator.host, emulator.port))
@@ -34,8 +34,8 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class _InThread:
-    """An object whose attributes are read, and whose methods are called, in a thread."""
+class _ThreadProxy:
+    """Stands for an object: reads its attributes, and calls its methods, in another thread."""
 
     _thread: LoopThread
     _target: object
@@ -48,8 +48,8 @@ class _InThread:
 
 
 @dataclass(eq=False, repr=False)
-class _InLoop:
-    """An object with ``start()`` and ``stop()`` that lives in a thread's loop."""
+class _HostedInThread:
+    """Base of objects that start and stop an emulator in a thread's event loop."""
 
     _thread: LoopThread
     _hosted: WireCamera | EmulatedFleet
@@ -92,7 +92,7 @@ class _InLoop:
         self.stop()
 
 
-class ThreadedCamera(_InLoop):
+class ThreadedCamera(_HostedInThread):
     """An emulated camera in a thread; a context manager.
 
     ``scene``, ``scenario`` and ``wait_received`` with ids work for a BVS camera only.
@@ -119,23 +119,23 @@ class ThreadedCamera(_InLoop):
         kind: Any = emulated_class(protocol)
         check_options(kind, options)
         emulator: WireCamera = kind(clock=ManualClock() if manual_clock else None, **options)
-        self._host(LoopThread(f"smartcam.emulator[{emulator.name}]"), emulator, owns=True)
+        self._set_up(LoopThread(f"smartcam.emulator[{emulator.name}]"), emulator, owns_thread=True)
 
     @classmethod
     def in_thread(cls, thread: LoopThread, emulator: WireCamera) -> Self:
-        """Return the synchronous object for an emulator that lives in a thread already."""
+        """Return the synchronous object for an emulator that runs in a thread already."""
         self = cls.__new__(cls)
-        self._host(thread, emulator, owns=False)
+        self._set_up(thread, emulator, owns_thread=False)
         return self
 
-    def _host(self, thread: LoopThread, emulator: WireCamera, *, owns: bool) -> None:
-        super().__init__(thread, emulator, owns)
+    def _set_up(self, thread: LoopThread, emulator: WireCamera, *, owns_thread: bool) -> None:
+        super().__init__(thread, emulator, owns_thread)
         self._emulator: WireCamera = emulator
         self.log: CameraLog = CameraLog(
-            read=lambda: self._look(lambda: list(emulator.log)),
+            read=lambda: self._call_in_thread(lambda: list(emulator.log)),
             visits=lambda: self.visits,
             links=lambda: self.links if self.transport == "tcp" else [],
-            pushed_out=lambda: self._look(lambda: emulator.log.pushed_out),
+            pushed_out=lambda: self._call_in_thread(lambda: emulator.log.pushed_out),
         )
 
     def __repr__(self) -> str:
@@ -181,42 +181,42 @@ class ThreadedCamera(_InLoop):
     @property
     def scenario(self) -> Scenario:
         """Scenario that the camera was made of."""
-        return self._bvs("scenario").scenario
+        return self._require_bvs("scenario").scenario
 
     @property
     def device(self) -> Device:
         """The camera itself; its methods and properties work in any thread."""
-        return cast("Device", _InThread(self._thread, self._emulator.device))
+        return cast("Device", _ThreadProxy(self._thread, self._emulator.device))
 
     @property
     def scene(self) -> TableScene:
         """The table that the camera sees; ``scene.pieces`` may be changed in any thread."""
-        return self._bvs("scene").scene
+        return self._require_bvs("scene").scene
 
     @property
     def has_session(self) -> bool:
         """True while a client has the session."""
-        return self._look(lambda: self._emulator.has_session)
+        return self._call_in_thread(lambda: self._emulator.has_session)
 
     @property
     def links(self) -> list[str]:
         """Address and port of all clients that are connected."""
-        return self._look(lambda: self._emulator.links)
+        return self._call_in_thread(lambda: self._emulator.links)
 
     @property
     def visits(self) -> list[Visit]:
         """The last connections that have ended, oldest first; over UDP there are none."""
-        return self._look(lambda: list(self._emulator.visits))
+        return self._call_in_thread(lambda: list(self._emulator.visits))
 
     @property
     def faults(self) -> list[Fault]:
-        """The faults that still wait."""
-        return self._look(lambda: self._emulator.faults)
+        """The faults that have not happened yet."""
+        return self._call_in_thread(lambda: self._emulator.faults)
 
     @property
     def fired(self) -> list[FiredFault]:
         """The last faults that have happened, oldest first."""
-        return self._look(lambda: list(self._emulator.fired))
+        return self._call_in_thread(lambda: list(self._emulator.fired))
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -226,7 +226,7 @@ class ThreadedCamera(_InLoop):
     @property
     def cues_done(self) -> list[int]:
         """Number of times that each cue of the timeline has happened."""
-        return self._look(lambda: self._emulator.cues_done)
+        return self._call_in_thread(lambda: self._emulator.cues_done)
 
     # ------------------------------------------------------------------ actions
 
@@ -247,7 +247,7 @@ class ThreadedCamera(_InLoop):
         self._thread.run(self._emulator.command, name)
 
     def advance(self, seconds: float) -> None:
-        """Advance the camera's manual clock; all events that fall due have happened on return.
+        """Advance the camera's manual clock; all events until the new time have happened on return.
 
         Raises:
             ConfigurationError: the clock runs in real time, or the time is negative.
@@ -298,21 +298,21 @@ class ThreadedCamera(_InLoop):
         else:
             await asyncio.wrap_future(future)
 
-    def _bvs(self, ability: str) -> EmulatedCamera:
-        """Return the emulator; UnsupportedError: it is of another make."""
+    def _require_bvs(self, ability: str) -> EmulatedCamera:
+        """Return the emulator; raise UnsupportedError if it is not an EmulatedCamera."""
         if isinstance(self._emulator, EmulatedCamera):
             return self._emulator
         raise UnsupportedError(f"{self._emulator!r} has no {ability}; an EmulatedCamera has")
 
-    def _look(self, function: Callable[[], T]) -> T:
-        """Call a function in the thread; in the caller's if the thread has ended."""
+    def _call_in_thread(self, function: Callable[[], T]) -> T:
+        """Call a function in the emulator's thread, or in this thread if that one has ended."""
         try:
             return self._thread.run(function)
         except ConfigurationError:
             return function()
 
 
-class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
+class ThreadedFleet(_HostedInThread, Mapping[str, ThreadedCamera]):
     """An :class:`~smartcam.emulator.EmulatedFleet` in a thread; a context manager.
 
     Args:

@@ -211,7 +211,7 @@ def test_calibrate_check_of_no_calibration_says_so_and_leaves_nothing(tmp_path: 
 def test_calibrate_check_with_a_name_is_wrong_usage(tmp_path: Path) -> None:
     done = calibrating("bvs://127.0.0.1:9", tmp_path, [], "--check", "a", "--name", "b")
     assert done.code == 2
-    assert "--check names the calibration: no --name beside it" in done.err
+    assert "--check names the calibration already: leave out --name" in done.err
 
 
 def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam._cli.calibrate_lens import MIN_NEW_VIEW_SHARE, Collecting
+from smartcam._cli.calibrate_lens import MIN_NEW_VIEW_SHARE, ViewCollector
 from smartcam._extras import load
 from smartcam.calibration import (
     CameraModel,
@@ -222,24 +222,24 @@ def view(shift: float, ids: Any = None) -> TargetView:
 
 
 def test_view_is_taken_of_a_target_that_stands_still_and_elsewhere() -> None:
-    taken = Collecting()
+    taken = ViewCollector()
     far = MIN_NEW_VIEW_SHARE * 320
-    assert not taken.offer(view(0.0))  # it may be moving
-    assert taken.offer(view(0.5))
-    assert not taken.offer(view(0.5))  # is there already
-    assert not taken.offer(view(far + 2.0))  # moved
-    assert taken.offer(view(far + 2.5))
-    assert not taken.offer(view(far - 3.0))
-    assert not taken.offer(view(far - 3.0))  # too near to one that is there
-    assert not taken.offer(view(3 * far))
-    taken.gone()
-    assert not taken.offer(view(3 * far))  # not seen in between: it may have moved
-    assert taken.offer(view(3 * far))
+    assert not taken.add_if_new(view(0.0))  # it may be moving
+    assert taken.add_if_new(view(0.5))
+    assert not taken.add_if_new(view(0.5))  # is there already
+    assert not taken.add_if_new(view(far + 2.0))  # moved
+    assert taken.add_if_new(view(far + 2.5))
+    assert not taken.add_if_new(view(far - 3.0))
+    assert not taken.add_if_new(view(far - 3.0))  # too near to one that is there
+    assert not taken.add_if_new(view(3 * far))
+    taken.note_target_lost()
+    assert not taken.add_if_new(view(3 * far))  # not seen in between: it may have moved
+    assert taken.add_if_new(view(3 * far))
     assert len(taken.views) == 3
 
 
 def test_views_without_common_points_are_others() -> None:
-    taken = Collecting()
-    taken.offer(view(0.0, range(10)))
-    assert not taken.offer(view(0.0, range(10, 20)))
-    assert taken.offer(view(0.0, range(10, 20)))
+    taken = ViewCollector()
+    taken.add_if_new(view(0.0, range(10)))
+    assert not taken.add_if_new(view(0.0, range(10, 20)))
+    assert taken.add_if_new(view(0.0, range(10, 20)))

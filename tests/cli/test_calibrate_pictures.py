@@ -174,7 +174,7 @@ def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_reports_it(
     with emulators(tmp_path, ()) as urls:
         done = calibrating(tmp_path, lines, urls[0], "--wizard", "sheet", *files[:4])
     assert (
-        "its protocol sends no pictures; expected one with them, or --pictures FOLDER"
+        "its protocol sends no pictures; expected a protocol that does, or --pictures FOLDER"
         in (done.lines[-2]["errors"]["base"])
     )
 
@@ -247,7 +247,7 @@ async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
     [
         (["--wizard", "sheet"], "a URL is missing"),
         (["--pictures", "."], "a URL is missing"),
-        (["bvs://x", "--check", "t", "--wizard", "sheet"], "no --wizard beside it"),
+        (["bvs://x", "--check", "t", "--wizard", "sheet"], "leave out --wizard"),
         (["v4l2:///dev/video0", "--wizard", "sheet"], "--pictures v4l2:///dev/video0 with"),
     ],
 )
@@ -295,14 +295,14 @@ def test_calibrate_with_a_lens_that_is_none_reports_it(tmp_path: Path) -> None:
 
 
 def test_terminal_names_the_file_of_a_step_s_picture(tmp_path: Path) -> None:
-    from smartcam._cli.calibrate_terminal import _drawn, _step_text
+    from smartcam._cli.calibrate_terminal import _step_text, _write_picture
 
     path = tmp_path / "table.step.svg"
     view = {"preview": {"svg": "<svg>ring</svg>"}, "can": ["abort"], "number": 4, "of": 10}
     view |= {"title": "Touch point 1", "description": "", "notes": [], "errors": {}}
     view |= {"schema": {"properties": {}}}
-    assert _drawn(view, path) == path
+    assert _write_picture(view, path) == path
     assert path.read_text() == "<svg>ring</svg>"
     text = _step_text(view, path)
     assert text == f"\nStep 4 of about 10: Touch point 1  (:abort)\n  picture: {path}"
-    assert _drawn({"preview": None}, path) is None
+    assert _write_picture({"preview": None}, path) is None

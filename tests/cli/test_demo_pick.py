@@ -195,7 +195,7 @@ def test_options_that_cannot_work_are_reported(arguments: list[str], text: str) 
 
 def test_table_has_no_room_for_too_many_parts() -> None:
     with pytest.raises(ConfigurationError, match="no room for 200 parts"):
-        DrawnTable(1).lay("bracket", 200)
+        DrawnTable(1).lay_parts("bracket", 200)
 
 
 def test_robot_that_goes_beside_a_part_leaves_it_on_the_table() -> None:
@@ -220,11 +220,11 @@ def test_robot_that_goes_beside_a_part_leaves_it_on_the_table() -> None:
 @NEEDS_INSPECTION
 def test_picture_shows_each_part_where_it_lies() -> None:
     table = DrawnTable(2)
-    table.lay("mark", 4)
-    picture = table.picture().astype(float)
+    table.lay_parts("mark", 4)
+    picture = table.take_picture().astype(float)
     reach = round(radius_of("mark") / table.pixel) + 6
     for part in table.parts:
-        u, v, _ = table.seen(part.pose)
+        u, v, _ = table.to_pixels(part.pose)
         left, top = round(u) - reach, round(v) - reach
         patch = picture[top : top + 2 * reach + 1, left : left + 2 * reach + 1] - 60
         rows, columns = (patch.sum(axis=1 - axis) for axis in (0, 1))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smartcam._cli import demo_tower
-from smartcam._cli.demo_tower import MISSED, BlockPose, measured_block, tower
+from smartcam._cli.demo_tower import MISSED_EXIT_CODE, BlockPose, measure_block, tower
 from smartcam.depth import ColourRange
 from smartcam.depth._inside import BLOCK, TowerTable, WoodenBlock, random_table, to_robot
 from smartcam.exceptions import FrameFormatError
@@ -58,7 +58,7 @@ async def test_too_coarse_is_reported_and_the_exit_code_shows_it(
     monkeypatch.setattr(demo_tower, "TOLERANCE", (1e-9, 1.0, 1e-3))
     with pytest.raises(SystemExit) as ended:
         await tower(Options(), 1, layers=1)
-    assert ended.value.code == MISSED
+    assert ended.value.code == MISSED_EXIT_CODE
     assert "not all within" in capsys.readouterr().out
 
 
@@ -79,7 +79,7 @@ async def test_missing_block_is_reported(capsys: pytest.CaptureFixture[str]) -> 
     table.blocks = [one for one in table.blocks if one.colour != "black" or one.size != BLOCK]
     with pytest.raises(FrameFormatError, match=r"got [12] regions of it") as caught:
         await tower(Options(as_json=True), 2, table=table)  # a square and a stick are black, too
-    assert caught.value.source == demo_tower.ARM
+    assert caught.value.source == demo_tower.CAMERA_NAME
     too_far = random_table(2, 0)
     with pytest.raises(FrameFormatError, match=r"within 0.15 to 0.5 m .* got 1 that are not"):
         await tower(Options(as_json=True), 2, table=too_far)
@@ -98,10 +98,10 @@ def test_block_that_moved_between_two_looks_is_not_picked_elsewhere() -> None:
     table.blocks.append(WoodenBlock(0.33, 0.0, 0.3, colour="black"))
     rough = BlockPose(0.30, 0.0, 0.3, BLOCK[2])
     with pytest.raises(FrameFormatError, match=r"one 30 mm beside it: something has moved"):
-        measured_block(table, rough, demo_tower.BLACK)
+        measure_block(table, rough, demo_tower.BLACK)
     table.blocks.clear()
     with pytest.raises(FrameFormatError, match="got none of it"):
-        measured_block(table, rough, demo_tower.BLACK)
+        measure_block(table, rough, demo_tower.BLACK)
 
 
 def test_gripper_that_closes_beside_a_block_is_empty() -> None:

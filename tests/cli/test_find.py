@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from smartcam._cli import find as command
-from smartcam._cli.find import fleet_lines, telling
+from smartcam._cli.find import fleet_lines, show_progress_line
 from smartcam.doctor._inside import CameraSearch, FoundPort
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import load_fleet
@@ -218,12 +218,12 @@ async def test_terminal_is_told_how_far_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     search = CameraSearch(["10.0.0.1"], protocols=["insight"])
-    async with telling(search):
+    async with show_progress_line(search):
         await asyncio.sleep(2.5)
     assert capsys.readouterr().err == ""  # which is no terminal
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
-    async with telling(search):
+    async with show_progress_line(search):
         search.opened, search.total, search.counts["open"] = 7, 9, 1
         await asyncio.sleep(1.5)
     clear = "\r\x1b[K"

@@ -161,7 +161,7 @@ def test_calibrate_a_camera_of_a_fleet(fleet: str, tmp_path: Path) -> None:
     mirrored = run("trigger", f"{fleet}/line2/mirrored", *told)
     mirrored.failed(2, "made with y_down=False, so with y_down=True its poses would be mirrored")
     wrong = calibrating(f"{fleet}/line2/mirrored", tmp_path / "other", lines[:2], "--json")
-    assert "its agent says y_down: true: give --y-down here, too" in wrong.out + wrong.err
+    assert "its agent has y_down: true: give --y-down here, too" in wrong.out + wrong.err
 
 
 def test_doctor_examines_a_camera_of_a_fleet(fleet: str, monkeypatch: pytest.MonkeyPatch) -> None:

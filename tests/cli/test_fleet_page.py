@@ -46,7 +46,7 @@ def test_fleet_that_is_not_there_yet_is_awaited(tmp_path: Path) -> None:
     path.write_text(FILE.format(place=place), encoding="utf-8")
     url = f"fleet://{place.removeprefix('tcp/')}"
     with Process("smartcam", "fleet", "page", url, "--control", "--timeout", "2") as shown:
-        assert shown.read_until(b"\n", stream="stderr").endswith("; it is awaited\n")
+        assert shown.read_until(b"\n", stream="stderr").endswith("; waiting for it\n")
         with Process("smartcam", "serve", str(path)):
             page = page_of(shown)
             answer = ask(f"{page}api/cameras/line1%2Fcam1/trigger", {})

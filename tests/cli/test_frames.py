@@ -424,14 +424,14 @@ def test_show_awaits_a_source_that_is_not_there(shelf: Puts) -> None:
     done = run("frames", "show", "shelf://", "synthetic://", "--seconds", "0.05")
     assert done.code == 0
     assert done.out.startswith("page: http://127.0.0.1:")
-    assert done.err == "note: shelf: no such device; it is awaited\n"
+    assert done.err == "note: shelf: no such device; waiting for it\n"
 
 
 def test_show_of_a_format_that_is_not_there_ends(shelf: Puts) -> None:
     shelf(fails=FrameFormatError("shelf: it has no YUYV"))
     run("frames", "show", "shelf://").failed(5, "shelf: it has no YUYV")
     done = run("frames", "show", "synthetic://", "shelf://", "--seconds", "0.05")
-    assert (done.code, done.err) == (0, "note: shelf: it has no YUYV; it is awaited\n")
+    assert (done.code, done.err) == (0, "note: shelf: it has no YUYV; waiting for it\n")
 
 
 @pytest.mark.parametrize(

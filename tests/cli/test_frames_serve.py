@@ -16,7 +16,7 @@ import click
 import pytest
 
 from smartcam._cli import frames_serve
-from smartcam._cli.frame_players import address, names_of, rtsp_server, rtsp_urls
+from smartcam._cli.frame_players import parse_address_option, rtsp_server, rtsp_urls, unique_names
 from smartcam._cli.frames_serve import viewers_text
 from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames import FrameAddress, FrameSource, StreamFormat, find_format
@@ -140,8 +140,8 @@ def test_one_that_is_not_there_does_not_end_the_others(shelf: dict[str, BaseExce
     assert done.code == 0
     assert done.out.count("\n") == 4
     assert sorted(done.err.splitlines()) == [
-        "note: shelf: it has no YUYV; it is awaited",
-        "note: shelf: no such device; it is awaited",
+        "note: shelf: it has no YUYV; waiting for it",
+        "note: shelf: no such device; waiting for it",
     ]
 
 
@@ -170,7 +170,7 @@ def test_one_that_takes_long_holds_up_the_page_for_a_while_only(
     done = run("frames", "serve", "shelf://slow", "shelf://wrong", "--seconds", "0.01")
     assert done.code == 0
     assert done.out.startswith("page: ")
-    assert done.err == "note: shelf: it has no YUYV; it is awaited\n"
+    assert done.err == "note: shelf: it has no YUYV; waiting for it\n"
 
 
 @pytest.mark.parametrize(
@@ -210,9 +210,9 @@ def test_address_is_read_or_refused(text: str, value: tuple[str, int] | None) ->
     parameter = click.Option(["--rtsp"])
     if value is None:
         with pytest.raises(click.BadParameter, match="expected HOST:PORT"):
-            address(None, parameter, text)
+            parse_address_option(None, parameter, text)
     else:
-        assert address(None, parameter, text) == value
+        assert parse_address_option(None, parameter, text) == value
 
 
 # ---------------------------------------------------------------------- names and passwords
@@ -232,7 +232,7 @@ def named(name: str) -> FrameSource:
 def test_names_are_such_as_a_url_has_and_each_its_own() -> None:
     given = ["left", "line1/cam 1", "left", "/ü/", "x" * 200, "left"]
     sources = [named(name) for name in given]
-    names = names_of(sources)
+    names = unique_names(sources)
     assert [*names] == ["left", "line1-cam-1", "left-2", "camera", "x" * 60, "left-3"]
     assert [*names.values()] == sources
     server, _ = rtsp_server(sources, ("127.0.0.1", 0), None)  # which refuses others

@@ -112,12 +112,12 @@ def test_any_thread_logs_whole_lines(tmp_path: Path) -> None:
 def test_a_pipe_that_nobody_reads_holds_nobody_up_and_what_was_dropped_is_told(
     pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(log_lines, "FAREWELL_TIMEOUT", 0.01)
+    monkeypatch.setattr(log_lines, "CLOSE_TIMEOUT", 0.01)
     reading, writing = pipe
-    with json_log(logging.INFO, str, set, descriptor=writing, most=50) as handler:
+    with json_log(logging.INFO, str, set, descriptor=writing, max_lines=50) as handler:
         for number in range(3000):  # more than a pipe and the queue hold
             LOGGER.info("%d %s", number, "x" * 100)
-        assert handler.dropped > 0
+        assert handler.dropped_count > 0
         said: list[int] = []
         lost = 0
         with os.fdopen(os.dup(reading), encoding="utf-8") as file:
@@ -131,15 +131,15 @@ def test_a_pipe_that_nobody_reads_holds_nobody_up_and_what_was_dropped_is_told(
                 else:
                     said.append(int(line["message"].split()[0]))
             assert said == sorted(set(said))
-            assert lost == handler.dropped
+            assert lost == handler.dropped_count
             LOGGER.info("and on")
             assert json.loads(file.readline())["message"] == "and on"
     # nobody reads any more: the end does not wait
-    with json_log(logging.INFO, str, set, descriptor=writing, most=50) as handler:
+    with json_log(logging.INFO, str, set, descriptor=writing, max_lines=50) as handler:
         for number in range(3000):
             LOGGER.info("%d %s", number, "x" * 100)
-    assert not handler._over.is_set()
-    while not handler._over.is_set():  # let the thread go
+    assert not handler._finished.is_set()
+    while not handler._finished.is_set():  # let the thread go
         os.read(reading, 1 << 16)
 
 

@@ -156,7 +156,7 @@ def test_agent_whose_router_is_away_tries_again_and_a_router_has_no_cameras(tmp_
     with Process("smartcam", "serve", str(south), merged=True) as agent:
         said = agent.read_until(b"\n")
         assert "cannot reach" in said
-        assert said.endswith("; it is tried on\n")
+        assert said.endswith("; trying again\n")
         with Process("smartcam", "serve", str(router)) as other:
             host = place.removeprefix("tcp/")
             assert other.read_until(b"\n") == f"fleet://{host}  a router, without cameras\n"

@@ -45,13 +45,13 @@ def read(sock: socket.socket) -> list[list[str]]:
 def test_each_state_is_one_datagram(place: str, heard: socket.socket) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": place})
     before = time.monotonic_ns() // 1000
-    notifier.ready("2 of 2")
-    notifier.reloading("reading")
-    notifier.ready("3 of 3,\nand a line")
-    notifier.status("3 of 3, and a line")  # as before: nothing new
-    notifier.status("x" * 1000)
-    notifier.alive()
-    notifier.stopping()
+    notifier.report_ready("2 of 2")
+    notifier.report_reloading("reading")
+    notifier.report_ready("3 of 3,\nand a line")
+    notifier.report_status("3 of 3, and a line")  # as before: nothing new
+    notifier.report_status("x" * 1000)
+    notifier.report_alive()
+    notifier.report_stopping()
     notifier.close()
     ready, reloading, again, long, alive, stopping = read(heard)
     assert ready == ["READY=1", "STATUS=2 of 2"]
@@ -69,13 +69,13 @@ def test_who_does_not_read_stops_nothing_and_hears_of_states_later(
 ) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": place})
     for _ in range(1000):
-        notifier.alive()
-    notifier.ready("here")
+        notifier.report_alive()
+    notifier.report_ready("here")
     assert ["READY=1", "STATUS=here"] not in read(heard)
-    notifier.alive()
+    notifier.report_alive()
     assert read(heard) == [["READY=1", "STATUS=here"], ["WATCHDOG=1"]]
     for _ in range(1000):
-        notifier.ready("again")
+        notifier.report_ready("again")
     assert len(notifier._unsent) <= MAX_UNSENT
     notifier.close()
 
@@ -83,12 +83,12 @@ def test_who_does_not_read_stops_nothing_and_hears_of_states_later(
 def test_nobody_is_told_if_nobody_wants_to_know(caplog: pytest.LogCaptureFixture) -> None:
     for given in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}):
         notifier = Notifier(given)
-        assert not notifier.wanted
-        notifier.ready("")
+        assert not notifier.is_wanted
+        notifier.report_ready("")
     assert "expected /PATH or @NAME, got 'vsock:2:1'" in caplog.text
     gone = Notifier({"NOTIFY_SOCKET": "/nowhere/at/all"})
-    gone.ready("")
-    gone.stopping()
+    gone.report_ready("")
+    gone.report_stopping()
     gone.close()
     assert caplog.text.count("reports to systemd by NOTIFY_SOCKET fail") == 1
 
@@ -106,7 +106,7 @@ async def test_the_loop_tells_that_it_runs_at_half_of_the_time(
 ) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": place, "WATCHDOG_USEC": "8000000"})
     said = "one"
-    with notifier.telling(lambda: said):
+    with notifier.reporting(lambda: said):
         assert read(heard) == [["WATCHDOG=1"], ["STATUS=one"]]
         await asyncio.sleep(3.9)
         assert read(heard) == []

@@ -115,7 +115,7 @@ def test_judge_documented_camera_finds_nothing(world: tuple[str, str], judged: J
     assert [(one.item.name, one.expected, one.observed) for one in report.differing] == []
     unseen = {one.item.name for one in report.findings if one.outcome is CheckOutcome.NOT_OBSERVED}
     assert unseen <= {"free-run-needs-no-trigger", "waiting_before_result"}
-    assert report.camera.left == ""
+    assert report.camera.not_restored == ""
 
 
 @pytest.mark.parametrize("world", WORLDS, ids="-".join)
@@ -143,7 +143,7 @@ def test_every_quirk_has_a_question() -> None:
 
 
 def test_every_contradiction_that_shows_is_decided() -> None:
-    decided = {name for item in ITEMS for name in item.documents}
+    decided = {name for item in ITEMS for name in item.contradictions}
     assert decided == {f"C{number}" for number in range(1, 10)}
 
 
@@ -265,17 +265,17 @@ UNDESCRIBED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "sin", "dialect", "came"), UNDESCRIBED)
+@pytest.mark.parametrize(("name", "sin", "dialect", "observed"), UNDESCRIBED)
 @at_any_pace
 def test_judge_answer_that_no_setting_describes_is_reported(
-    name: str, sin: Any, dialect: str, came: str, monkeypatch: pytest.MonkeyPatch
+    name: str, sin: Any, dialect: str, observed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ClientLink, "_handle_bytes", camera_sins.open_to_bytes)
     monkeypatch.setattr(ClientLink, "dismiss", lambda *_: None)
     (report,) = judge_all([Case({"dialect": dialect}, (name,), sin, IMPATIENT)])
     finding = report[name]
     assert finding.outcome is CheckOutcome.UNDESCRIBED
-    assert came in finding.observed
+    assert observed in finding.observed
     assert name not in report.quirks
     if name in Quirks.model_fields:
         assert report.yaml() == f"quirks: {{}}\n  # {name}: no setting fits"
@@ -293,7 +293,7 @@ def thread() -> Iterator[LoopThread]:
 def broken_off(camera: CameraUnderTest) -> None:
     """Load the other application, and be interrupted."""
     with camera.session() as client:
-        camera.load(client, OTHER)
+        camera.load_application(client, OTHER)
         raise KeyboardInterrupt
 
 
@@ -312,14 +312,14 @@ def test_judge_item_interrupted_puts_application_and_run_mode_back(
         assert emulator.device.active_application == APPLICATION
         assert emulator.device.running == (running or dialect == "bid")
         assert not emulator.has_session
-    assert camera.left == ""
+    assert camera.not_restored == ""
 
 
 @at_any_pace
 def test_judge_camera_that_dies_says_what_could_not_be_put_back(thread: LoopThread) -> None:
     def dies(camera: CameraUnderTest) -> None:
         with camera.session() as client:
-            camera.stop(client)
+            camera.ensure_stopped(client)
             thread.call(emulator.stop)
             client.fence()
 
@@ -329,8 +329,13 @@ def test_judge_camera_that_dies_says_what_could_not_be_put_back(thread: LoopThre
         finding = judge_item(camera, item)
         later = judge_item(camera, CHECKS[2])
     assert finding.outcome is CheckOutcome.DIFFERS
-    assert (finding.expected, camera.gone[:22]) == ("the link stays up", "there is no connection")
-    assert camera.left.startswith("application 5, running, could not be put back: there is no sess")
+    assert (finding.expected, camera.gone_reason[:22]) == (
+        "the link stays up",
+        "there is no connection",
+    )
+    assert camera.not_restored.startswith(
+        "application 5, running, could not be put back: there is no sess"
+    )
     assert later.text.startswith("the camera is gone: there is no connection to 127.0.0.1:")
 
 

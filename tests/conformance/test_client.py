@@ -21,7 +21,7 @@ from tests.conformance.inside import (
     ClientRun,
     CommandClient,
     FunctionClient,
-    perform,
+    run_scene,
 )
 from tests.conformance.pace import at_any_pace, is_first, slowed
 from tests.conformance.plain_client import plain_client
@@ -43,7 +43,7 @@ async def findings(
 
     async def one(name: str) -> ClientRun:
         async with room:
-            return await perform(
+            return await run_scene(
                 client, SCENES[name], dialect=dialect, transport=transport, timeout=slowed(15)
             )
 
@@ -166,7 +166,7 @@ class Convictions:
             client = FunctionClient(plain_client(*SINS[name][0].split(", "), seconds=slowed(1)))
             timeout = 1.0 if SINS[name][1] == HANGS else 15.0
             async with room:
-                return await perform(client, BY_NAME[name].scene, timeout=slowed(timeout))
+                return await run_scene(client, BY_NAME[name].scene, timeout=slowed(timeout))
 
         runs = await asyncio.gather(*map(one, names))
         return {name: judge(BY_NAME[name], run) for name, run in zip(names, runs, strict=True)}

@@ -16,8 +16,8 @@ from tests.conformance.inside import (
     CommandClient,
     FunctionClient,
     Outcome,
-    perform,
     read_results,
+    run_scene,
 )
 from tests.conformance.pace import at_any_pace, slowed
 
@@ -107,7 +107,7 @@ def test_odd_function_is_refused(odd: str) -> None:
 async def test_odd_argument_of_a_run_is_refused(argument: str, odd: str) -> None:
     given = {"client": FunctionClient(lambda _: []), "scene": SCENES["trigger"]}
     with pytest.raises(ConfigurationError):
-        await perform(**{**given, argument: ODD[odd]})
+        await run_scene(**{**given, argument: ODD[odd]})
 
 
 # ---------------------------------------------------------------------- what it prints
@@ -157,7 +157,7 @@ async def test_command_that_does_not_end_is_killed_with_what_it_has_started() ->
     code = f"import subprocess, sys; subprocess.run([sys.executable, '-S', '-c', '{child}'])"
     async with asyncio.timeout(60):
         outcome = await command(code).perform(TASK, 0.5)
-    assert without_time(outcome) == Outcome(ended=False)
+    assert without_time(outcome) == Outcome(ended_in_time=False)
 
 
 async def test_command_that_is_not_there_is_a_mistake_of_the_user() -> None:
@@ -212,7 +212,7 @@ async def test_function_that_does_not_end_is_left_behind() -> None:
 
     outcome = await FunctionClient(perform).perform(TASK, SHORT)
     release.set()
-    assert without_time(outcome) == Outcome(ended=False)
+    assert without_time(outcome) == Outcome(ended_in_time=False)
 
 
 @at_any_pace  # it is to begin before
@@ -227,5 +227,5 @@ async def test_asynchronous_function_that_does_not_end_is_cancelled() -> None:
         return []
 
     outcome = await FunctionClient(perform).perform(TASK, slowed(SHORT))
-    assert without_time(outcome) == Outcome(ended=False)
+    assert without_time(outcome) == Outcome(ended_in_time=False)
     assert ended == ["cancelled"]

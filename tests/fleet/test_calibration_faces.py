@@ -25,7 +25,7 @@ from smartcam.emulator import Application, EmulatedCamera
 from smartcam.fleet import FleetFile, FleetServer
 from smartcam.fleet._inside import FleetAddress, RosSection
 from smartcam.geometry import Transform
-from smartcam.ros1._inside import bridged
+from smartcam.ros1._inside import run_bridged_nodes
 from smartcam.ros2 import Node, QoS
 from tests.calibration.scenes import SHEET
 from tests.calibration.wizards.bench import GRID, OFFSET, ROTATION, Bench, where
@@ -314,7 +314,7 @@ async def in_ros1(folder: Path, **more: Any) -> AsyncIterator[Face]:
         address = FleetAddress.parse(server.address.url)
         section = RosSection.model_validate({})
         given = (bridge.url, lambda _: None, address, section)
-        async with bridged(*given, desks=server.calibrations) as ros:
+        async with run_bridged_nodes(*given, desks=server.calibrations) as ros:
             await ros.wait_first_attempts()
             face = Ros1Face(server, bridge)
             async with running(face.run_robot()):

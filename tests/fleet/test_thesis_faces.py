@@ -15,7 +15,7 @@ import pytest
 import smartcam
 from smartcam.fleet import FleetFile, FleetServer
 from smartcam.fleet._inside import FleetAddress, RosSection
-from smartcam.ros1._inside import bridged
+from smartcam.ros1._inside import run_bridged_nodes
 from smartcam.ros2 import Node, QoS
 from tests.fleet.fleetkit import until
 from tests.fleet.plainkit import NAME, PATIENCE, PREFIX, ask_thesis, zenoh_session
@@ -270,7 +270,7 @@ async def in_ros1() -> AsyncIterator[tuple[FleetServer, Face]]:
     async with plant() as server, Bridge(wakes_after=0.002) as bridge:
         address = FleetAddress.parse(server.address.url)
         section = RosSection.model_validate({})
-        async with bridged(bridge.url, lambda _: None, address, section) as ros:
+        async with run_bridged_nodes(bridge.url, lambda _: None, address, section) as ros:
             await ros.wait_first_attempts()
             made = Ros1Face(bridge)
             try:

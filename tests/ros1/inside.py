@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-from smartcam.ros1._json_messages import Raw, encoded, from_json, ros1_name, to_json
+from smartcam.ros1._json_messages import RawBytes, encode_operation, from_json, ros1_name, to_json

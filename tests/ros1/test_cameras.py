@@ -14,7 +14,7 @@ import smartcam.fleet
 from smartcam.fleet import FleetFile
 from smartcam.fleet._inside import FleetAddress, RosSection
 from smartcam.ros1 import RosbridgeNode
-from smartcam.ros1._inside import bridged
+from smartcam.ros1._inside import run_bridged_nodes
 from tests.cli.commandline import closed_port, run
 from tests.processes import Process, free_place
 from tests.ros1.bridge import Bridge
@@ -34,10 +34,10 @@ async def test_a_fleet_is_seen_and_used_from_ros1() -> None:
     heard: list[RosbridgeNode] = []
     async with Bridge() as bridge, smartcam.fleet.serve(plant) as server, asyncio.timeout(PATIENCE):
         address = FleetAddress.parse(server.address.url)
-        async with bridged(bridge.url, heard.append, address, section) as ros:
+        async with run_bridged_nodes(bridge.url, heard.append, address, section) as ros:
             await ros.wait_first_attempts()
             names = ["/plant/cam4", "/plant/line_1/cam3"]
-            assert [one.full_name for one in ros.bridged] == ros.names == names
+            assert [one.full_name for one in ros.bridged_nodes] == ros.names == names
             assert sorted(one.full_name for one in heard) == names
             camera = "/plant/line_1/cam3"
 

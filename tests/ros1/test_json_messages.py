@@ -12,7 +12,7 @@ import pytest
 
 from smartcam.exceptions import RosMessageError
 from smartcam.ros2 import RosTypes
-from tests.ros1.inside import Raw, encoded, from_json, ros1_name, to_json
+from tests.ros1.inside import RawBytes, encode_operation, from_json, ros1_name, to_json
 
 TYPES = RosTypes()
 HEADER = {"seq": 0, "stamp": {"secs": 3, "nsecs": 4}, "frame_id": "cam3"}
@@ -61,10 +61,11 @@ EXAMPLES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 def said(kind: str, fields: dict[str, Any]) -> Any:
     """Return a message as another program reads it."""
     form = TYPES.message(kind)
-    parts = encoded(to_json(form, form.new(**fields)))
+    parts = encode_operation(to_json(form, form.new(**fields)))
     return json.loads(
         "".join(
-            base64.b64encode(one.data).decode() if isinstance(one, Raw) else one for one in parts
+            base64.b64encode(one.data).decode() if isinstance(one, RawBytes) else one
+            for one in parts
         )
     )
 
@@ -89,9 +90,9 @@ def test_bytes_are_base64(data: Any) -> None:
 
 def test_bytes_are_those_of_the_moment() -> None:
     form, data = TYPES.message("sensor_msgs/msg/Image"), bytearray(b"before")
-    parts = encoded(to_json(form, form.new(data=data)))
+    parts = encode_operation(to_json(form, form.new(data=data)))
     data[:] = b"after!"
-    (raw,) = [one for one in parts if isinstance(one, Raw)]
+    (raw,) = [one for one in parts if isinstance(one, RawBytes)]
     assert bytes(raw.data) == b"before"
     assert len(raw) == len(base64.b64encode(raw.data))
 
@@ -162,7 +163,9 @@ def test_an_array_is_the_first_fields() -> None:
 def test_numbers_that_json_has_not(value: float) -> None:
     form = TYPES.message("std_msgs/msg/Float64")
     with pytest.raises(RosMessageError, match="/t: expected finite numbers"):
-        encoded({"op": "publish", "topic": "/t", "msg": to_json(form, form.new(data=value))})
+        encode_operation(
+            {"op": "publish", "topic": "/t", "msg": to_json(form, form.new(data=value))}
+        )
 
 
 def test_what_is_of_another_type() -> None:

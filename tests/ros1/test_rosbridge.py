@@ -179,10 +179,10 @@ async def test_newest_pictures_win_over_a_bridge_that_does_not_read(
     for number in range(60):  # more than any buffer of sockets holds
         publisher.publish(height=number, data=data)
         await asyncio.sleep(0)
-    waiting = len(publisher.lane._waiting)  # one less where the last turn has taken one
+    waiting = len(publisher.queue._waiting)  # one less where the last turn has taken one
     assert publisher.published + publisher.dropped + waiting == 60
     assert publisher.dropped > 30
-    assert publisher.lane.waiting_bytes < 3_000_000
+    assert publisher.queue.waiting_bytes < 3_000_000
     bridge.reading.set()
     await bridge.until(lambda: bridge.published and bridge.published[-1]["msg"]["height"] == 59)
     heights = [one["msg"]["height"] for one in bridge.published]
@@ -549,7 +549,7 @@ async def test_close_services_one_after_another(bridge: Bridge, node: RosbridgeN
     await bridge.until(lambda: not bridge.services)
     node.serve("~/last", TRIGGER, yes)
     assert (await bridge.call("/line1/cam3/last"))["result"] is True
-    assert not node._leaving
+    assert not node._to_withdraw
     assert [*bridge.services] == ["/line1/cam3/last"]
 
 
@@ -678,7 +678,7 @@ async def test_answers_to_a_bridge_that_does_not_read_have_a_bound(
             await bridge.say({"op": "call_service", "service": service.name, "id": str(number)})
 
     calling = asyncio.create_task(call())
-    while not node._outbox.full:  # noqa: ASYNC110 - there is no event for it
+    while not node._outbox.is_full:  # noqa: ASYNC110 - there is no event for it
         await asyncio.sleep(0.001)
     assert service.calls < 20
     bridge.reading.set()
@@ -795,7 +795,7 @@ async def test_newest_messages_wait_and_wrong_ones_are_left_out(
 
 async def test_what_ros1_has_not_is_not_asked_for(bridge: Bridge, node: RosbridgeNode) -> None:
     heard = node.subscribe("found", "vision_msgs/msg/Detection3DArray")
-    assert not heard.exists
+    assert not heard.has_ros1_type
     heard.close()
     with pytest.raises(ConfigurationError):
         node.subscribe("no topic", STRING)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from smartcam.ros2._cameras.image_messages import (
     ENCODINGS,
     array_fields,
+    choose_compression,
     compressed_fields,
-    compression,
-    header_fields,
+    header_fields_at,
     image_fields,
-    prepared,
+    to_ros_format,
 )
 from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
 from smartcam.ros2._cameras.results import CameraResults
@@ -19,4 +19,4 @@ from smartcam.ros2._node.qos import PARAMETERS, SENSOR_DATA
 from smartcam.ros2._node.tokens import Entity, gid_of
 from smartcam.ros2._types.built_in import MESSAGES, SERVICES
 from smartcam.ros2._types.definitions import INTEGERS, NUMBERS, parse_message, parse_service
-from smartcam.ros2._types.stores import stored
+from smartcam.ros2._types.stores import stored_fields

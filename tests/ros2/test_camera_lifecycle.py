@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import CommandRejectedError, RosError, SmartCamError
-from smartcam.ros2._node.lifecycle import PRIVATE, STATES, TRANSITIONS, Lifecycle
+from smartcam.ros2._node.lifecycle import FIRST_INTERNAL_ID, STATES, TRANSITIONS, Lifecycle
 from tests.ros2.nodekit import COUNTER, OTHER, TYPES, NotedNode, away, box, seen, until
 
 WAYS = {
@@ -62,12 +62,12 @@ async def _in_state(state: str, work: Any = None, timeout: float = 5.0) -> Lifec
 def test_ids_are_those_of_lifecycle_msgs() -> None:
     states = TYPES.message("lifecycle_msgs/msg/State").new()
     for state in STATES:
-        kind = "PRIMARY" if state.id < PRIVATE else "TRANSITION"
+        kind = "PRIMARY" if state.id < FIRST_INTERNAL_ID else "TRANSITION"
         assert getattr(states, f"{kind}_STATE_{state.label.upper()}") == state.id
     transitions = TYPES.message("lifecycle_msgs/msg/Transition").new()
     for one in TRANSITIONS:
         name = one.label.removeprefix("transition_").upper()
-        if one.id >= PRIVATE:
+        if one.id >= FIRST_INTERNAL_ID:
             name = f"ON_{STEMS[one.start.label]}_{name}"
         elif name == "SHUTDOWN":
             name = f"{one.start.label.upper()}_SHUTDOWN"
@@ -212,7 +212,7 @@ async def test_who_gives_up_does_not_end_a_transition() -> None:
         await asking
     assert life.state.label == "configuring"
     gate.set()
-    await life.settled()
+    await life.wait_for_transition()
     assert life.state.label == "inactive"
 
 
@@ -290,8 +290,8 @@ async def test_whatever_is_asked_for_it_goes_step_by_step(asked: list[Any]) -> N
             asyncio.get_running_loop().call_later(patience, task.cancel)
         tasks.append(task)
     await asyncio.gather(*tasks, return_exceptions=True)
-    await life.settled()
-    assert life.state.id < PRIVATE
+    await life.wait_for_transition()
+    assert life.state.id < FIRST_INTERNAL_ID
     assert all(before.goal is after.start for before, after in itertools.pairwise(steps))
     assert set(steps) <= set(TRANSITIONS)
     assert life.state is (steps[-1].goal if steps else STATES[1])

@@ -174,8 +174,8 @@ async def test_a_node_that_is_closed_while_a_hook_waits() -> None:
     async with two() as (cam, viewer):
         submit = cam.submit
 
-        def late(work: Any) -> Any:
-            found = submit(work)
+        def late(make_coroutine: Any) -> Any:
+            found = submit(make_coroutine)
             time.sleep(0.2)  # the thread of rclpy learns of its own wait when all is closed
             return found
 

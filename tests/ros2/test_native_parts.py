@@ -75,20 +75,20 @@ def test_jobs_are_done_in_order_and_all_before_it_ends() -> None:
     done: list[int] = []
     box = MessageThread("test")
     for number in range(1000):
-        box.put(lambda number=number: done.append(number))  # type: ignore[misc]
+        box.add_job(lambda number=number: done.append(number))  # type: ignore[misc]
     assert box.close(10.0)
     assert done == [*range(1000)]
     with pytest.raises(RosError, match="closed"):
-        box.put(lambda: done.append(1))
+        box.add_job(lambda: done.append(1))
 
 
 def test_what_waits_is_bounded_and_the_oldest_goes() -> None:
     go, done, dropped = threading.Event(), list[int](), list[int]()
     box = MessageThread("test")
-    box.put(go.wait)  # type: ignore[arg-type]
-    box.put(lambda: done.append(-1))  # which cannot be dropped
+    box.add_job(go.wait)  # type: ignore[arg-type]
+    box.add_job(lambda: done.append(-1))  # which cannot be dropped
     for number in range(MAX_WAITING_MESSAGES + 10):
-        box.put(
+        box.add_job(
             lambda number=number: done.append(number),  # type: ignore[misc]
             1,
             lambda number=number: dropped.append(number),  # type: ignore[misc]
@@ -103,7 +103,7 @@ def test_what_waits_is_bounded_and_the_oldest_goes() -> None:
 def test_one_that_does_not_end_holds_up_nobody_for_long() -> None:
     go = threading.Event()
     box = MessageThread("test")
-    box.put(go.wait)  # type: ignore[arg-type]
+    box.add_job(go.wait)  # type: ignore[arg-type]
     assert not box.close(0.05)
     go.set()
     assert box.close(10.0)
@@ -112,8 +112,8 @@ def test_one_that_does_not_end_holds_up_nobody_for_long() -> None:
 def test_a_job_that_fails_leaves_the_others() -> None:
     done: list[int] = []
     box = MessageThread("test")
-    box.put(lambda: [][0])
-    box.put(lambda: done.append(1))
+    box.add_job(lambda: [][0])
+    box.add_job(lambda: done.append(1))
     assert box.close(10.0)
     assert done == [1]
 
@@ -132,7 +132,7 @@ def test_changes_of_parameters_reach_ros(monkeypatch: pytest.MonkeyPatch) -> Non
     )
     made = parameters.NativeParameters(node)
     monkeypatch.setattr(made, "_declare_in_ros", lambda name: seen.append(("declare", name)))
-    monkeypatch.setattr(made, "_parameter", lambda name: (name, made.get(name)))
+    monkeypatch.setattr(made, "_rclpy_parameter", lambda name: (name, made.get(name)))
     made.declare("rate", 1)
     assert seen == []
     made.open()
@@ -152,13 +152,15 @@ def test_all_headers_are_moved_and_equal_stamps_stay_equal() -> None:
     image = TYPES.message("sensor_msgs/msg/Image")
     result = TYPES.message("smartcam_msgs/msg/Result")
     first = {"stamp": {"sec": 100, "nanosec": 250_000_000}, "frame_id": "cam"}
-    moved = image.decode(stamps.moved(image, image.encode({"header": first, "data": b"\1\2"})))
+    moved = image.decode(
+        stamps.to_ros_time(image, image.encode({"header": first, "data": b"\1\2"}))
+    )
     assert (moved.header.stamp.sec, moved.header.stamp.nanosec) == (98, 750_000_000)
     assert (moved.header.frame_id, bytes(moved.data)) == ("cam", b"\1\2")
     later = {"stamp": {"sec": 101}}
     parts = [{"pose": {"header": later}}, {"pose": {"header": first}}]
     fields = {"header": first, "localizations": parts}
-    again = result.decode(stamps.moved(result, result.encode(fields)))
+    again = result.decode(stamps.to_ros_time(result, result.encode(fields)))
     seconds = [again.header.stamp.sec, *(one.pose.header.stamp.sec for one in again.localizations)]
     assert seconds == [98, 99, 98]
 
@@ -166,5 +168,5 @@ def test_all_headers_are_moved_and_equal_stamps_stay_equal() -> None:
 def test_few_stamps_are_remembered() -> None:
     stamps = RosStamps(lambda: 1.0)
     for second in range(2 * MAX_STAMPS):
-        assert stamps._moved(second * BILLION) == (second + 1) * BILLION
-    assert len(stamps._moved_stamps) == MAX_STAMPS
+        assert stamps._shift_stamp(second * BILLION) == (second + 1) * BILLION
+    assert len(stamps._shifted_stamps) == MAX_STAMPS

@@ -357,7 +357,7 @@ async def test_the_graph_says_who_does_what_and_forgets_who_is_gone() -> None:
         served.close()
         await until(lambda: there.graph.services() == {})
         await here.stop()
-        assert not here._ends
+        assert not here._endpoints
 
 
 async def test_nodes_of_one_session_do_not_collide() -> None:

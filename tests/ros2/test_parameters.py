@@ -12,7 +12,7 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
 from smartcam.ros2 import Node, RosTypes
-from smartcam.ros2._node.parameter_values import decode_value, encode_value, typed
+from smartcam.ros2._node.parameter_values import decode_value, encode_value, typed_value
 from tests.ros2.inside import RosParameters
 
 PATIENCE = 10.0
@@ -68,7 +68,7 @@ class Device:
     ],
 )
 def test_a_value_has_a_type_and_goes_through_a_message(value: Any, kind: str, kept: Any) -> None:
-    made = typed("it", value)
+    made = typed_value("it", value)
     assert (made.type, made.value) == (kind, kept)
     assert type(made.value) is type(kept)
     message = RosTypes().message("rcl_interfaces/msg/ParameterValue")
@@ -373,7 +373,7 @@ async def test_sets_that_go_on_end_with_the_node(
     for name in ("a", "b"):
         parameters.declare(name, 1, on_set=device.hook(name))
     device.slow = {3: math.inf}
-    caller = asyncio.create_task(parameters.carry_out({"a": 2, "b": 3}))
+    caller = asyncio.create_task(parameters.set_shielded({"a": 2, "b": 3}))
     await asyncio.sleep(1)
     caller.cancel()  # who asked is gone: it goes on
     await asyncio.sleep(1)

@@ -175,7 +175,7 @@ async def test_events(nodes: tuple[Node, Node]) -> None:
     heard = there.subscribe(
         "/parameter_events", "rcl_interfaces/msg/ParameterEvent", qos=PARAMETERS
     )
-    (says,) = [one for one in here._ends if one.name == "/parameter_events"]
+    (says,) = [one for one in here._endpoints if one.name == "/parameter_events"]
     await until(lambda: says.has_subscribers)  # type: ignore[attr-defined]
     here.parameters.declare("a", 1)
     here.parameters.declare("b", 1, read_only=True)
@@ -364,7 +364,7 @@ async def test_the_client(shared: tuple[Node, Node]) -> None:
         for bad in wrong:
             with pytest.raises(ConfigurationError):
                 await client.set(bad)
-    assert not [one for one in there._ends if one.name.startswith(CAMERA)]
+    assert not [one for one in there._endpoints if one.name.startswith(CAMERA)]
 
 
 async def test_a_client_of_who_is_not_there_or_answers_nonsense(nodes: tuple[Node, Node]) -> None:

@@ -32,12 +32,12 @@ from smartcam.exceptions import (
 from smartcam.frames import FrameSource, find_format
 from smartcam.ros2 import Node, frame_from
 from smartcam.ros2._cameras import picture_stream
-from smartcam.ros2._cameras.lens import as_path
+from smartcam.ros2._cameras.lens import path_from_url
 from smartcam.ros2._cameras.pictures import CameraPictures
 from smartcam.ros2._inside import DRIVER
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.processes import free_place
-from tests.ros2.inside import header_fields, lens_fields
+from tests.ros2.inside import header_fields_at, lens_fields
 from tests.ros2.roskit import soon, two_nodes, until
 
 pytestmark = pytest.mark.real_time
@@ -298,9 +298,9 @@ def test_values_that_cannot_be_are_refused(options: dict[str, Any]) -> None:
 
 
 def test_where_a_lens_is_kept() -> None:
-    assert as_path("") is None
-    assert as_path("file:///a/b%20c.yaml") == Path("/a/b c.yaml")
-    assert as_path("b.yaml") == Path("b.yaml")
+    assert path_from_url("") is None
+    assert path_from_url("file:///a/b%20c.yaml") == Path("/a/b c.yaml")
+    assert path_from_url("b.yaml") == Path("b.yaml")
 
 
 # ---------------------------------------------------------------------- set_camera_info
@@ -308,7 +308,7 @@ def test_where_a_lens_is_kept() -> None:
 
 def request(size: tuple[int, int] = (4, 2), **change: Any) -> dict[str, Any]:
     lens = CameraModel(size=size, matrix=LENS.matrix, distortion=np.arange(5) / 100)
-    return {"camera_info": lens_fields(lens, header_fields(1.0, "a"), size) | change}
+    return {"camera_info": lens_fields(lens, header_fields_at(1.0, "a"), size) | change}
 
 
 async def test_a_lens_that_is_set_is_kept_and_published(tmp_path: Path) -> None:

@@ -20,19 +20,19 @@ from smartcam.ros2._cameras.cloud_messages import (
     cloud_fields,
     compressed_depth_fields,
     depth_fields,
-    points_of,
+    depth_points,
 )
 from tests.frames.pictures import RAW_FORMATS as RAW
 from tests.ros2.inside import (
     ENCODINGS,
     array_fields,
+    choose_compression,
     compressed_fields,
-    compression,
-    header_fields,
+    header_fields_at,
     image_fields,
     lens_fields,
     lens_from,
-    prepared,
+    to_ros_format,
 )
 
 TYPES = RosTypes("jazzy")
@@ -42,7 +42,7 @@ INFO = TYPES.message("sensor_msgs/msg/CameraInfo")
 CLOUD = TYPES.message("sensor_msgs/msg/PointCloud2")
 WIDTH, HEIGHT = 12, 6
 UTC = 1_700_000_000.25
-HEADER = header_fields(UTC, "cam")
+HEADER = header_fields_at(UTC, "cam")
 
 
 async def as_png(frame: Frame) -> Frame:
@@ -75,7 +75,7 @@ def picture(name: str, padding: int = 0, *, whole: bool = True) -> Frame:
 
 def there(frame: Frame) -> Any:
     """Return the message of a frame after its way through bytes."""
-    return IMAGE.decode(IMAGE.encode(image_fields(prepared(frame), "cam3_optical")))
+    return IMAGE.decode(IMAGE.encode(image_fields(to_ros_format(frame), "cam3_optical")))
 
 
 def test_every_format_has_the_same_pixels_there_and_back() -> None:
@@ -124,7 +124,7 @@ def test_encodings_have_the_names_that_ros_gives_them() -> None:
 
 def test_other_encodings_are_read_too() -> None:
     values = np.arange(HEIGHT * WIDTH * 4, dtype=np.uint8).reshape(HEIGHT, WIDTH, 4)
-    header = header_fields(UTC, "a")
+    header = header_fields_at(UTC, "a")
     four = IMAGE.new(**array_fields(values, "bgra8", header))
     assert np.array_equal(frame_from(four).rgb(), values[..., 2::-1])
     depth = np.linspace(0, 9, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
@@ -188,7 +188,7 @@ def test_the_time_of_a_picture_from_the_future_is_now() -> None:
     ],
 )
 def test_the_format_of_compressed_pictures(name: str, text: str) -> None:
-    assert compression(picture(name)).text() == text
+    assert choose_compression(picture(name)).format_text() == text
 
 
 def test_compressed_pictures_are_read() -> None:
@@ -200,7 +200,7 @@ def test_compressed_pictures_are_read() -> None:
     back = frame_from(message)
     assert (back.format.name, back.width, back.height) == ("MJPEG", WIDTH, HEIGHT)
     assert bytes(back.data) == bytes(jpeg.data)
-    assert compression(jpeg).text() == "mono8; jpeg compressed mono8"
+    assert choose_compression(jpeg).format_text() == "mono8; jpeg compressed mono8"
     depth = picture("Coord3D_C16")
     png = COMPRESSED.new(**compressed_fields(asyncio.run(as_png(depth)), "x", "a"))
     assert np.array_equal(decoded(frame_from(png), "Coord3D_C16").array(), depth.array())
@@ -220,7 +220,7 @@ MATRIX = np.array([[600.0, 0, 5.5], [0, 610, 2.5], [0, 0, 1]])
 def test_lenses_there_and_back(model: Any, count: int) -> None:
     coefficients = np.arange(1, count + 1) / 100
     lens = CameraModel(size=(12, 6), matrix=MATRIX, distortion=coefficients, distortion_model=model)
-    message = INFO.decode(INFO.encode(lens_fields(lens, header_fields(UTC, "a"), (12, 6))))
+    message = INFO.decode(INFO.encode(lens_fields(lens, header_fields_at(UTC, "a"), (12, 6))))
     assert message.p.tolist() == [600.0, 0, 5.5, 0, 0, 610, 2.5, 0, 0, 0, 1, 0]
     back = lens_from(message)
     assert back is not None
@@ -231,7 +231,7 @@ def test_lenses_there_and_back(model: Any, count: int) -> None:
 
 
 def test_a_camera_that_is_not_calibrated_has_zeros() -> None:
-    message = INFO.new(**lens_fields(None, header_fields(UTC, "a"), (12, 6)))
+    message = INFO.new(**lens_fields(None, header_fields_at(UTC, "a"), (12, 6)))
     assert (message.width, message.height, message.distortion_model) == (12, 6, "")
     assert not np.any(message.k)
     assert not np.any(message.r)
@@ -256,7 +256,7 @@ def test_a_camera_that_is_not_calibrated_has_zeros() -> None:
 )
 def test_a_lens_that_is_none_is_refused(change: dict[str, Any]) -> None:
     lens = CameraModel(size=(12, 6), matrix=MATRIX)
-    fields = lens_fields(lens, header_fields(UTC, "a"), (12, 6)) | change
+    fields = lens_fields(lens, header_fields_at(UTC, "a"), (12, 6)) | change
     with pytest.raises((RosMessageError, CalibrationError)):
         lens_from(INFO.new(**fields))
 
@@ -268,11 +268,11 @@ def test_a_cloud_there_and_back() -> None:
     depth = np.full((4, 5), 2.0, np.float32)
     depth[1, 2] = 0
     lens = CameraModel(size=(5, 4), matrix=np.array([[10.0, 0, 2], [0, 10, 1], [0, 0, 1]]))
-    points = points_of(depth, lens)
+    points = depth_points(depth, lens)
     assert np.isnan(points[1, 2]).all()
     assert points[0, 4].tolist() == pytest.approx([0.4, -0.2, 2.0])
     colours = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
-    header = header_fields(UTC, "a")
+    header = header_fields_at(UTC, "a")
     message = CLOUD.decode(CLOUD.encode(cloud_fields(points, colours, header)))
     assert (message.width, message.height, message.is_dense) == (5, 4, False)
     assert [one.name for one in message.fields] == ["x", "y", "z", "rgb"]
@@ -334,14 +334,14 @@ def test_a_cloud_of_another_kind_is_read() -> None:
     ],
 )
 def test_a_cloud_that_is_none_is_refused(change: dict[str, Any]) -> None:
-    fields = cloud_fields(np.ones((3, 3), np.float32), None, header_fields(UTC, "a"))
+    fields = cloud_fields(np.ones((3, 3), np.float32), None, header_fields_at(UTC, "a"))
     with pytest.raises(RosMessageError, match="point cloud"):
         cloud_from(CLOUD.new(**(fields | change)))
 
 
 def test_depth_in_millimetres_and_in_metres() -> None:
     depth = np.array([[0, 1.2344, 65.5, 70]], np.float32)
-    header = header_fields(UTC, "a")
+    header = header_fields_at(UTC, "a")
     whole = pixels_from(IMAGE.new(**depth_fields(depth, header, "16UC1")))
     assert whole.tolist() == [[0, 1234, 65500, 0]]
     metres = pixels_from(IMAGE.new(**depth_fields(depth, header)))

@@ -93,7 +93,7 @@ async def test_text_that_is_none_and_what_is_wanted(
     here, there = pair
     heard = there.subscribe("/rosout", LOG, qos=ROSOUT)
     out = RosOut(
-        here, logger, level=logging.DEBUG, wanted=lambda record: record.levelno != logging.INFO
+        here, logger, level=logging.DEBUG, is_wanted=lambda record: record.levelno != logging.INFO
     )
     out.start()
     logger.info("not this")
@@ -172,7 +172,7 @@ async def test_it_does_not_hear_itself(
     await asyncio.sleep(0)
     assert [one["msg"] for one in said] == ["one", "two", "loud"]
     assert not out._waiting
-    assert not out._woken
+    assert not out._publish_scheduled
     await out.close()
 
 

@@ -13,7 +13,11 @@ import pytest
 from smartcam.exceptions import CalibrationError
 from smartcam.ros2 import Node, QoS, RosTypes
 from smartcam.ros2._cameras import transform_listener
-from smartcam.ros2._cameras.transform_listener import MAX_FRAMES, MAX_MOMENTS, TransformListener
+from smartcam.ros2._cameras.transform_listener import (
+    MAX_FRAMES,
+    MAX_TRANSFORMS_PER_FRAME,
+    TransformListener,
+)
 from tests.fleet.fleetkit import until
 from tests.processes import free_place
 
@@ -82,7 +86,7 @@ def paper() -> Paper:
 
 @pytest.fixture
 async def listener(paper: Paper, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(transform_listener, "WAIT", 0.05)
+    monkeypatch.setattr(transform_listener, "TRANSFORM_TIMEOUT", 0.05)
     made = TransformListener(paper)
     made.listen()
     yield made
@@ -226,7 +230,7 @@ async def test_a_robot_that_says_no_more_is_refused(
 async def test_what_is_not_known_yet_is_waited_for(
     paper: Paper, listener: TransformListener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transform_listener, "WAIT", 5.0)
+    monkeypatch.setattr(transform_listener, "TRANSFORM_TIMEOUT", 5.0)
     asked = asyncio.create_task(listener.pose("tool", "base"))
     await asyncio.sleep(0.05)
     paper.say("base", "tool", 3.0)
@@ -247,11 +251,11 @@ async def test_a_clock_that_was_set_back_begins_anew(
 async def test_frames_and_moments_are_bounded(paper: Paper, listener: TransformListener) -> None:
     now = time.time()
     for number in range(MAX_FRAMES + 50):
-        listener._add(as_message("base", f"f{number}", now), static=True)
-    for number in range(2 * MAX_MOMENTS):
-        listener._add(as_message("base", "f1", now + 1e-3 * number), static=False)
+        listener._add_transform(as_message("base", f"f{number}", now), static=True)
+    for number in range(2 * MAX_TRANSFORMS_PER_FRAME):
+        listener._add_transform(as_message("base", "f1", now + 1e-3 * number), static=False)
     assert len(listener._links) == MAX_FRAMES
-    assert len(listener._links["f1"].times) == MAX_MOMENTS
+    assert len(listener._links["f1"].times) == MAX_TRANSFORMS_PER_FRAME
 
 
 def as_message(parent: str, child: str, utc: float) -> Any:
@@ -263,7 +267,7 @@ def as_message(parent: str, child: str, utc: float) -> Any:
 async def test_nothing_is_heard_after_a_while_without_questions(
     paper: Paper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transform_listener, "LINGER", 0.1)
+    monkeypatch.setattr(transform_listener, "LINGER_TIME", 0.1)
     made = TransformListener(paper)
     assert not paper.heard
     made.listen()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from smartcam.ros2._inside import MessageField
-from tests.ros2.inside import INTEGERS, NUMBERS, stored
+from tests.ros2.inside import INTEGERS, NUMBERS, stored_fields
 
 if TYPE_CHECKING:
     import random
@@ -33,7 +33,7 @@ SHAPES = {
 
 def forget_stores() -> None:
     """Have the messages of ROS read from rosbags anew."""
-    stored.cache_clear()
+    stored_fields.cache_clear()
 
 
 def each(suffix: str, shape: str = "", kinds: tuple[str, ...] = ORDER) -> str:

@@ -183,5 +183,5 @@ def test_any_rules_and_chunks_give_what_the_plain_way_gives(
 def test_rules_added_later_come_after_and_past_places_do_nothing() -> None:
     editor = Editor([InsertBytes(at=6, data=b"a")])
     editor.feed(DATA[:4])
-    editor.add([InsertBytes(at=6, data=b"b"), DropBytes(at=3, count=4), Flip(at=4)])
+    editor.add_rules([InsertBytes(at=6, data=b"b"), DropBytes(at=3, count=4), Flip(at=4)])
     assert written(editor.feed(DATA[4:])) == b"\xcb5ab6789"

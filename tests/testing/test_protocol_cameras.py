@@ -17,7 +17,7 @@ from smartcam.client import SmartCamera
 from smartcam.exceptions import SmartCamError
 from smartcam.models import Status
 from smartcam.testing import CameraKind, CameraSuite, LiveCamera
-from smartcam.testing._suites.protocols.client_checks import in_a_loop
+from smartcam.testing._suites.protocols.client_checks import with_event_loop
 from tests.testing.cameras_under_test import BVS_WORLDS, INSIGHT_WORLDS, LONELY_WORLDS
 
 pytestmark = [pytest.mark.long, pytest.mark.widest]
@@ -184,7 +184,7 @@ def test_every_check_has_a_mistake() -> None:
 def test_check_that_leaves_a_task_running_fails() -> None:
     left: list[asyncio.Task[None]] = []
 
-    @in_a_loop
+    @with_event_loop
     async def check(_: object) -> None:
         left.append(asyncio.create_task(asyncio.sleep(60), name="leaked"))
 

@@ -27,7 +27,7 @@ from smartcam.protocols import LineMachine as Machine
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK
 from smartcam.testing import Conversation, Received, Sent, WireSuite
-from smartcam.testing._suites.protocols.words import ABILITIES
+from smartcam.testing._suites.protocols.words import MESSAGES_BY_CAPABILITY
 from tests.testing.acme_page import acme, acme_is_known
 
 __all__ = ["acme_is_known"]
@@ -204,7 +204,10 @@ def test_frames_that_are_read_otherwise_fail() -> None:
 
 def test_table_of_abilities_has_every_capability() -> None:
     others = {"dialect", "status_by_itself", "unasked_results", "result_codes"}
-    assert {one.name for one in dataclasses.fields(Capabilities)} == {*ABILITIES, *others}
+    assert {one.name for one in dataclasses.fields(Capabilities)} == {
+        *MESSAGES_BY_CAPABILITY,
+        *others,
+    }
 
 
 # ---------------------------------------------------------------------- machines

@@ -235,9 +235,13 @@ async def test_receiver_that_does_not_read_stops_the_sender() -> None:
     async with linked() as (proxy, end, camera):
         end.transport.pause_reading()
         camera.write(sent)
-        pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
+        pipe = proxy._relay.clients[1]._pipes["down"]  # type: ignore[union-attr]
         await until(lambda: pipe._writing and not pipe._reading)
-        assert directions.MAX_HELD_BYTES <= pipe.held < directions.MAX_HELD_BYTES + directions.CHUNK
+        assert (
+            directions.MAX_HELD_BYTES
+            <= pipe.held_bytes
+            < directions.MAX_HELD_BYTES + directions.CHUNK
+        )
         assert camera.transport.get_write_buffer_size() > 0
         end.transport.resume_reading()
         await proxy.wait_passed("down", len(sent), timeout=20)
@@ -309,7 +313,7 @@ async def test_cut_connection_is_let_go_where_both_answer_with_a_reset() -> None
 async def test_cut_connection_is_let_go_if_nobody_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(tcp, "LINGER", SHORT)
+    monkeypatch.setattr(tcp, "LINGER_TIME", SHORT)
     async with linked(Cut()) as (proxy, end, _):
         await end.wait_eof()
         assert proxy.open_connections == 1
@@ -471,7 +475,7 @@ async def test_stall_and_resume_do_not_shorten_a_pause() -> None:
 
 async def in_pieces(end: End, proxy: LinkProxy, data: bytes) -> None:
     """Write byte by byte, the next when the proxy has read the one before."""
-    pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
+    pipe = proxy._relay.clients[1]._pipes["down"]  # type: ignore[union-attr]
     for position, byte in enumerate(data, pipe._editor.position + 1):
         end.write(bytes([byte]))
         await until(functools.partial(pipe_is_at, pipe, position))
@@ -622,8 +626,8 @@ async def test_jitter_is_the_same_again_with_the_same_seed() -> None:
         async with linked(DelayBytes(seconds=10, jitter=100, seed=seed)) as (proxy, _, camera):
             begin = asyncio.get_running_loop().time()
             await in_pieces(camera, proxy, b"0")
-            pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
-            delays.append(pipe._line._queue[0].due_at * 1e-9 - begin)
+            pipe = proxy._relay.clients[1]._pipes["down"]  # type: ignore[union-attr]
+            delays.append(pipe._delay_line._queue[0].due_at * 1e-9 - begin)
     assert delays[0] == pytest.approx(delays[1], abs=3)
     assert abs(delays[0] - delays[2]) > 50
 
@@ -642,8 +646,8 @@ async def test_slow_rate_stops_the_sender_and_not_only_the_receiver() -> None:
     async with linked(Rate(bytes_per_second=1_000)) as (proxy, _, camera):
         camera.write(bytes(32_000_000))
         await proxy.wait_passed("down", 60)
-        pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
-        assert pipe.held < directions.MAX_HELD_BYTES + directions.CHUNK
+        pipe = proxy._relay.clients[1]._pipes["down"]  # type: ignore[union-attr]
+        assert pipe.held_bytes < directions.MAX_HELD_BYTES + directions.CHUNK
         assert not pipe._reading
 
 

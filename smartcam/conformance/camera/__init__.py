@@ -1,4 +1,4 @@
-"""Judge whether a camera is a BVS camera, and observe behaviour without a document.
+"""Judge whether a camera is a BVS camera, and observe behaviour that no document describes.
 
 On the command line, with the camera's address::
 

@@ -1,7 +1,7 @@
-"""List all checks and questions, in the order in which a camera is tested.
+"""List all checks and questions (items), in the order in which a camera is tested.
 
-Items that change least come first; items that may leave a camera confused (bytes that are no frame,
-a restart) come last. Each module lists its own in this order.
+Items that change the camera least come first. Items that may leave it in a wrong state, by bytes
+that are no frame or a restart, come last. Each module defines its items in this order.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from smartcam.conformance.camera._results import Check, Item, Question
 
 _MODULES = (session_checks, running_checks, setting_checks, message_checks, questions)
 _DECLARED = [
-    member for module in _MODULES for member in vars(module).values() if isinstance(member, Item)
+    value for module in _MODULES for value in vars(module).values() if isinstance(value, Item)
 ]
 
 
-def _is_late(item: Item) -> tuple[bool, bool]:
+def _sort_key(item: Item) -> tuple[bool, bool]:
+    """Return a key that sorts two kinds of items after the others."""
     return item is message_checks.only_documented_messages_came, Allow.REBOOT in item.needs
 
 
-ITEMS: tuple[Item, ...] = tuple(sorted(_DECLARED, key=_is_late))
+ITEMS: tuple[Item, ...] = tuple(sorted(_DECLARED, key=_sort_key))
 """All checks and questions, in the order in which they are judged."""
 
 CHECKS: tuple[Check, ...] = tuple(item for item in ITEMS if isinstance(item, Check))

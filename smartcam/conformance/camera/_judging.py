@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam._arguments import check_all, check_kind, check_text
 from smartcam.conformance.camera._items import ITEMS
 from smartcam.conformance.camera._options import ConformanceOptions
-from smartcam.conformance.camera._raw_client import EndedError
+from smartcam.conformance.camera._raw_client import LinkClosedError
 from smartcam.conformance.camera._report import CameraReport
 from smartcam.conformance.camera._results import CameraFinding, CheckOutcome, Item, Question
 from smartcam.conformance.camera._session_under_test import CameraUnderTest
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 
 CONNECT_CHECK = "connect-is-answered"
-"""The check that fails if there is no camera at all; the others are not observed then."""
+"""Name of the check that fails if there is no camera; then the other checks are not observed."""
 
 
 def judge(options: ConformanceOptions, names: Iterable[str] | None = None) -> CameraReport:
     """Run all checks and questions, or some, on a camera, and return the report.
 
-    It blocks, for a minute or two with the default times: do not call it in an event loop's thread.
-    The camera is taken from any other client. Application and run state are restored, also if an
-    exception, such as Ctrl-C, ends the call.
+    It blocks for a minute or two with the default times: do not call it in an event loop's thread.
+    Any other client loses the camera. The active application and the run mode are restored, also if
+    an exception, such as Ctrl-C, ends the call.
 
     Args:
         options: options of the examination.
@@ -38,67 +38,71 @@ def judge(options: ConformanceOptions, names: Iterable[str] | None = None) -> Ca
         ConfigurationError: the address cannot work, or a name is unknown.
     """
     check_kind(options, ConformanceOptions, "options", "ConformanceOptions", "judge")
-    wanted = None
+    wanted_names = None
     if names is not None:
-        given = check_all(names, "names", "names of checks", "judge")
-        wanted = {check_text(name, "names", "judge") for name in given}
-    unknown = sorted((wanted or set()) - {item.name for item in ITEMS})
+        name_list = check_all(names, "names", "names of checks", "judge")
+        wanted_names = {check_text(name, "names", "judge") for name in name_list}
+    unknown = sorted((wanted_names or set()) - {item.name for item in ITEMS})
     if unknown:
         raise ConfigurationError(f"there is no check or question {unknown[0]!r}")
     camera = CameraUnderTest(options)
     report = CameraReport(camera)
     try:
         for item in ITEMS:
-            if wanted is None or item.name in wanted:
+            if wanted_names is None or item.name in wanted_names:
                 report.add(judge_item(camera, item))
     finally:
-        camera.restore(again=True)
+        camera.restore(retry=True)
     return report
 
 
 def judge_item(camera: CameraUnderTest, item: Item) -> CameraFinding:
-    """Run one check or question; its changes are undone afterwards.
+    """Run one check or question, and undo its changes of the camera.
 
-    It takes as long as the options' times allow, and ends by itself in any case.
+    Each wait has a limit, which the options set.
     """
-    camera.forget_trail()
-    began = time.monotonic()
-    was_gone = bool(camera.gone)
+    camera.clear_message_log()
+    started_at = time.monotonic()
+    was_gone = bool(camera.gone_reason)
     try:
-        result = _run(camera, item)
-        wire = tuple(camera.trail)
+        result = _run_item(camera, item)
+        wire = tuple(camera.message_log)
     finally:
         camera.restore()
-    if camera.gone and not was_gone and result["outcome"] is not CheckOutcome.DIFFERS:
+    if camera.gone_reason and not was_gone and result["outcome"] is not CheckOutcome.DIFFERS:
         result = {
             "outcome": CheckOutcome.DIFFERS,
             "expected": "the camera is still there",
-            "observed": camera.gone,
+            "observed": camera.gone_reason,
         }
     failed = result["outcome"] in {CheckOutcome.DIFFERS, CheckOutcome.UNDESCRIBED}
-    place, grade = item.source(camera.known_dialect)
+    source, grade = item.source(camera.known_dialect)
     return CameraFinding(
         item=item,
-        source=place,
+        source=source,
         grade=grade,
         wire=wire if failed else (),
-        seconds=time.monotonic() - began,
+        seconds=time.monotonic() - started_at,
         **result,
     )
 
 
-def _run(camera: CameraUnderTest, item: Item) -> dict[str, Any]:
+def _run_item(camera: CameraUnderTest, item: Item) -> dict[str, Any]:
     try:
-        unfit = _unfit(camera, item)
-        if unfit:
-            return {"outcome": CheckOutcome.NOT_APPLICABLE, "text": unfit}
-        camera.require(item.needs)
+        reason = _reason_not_applicable(camera, item)
+        if reason:
+            return {"outcome": CheckOutcome.NOT_APPLICABLE, "text": reason}
+        camera.require_allowed(item.needs)
         value = item.run(camera)
     except Undescribed as exc:
-        return {"outcome": CheckOutcome.UNDESCRIBED, "expected": exc.expected, "observed": exc.came}
+        return {
+            "outcome": CheckOutcome.UNDESCRIBED,
+            "expected": exc.expected,
+            "observed": exc.observed,
+        }
     except Differs as exc:
-        return {"outcome": CheckOutcome.DIFFERS, "expected": exc.expected, "observed": exc.came}
-    except EndedError as exc:
+        return {"outcome": CheckOutcome.DIFFERS, "expected": exc.expected, "observed": exc.observed}
+    except LinkClosedError as exc:
         return {
             "outcome": CheckOutcome.DIFFERS,
             "expected": "the link stays up",
@@ -111,16 +115,16 @@ def _run(camera: CameraUnderTest, item: Item) -> dict[str, Any]:
     return {"outcome": CheckOutcome.AS_DOCUMENTED, "text": value or ""}
 
 
-def _unfit(camera: CameraUnderTest, item: Item) -> str:
+def _reason_not_applicable(camera: CameraUnderTest, item: Item) -> str:
     """Return the reason why a check does not apply here, "" if it applies."""
     try:
         dialect = camera.dialect
     except Differs as exc:
         if item.name == CONNECT_CHECK:
             raise
-        raise NotObserved(f"the camera answers in no dialect: {exc.came}") from exc
-    if camera.gone and item.name != CONNECT_CHECK and dialect in item.dialects:
-        raise NotObserved(f"the camera is gone: {camera.gone}")
+        raise NotObserved(f"the camera answers in no dialect: {exc.observed}") from exc
+    if camera.gone_reason and item.name != CONNECT_CHECK and dialect in item.dialects:
+        raise NotObserved(f"the camera is gone: {camera.gone_reason}")
     if dialect not in item.dialects:
         return f"only in {' and '.join(item.dialects)}; this camera speaks {dialect}"
     if camera.transport not in item.transports:

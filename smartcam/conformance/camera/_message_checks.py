@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam.conformance._dialects import SMART
 from smartcam.conformance.camera._results import check
 from smartcam.conformance.camera._verdicts import Differs
-from smartcam.conformance.camera._wire import of_kind
+from smartcam.conformance.camera._wire import frames_with_id
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
 
@@ -17,8 +17,12 @@ if TYPE_CHECKING:
 UNKNOWN_ID = 0x7F
 """A message id that is in no table."""
 
-_IGNORED = {"": "SC-A28, MV25, published", "b16": "KB-seq, published", "bid": "ID-b 206, published"}
-_BODIES = {
+_IGNORED_SOURCES = {
+    "": "SC-A28, MV25, published",
+    "b16": "KB-seq, published",
+    "bid": "ID-b 206, published",
+}
+_BODY_SOURCES = {
     "": "SC-A29 to SC-B34, MV27, MV29, published",
     "b16": "the bodies of the dialects with 32 bits narrowed, inferred",
     "bid": "ID-a 226 to 232, ID-b 210 to 221, published",
@@ -27,63 +31,74 @@ _BODIES = {
 
 def wrong_magic(camera: CameraUnderTest) -> bytes:
     """Return a Query with every bit of its magic number inverted."""
-    frame = camera.wire.request(m.Query())
+    frame = camera.wire.encode_request(m.Query())
     size = len(camera.wire.magic)
     return bytes(byte ^ 0xFF for byte in frame[:size]) + frame[size:]
 
 
-def _ignored(camera: CameraUnderTest, label: str, *data: bytes) -> None:
-    """Check that the camera ignores these bytes and answers a Query after them once."""
+def _check_ignored(camera: CameraUnderTest, label: str, *data: bytes) -> None:
+    """Check that the camera does not answer these bytes, and answers the next Query once."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.received)
+        start_index = len(client.received)
         client.write(*data)
         client.fence()
         client.listen(camera.options.quiet)
-        frames = [each for each in client.received[mark:] if each.message_id != MessageId.STATUS]
-        results = of_kind(frames, MessageId.RESULT_CONTAINER)
+        frames = [
+            each for each in client.received[start_index:] if each.message_id != MessageId.STATUS
+        ]
+        results = frames_with_id(frames, MessageId.RESULT_CONTAINER)
         if len(frames) - len(results) != 1:
-            raise Differs(f"no answer to {label}, one to the Query after it", client.words(mark))
+            raise Differs(
+                f"no answer to {label}, one to the Query after it",
+                client.describe_received(start_index),
+            )
 
 
-@check(_IGNORED, dialects=SMART)
+@check(_IGNORED_SOURCES, dialects=SMART)
 def unknown_id_is_ignored(camera: CameraUnderTest) -> None:
     """A message with an unknown id is not answered, and what follows it is."""
-    _ignored(camera, "an unknown id", camera.wire.frame(UNKNOWN_ID, bytes(camera.wire.word)))
+    _check_ignored(
+        camera, "an unknown id", camera.wire.make_frame(UNKNOWN_ID, bytes(camera.wire.word_size))
+    )
 
 
-@check(_IGNORED, dialects=SMART)
+@check(_IGNORED_SOURCES, dialects=SMART)
 def long_body_is_ignored(camera: CameraUnderTest) -> None:
     """A Query with a body is not answered, and what follows it is."""
-    body = bytes(camera.wire.word)
-    _ignored(camera, "a Query with a body", camera.wire.frame(MessageId.QUERY_APPLICATION, body))
+    body = bytes(camera.wire.word_size)
+    _check_ignored(
+        camera, "a Query with a body", camera.wire.make_frame(MessageId.QUERY_APPLICATION, body)
+    )
 
 
-@check(_IGNORED, dialects=SMART)
+@check(_IGNORED_SOURCES, dialects=SMART)
 def short_body_is_ignored(camera: CameraUnderTest) -> None:
     """A switch without an id is not answered, and what follows it is."""
-    _ignored(camera, "a switch without an id", camera.wire.frame(MessageId.SWITCH_APPLICATION))
+    _check_ignored(
+        camera, "a switch without an id", camera.wire.make_frame(MessageId.SWITCH_APPLICATION)
+    )
 
 
-@check(_IGNORED, dialects=("handbook", "thesis"), transports=("udp",))
+@check(_IGNORED_SOURCES, dialects=("handbook", "thesis"), transports=("udp",))
 def wrong_magic_is_ignored(camera: CameraUnderTest) -> None:
     """A datagram with a wrong magic number is not answered, and what follows it is."""
-    _ignored(camera, "a wrong magic number", wrong_magic(camera))
+    _check_ignored(camera, "a wrong magic number", wrong_magic(camera))
 
 
-@check(_IGNORED, transports=("udp",))
+@check(_IGNORED_SOURCES, transports=("udp",))
 def broken_datagram_is_ignored(camera: CameraUnderTest) -> None:
     """Datagrams that are cut, or whose length is wrong, are not answered."""
-    _ignored(
+    _check_ignored(
         camera,
         "datagrams that are not one whole frame",
-        camera.wire.frame(MessageId.QUERY_APPLICATION, length=camera.wire.word),
-        camera.wire.request(m.Query())[:-1],
+        camera.wire.make_frame(MessageId.QUERY_APPLICATION, length=camera.wire.word_size),
+        camera.wire.encode_request(m.Query())[:-1],
     )
 
 
 @check(
-    _BODIES,
+    _BODY_SOURCES,
     about="every message that came has a known id and the documented length; commands that "
     "have no answer have none",
 )
@@ -94,5 +109,5 @@ def only_documented_messages_came(camera: CameraUnderTest) -> None:
     if camera.flaws:
         raise Differs(
             "only messages and lengths that are documented",
-            "; ".join(f"{flaw} ({shown})" for flaw, shown in camera.flaws.items()),
+            "; ".join(f"{flaw} ({frame_text})" for flaw, frame_text in camera.flaws.items()),
         )

@@ -1,6 +1,6 @@
-"""Observe events that several checks need: inspections, switches, a reboot.
+"""Observations that several checks use: inspections, switches, a restart.
 
-Each observation is made at most once for a camera, since inspections take time.
+Inspections take time, so each observation is made only once for a camera.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import time
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from smartcam.conformance.camera._options import Allow
-from smartcam.conformance.camera._raw_client import EndedError, RawClient
+from smartcam.conformance.camera._raw_client import LinkClosedError, RawClient
 from smartcam.conformance.camera._verdicts import Differs, NotObserved, Undescribed
-from smartcam.conformance.camera._wire import of_kind
+from smartcam.conformance.camera._wire import frames_with_id
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 INSPECTION_COUNT = 3
-"""Number of observed inspections; several show whether the order of messages varies."""
+"""Number of observed inspections: more than one, to see whether the order of messages varies."""
 
 REBOOT_POLL_INTERVAL = 0.25
 """Largest number of seconds between two Connects to a camera that restarts."""
 
 
-def _once(observe: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest], T]:
-    """Make an observation at most once for a camera; an exception is raised again each time."""
+def _observe_once(observation: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest], T]:
+    """Make an observation once for a camera; later calls return, or raise, the same again."""
 
-    @functools.wraps(observe)
+    @functools.wraps(observation)
     def observed(camera: CameraUnderTest) -> T:
-        return camera.once(observe.__name__, lambda: observe(camera))
+        return camera.observe_once(observation.__name__, lambda: observation(camera))
 
     return observed
 
@@ -46,124 +46,144 @@ class ObservedRun(NamedTuple):
 
     sent_at: float  # time of sending
     frames: list[ReceivedFrame]  # frames until the camera waited for the next trigger
-    under_way: int | None  # status word, asked for right after the trigger; ``bid`` only
-    word: int  # size of a number, bytes
-    waiting: int  # mask of Waiting for Trigger
+    status_under_way: int | None  # answer to Get status right after the trigger; ``bid`` only
+    word_size: int  # size of a number, bytes
+    waiting_mask: int  # mask of Waiting for Trigger
 
     @property
     def results(self) -> list[ReceivedFrame]:
         """The result containers."""
-        return of_kind(self.frames, MessageId.RESULT_CONTAINER)
+        return frames_with_id(self.frames, MessageId.RESULT_CONTAINER)
 
-    def places(self) -> tuple[int | None, int | None, int | None]:
-        """Return the places where Waiting ended, the first result came, and Waiting began again."""
-        fell = result = rose = None
-        for place, frame in enumerate(self.frames):
-            if frame.message_id == MessageId.RESULT_CONTAINER and result is None:
-                result = place
+    def transition_indices(self) -> tuple[int | None, int | None, int | None]:
+        """Return indices of the frames in which Waiting fell, the result came, and Waiting rose."""
+        fall_index = result_index = rise_index = None
+        for index, frame in enumerate(self.frames):
+            if frame.message_id == MessageId.RESULT_CONTAINER and result_index is None:
+                result_index = index
             elif frame.message_id == MessageId.STATUS:
-                set_ = int.from_bytes(frame.body[: self.word], "little") & self.waiting
-                if not set_ and fell is None:
-                    fell = place
-                elif set_ and fell is not None and rose is None:
-                    rose = place
-        return fell, result, rose
+                is_waiting = (
+                    int.from_bytes(frame.body[: self.word_size], "little") & self.waiting_mask
+                )
+                if not is_waiting and fall_index is None:
+                    fall_index = index
+                elif is_waiting and fall_index is not None and rise_index is None:
+                    rise_index = index
+        return fall_index, result_index, rise_index
 
 
-@_once
-def inspections(camera: CameraUnderTest) -> list[ObservedRun]:
-    """Trigger a few times, one after the other.
+@_observe_once
+def observe_inspections(camera: CameraUnderTest) -> list[ObservedRun]:
+    """Trigger ``INSPECTION_COUNT`` times, one after the other.
 
     Raises:
-        NotObserved: nothing may be triggered, or the application runs without triggers.
-        Differs: the camera takes no trigger.
+        NotObserved: triggers are not allowed, or the application runs without triggers.
+        Differs: the camera does not start or load the application, or sends no status.
     """
-    camera.require(Allow.TRIGGER)
+    camera.require_allowed(Allow.TRIGGER)
     runs: list[ObservedRun] = []
     with camera.session() as client:
         for _ in range(INSPECTION_COUNT):
-            camera.ready(client)
+            camera.ensure_ready(client)
             runs.append(_inspect_once(camera, client))
     times = [run.results[0].at - run.sent_at for run in runs if run.results]
     if times:
-        camera.measured["trigger until result"] = max(times)
+        camera.measured_times["trigger until result"] = max(times)
     return runs
 
 
 def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
-    mark, under_way = len(client.received), None
-    waiting, word = camera.wire.bits.waiting, camera.wire.word
+    start_index, status_under_way = len(client.received), None
+    waiting_mask, word_size = camera.wire.bits.waiting, camera.wire.word_size
     sent_at = client.send(m.Trigger())
     if camera.wire.is_bid:
         client.send(m.GetStatus())
-        answer = client.until(
-            MessageId.STATUS, camera.options.timeout, "an answer to Get status", mark=mark
+        answer = client.wait_for_frame(
+            MessageId.STATUS,
+            camera.options.timeout,
+            "an answer to Get status",
+            start_index=start_index,
         )
-        under_way = camera.wire.numbers(answer.body)[0]
-        _wait_result(camera, client, mark)
+        status_under_way = camera.wire.read_numbers(answer.body)[0]
+        _wait_result(camera, client, start_index)
         client.wait_status(
-            lambda status: status & waiting,
+            lambda status: status & waiting_mask,
             camera.options.timeout,
             "a status with Waiting for Trigger",
         )
-        return ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
+        return ObservedRun(
+            sent_at, client.received[start_index:], status_under_way, word_size, waiting_mask
+        )
     deadline = sent_at + camera.options.timeout
-    while (left := deadline - time.monotonic()) > 0:
-        so_far = ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
-        if None not in so_far.places():
+    while (remaining := deadline - time.monotonic()) > 0:
+        run = ObservedRun(
+            sent_at, client.received[start_index:], status_under_way, word_size, waiting_mask
+        )
+        if None not in run.transition_indices():
             break
-        inspected = so_far.places()[2] is not None  # a result may still come
-        if client.next(min(left, camera.options.quiet) if inspected else left) is None:
+        waits_again = run.transition_indices()[2] is not None  # a result may still come
+        if (
+            client.next_frame(min(remaining, camera.options.quiet) if waits_again else remaining)
+            is None
+        ):
             break
-    return ObservedRun(sent_at, client.received[mark:], under_way, word, waiting)
+    return ObservedRun(
+        sent_at, client.received[start_index:], status_under_way, word_size, waiting_mask
+    )
 
 
-def _wait_result(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
-    """Wait for a result as long as one may take."""
+def _wait_result(camera: CameraUnderTest, client: RawClient, start_index: int) -> None:
+    """Wait until a result has come, or until the timeout for one."""
     deadline = time.monotonic() + camera.options.timeout
-    while (left := deadline - time.monotonic()) > 0:
-        if of_kind(client.received[mark:], MessageId.RESULT_CONTAINER):
+    while (remaining := deadline - time.monotonic()) > 0:
+        if frames_with_id(client.received[start_index:], MessageId.RESULT_CONTAINER):
             return
-        client.next(left)
+        client.next_frame(remaining)
 
 
-@_once
-def unasked(camera: CameraUnderTest) -> ObservedRun:
-    """Trigger once without asking for anything, so that all statuses are unasked.
+@_observe_once
+def observe_unasked_statuses(camera: CameraUnderTest) -> ObservedRun:
+    """Trigger once and send nothing else, so that every status comes unasked.
 
-    For ``bid``, for which :func:`inspections` asks. Raises the same; NotObserved if no result
-    comes.
+    It is for ``bid``, since :func:`observe_inspections` sends Get status there. Raises as that
+    function does, and NotObserved if no result comes.
     """
     inspection_time(camera)  # raises if there are no results
     with camera.session() as client:
-        camera.ready(client)
-        mark = len(client.received)
+        camera.ensure_ready(client)
+        start_index = len(client.received)
         sent_at = client.send(m.Trigger())
-        _wait_result(camera, client, mark)
-        client.listen(camera.patience)
-        seen = ObservedRun(
-            sent_at, client.received[mark:], None, camera.wire.word, camera.wire.bits.waiting
+        _wait_result(camera, client, start_index)
+        client.listen(camera.silence_timeout)
+        run = ObservedRun(
+            sent_at,
+            client.received[start_index:],
+            None,
+            camera.wire.word_size,
+            camera.wire.bits.waiting,
         )
-        if not seen.results:
-            raise NotObserved(f"no result came of a trigger: {client.words(mark)}")
-        return seen
+        if not run.results:
+            raise NotObserved(
+                f"no result came of a trigger: {client.describe_received(start_index)}"
+            )
+        return run
 
 
-@_once
+@_observe_once
 def inspection_time(camera: CameraUnderTest) -> float:
-    """Return the time of the longest inspection, from trigger to result, seconds.
+    """Return the seconds from trigger to result of the longest observed inspection.
 
     Raises:
         NotObserved: no result comes from this application.
     """
-    inspections(camera)
-    longest = camera.measured.get("trigger until result")
+    observe_inspections(camera)
+    longest = camera.measured_times.get("trigger until result")
     if longest is None:
         raise NotObserved(f"application {camera.application} sends no results")
     return longest
 
 
-def no_id(camera: CameraUnderTest) -> bool:
+def has_no_id(camera: CameraUnderTest) -> bool:
     """Return True if result containers do not begin with the application's id, as in some ``b16``.
 
     Raises:
@@ -173,139 +193,142 @@ def no_id(camera: CameraUnderTest) -> bool:
     inspection_time(camera)  # raises if there are no results
     if camera.dialect != "b16":
         return False
-    first = [
-        int.from_bytes(inspection.results[0].body[: camera.wire.word], "little")
-        for inspection in inspections(camera)
+    first_words = [
+        int.from_bytes(inspection.results[0].body[: camera.wire.word_size], "little")
+        for inspection in observe_inspections(camera)
         if inspection.results
     ]
-    absent = camera.application not in first
-    if not absent and len(set(first)) > 1:
-        raise Undescribed("the same id in front of each result", str(first))
-    camera.learn_quirk("no_id", on=absent)
-    return absent
+    is_absent = camera.application not in first_words
+    if not is_absent and len(set(first_words)) > 1:
+        raise Undescribed("the same id at the beginning of each result", str(first_words))
+    camera.learn_quirk("no_id", is_present=is_absent)
+    return is_absent
 
 
-# ---------------------------------------------------------------------- triggers too many
+# ---------------------------------------------------------------------- ignored triggers
 
 
 class DoubleTrigger(NamedTuple):
     """Two triggers at once and their outcome."""
 
     results: int  # number of results that came
-    rose_at: float | None  # time of the status with Overtriggered; None without one
-    fell_at: float | None  # time of the status without it
+    rose_at: float | None  # time of the first status with Overtriggered, None if none came
+    fell_at: float | None  # time of the next status without Overtriggered, None if none came
     text: str  # observation in words
 
 
-def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
-    """Trigger twice at once and watch Overtriggered; raises as :func:`inspections`.
+def observe_double_trigger(camera: CameraUnderTest) -> DoubleTrigger:
+    """Trigger twice at once and follow Overtriggered; raises as :func:`observe_inspections`.
 
-    For cameras that send their status unasked.
+    The camera has to send its status unasked.
     """
-    takes = inspection_time(camera)
+    inspection_seconds = inspection_time(camera)
     bits, rose_at, fell_at = camera.wire.bits, None, None
     with camera.session() as client:
-        camera.ready(client)
-        mark = len(client.received)
+        camera.ensure_ready(client)
+        start_index = len(client.received)
         client.send(m.Trigger(), m.Trigger())
         client.fence()
-        deadline, place = time.monotonic() + 2 * takes + camera.options.quiet, mark
+        deadline, index = (
+            time.monotonic() + 2 * inspection_seconds + camera.options.quiet,
+            start_index,
+        )
         while fell_at is None:
-            if place == len(client.received):
-                left = deadline - time.monotonic()
-                if left <= 0 or client.next(left) is None:
+            if index == len(client.received):
+                remaining = deadline - time.monotonic()
+                if remaining <= 0 or client.next_frame(remaining) is None:
                     break
-            frame, place = client.received[place], place + 1
+            frame, index = client.received[index], index + 1
             if frame.message_id != MessageId.STATUS:
                 continue
-            if not camera.wire.numbers(frame.body)[0] & bits.overtriggered:
+            if not camera.wire.read_numbers(frame.body)[0] & bits.overtriggered:
                 fell_at = None if rose_at is None else frame.at
             elif rose_at is None:
                 rose_at = frame.at
                 deadline = rose_at + camera.options.timeout
-        client.listen(takes)
-        results = len(of_kind(client.received[mark:], MessageId.RESULT_CONTAINER))
-        return DoubleTrigger(results, rose_at, fell_at, client.words(mark))
+        client.listen(inspection_seconds)
+        results = len(frames_with_id(client.received[start_index:], MessageId.RESULT_CONTAINER))
+        return DoubleTrigger(results, rose_at, fell_at, client.describe_received(start_index))
 
 
-class Stopped(NamedTuple):
+class StoppedTrigger(NamedTuple):
     """A trigger to a stopped camera and its outcome."""
 
     frames: list[ReceivedFrame]
     text: str  # observation in words
 
 
-@_once
-def stopped_trigger(camera: CameraUnderTest) -> Stopped:
-    """Trigger a stopped camera; raises as :func:`inspections`."""
-    camera.require(Allow.RUN | Allow.TRIGGER)
-    takes = inspection_time(camera)
+@_observe_once
+def observe_stopped_trigger(camera: CameraUnderTest) -> StoppedTrigger:
+    """Trigger a stopped camera; raises as :func:`observe_inspections`."""
+    camera.require_allowed(Allow.RUN | Allow.TRIGGER)
+    inspection_seconds = inspection_time(camera)
     with camera.session() as client:
-        camera.stop(client)
-        mark = len(client.received)
+        camera.ensure_stopped(client)
+        start_index = len(client.received)
         client.send(m.Trigger())
-        frames = client.listen(takes + camera.options.quiet)
-        return Stopped(frames, client.words(mark))
+        frames = client.listen(inspection_seconds + camera.options.quiet)
+        return StoppedTrigger(frames, client.describe_received(start_index))
 
 
 # ---------------------------------------------------------------------- switch, reboot
 
 
-class Switch(NamedTuple):
+class ObservedSwitch(NamedTuple):
     """A switch and its outcome."""
 
     application: int  # application that was asked for
-    frames: list[ReceivedFrame]  # the frames until the answer and the status that is not busy
+    frames: list[ReceivedFrame]  # frames until the answer and a status without BUSY
     answer: ReceivedFrame
     active: int  # application that Query reported afterwards
     seconds: float  # seconds from the request to the answer
 
 
-@_once
-def switch(camera: CameraUnderTest) -> Switch:
+@_observe_once
+def observe_switch(camera: CameraUnderTest) -> ObservedSwitch:
     """Load the other application on a stopped camera.
 
     Raises:
         NotObserved: no application was named, or loading is not allowed.
         Differs: no answer comes.
     """
-    camera.require(Allow.SWITCH)
+    camera.require_allowed(Allow.SWITCH)
     other = camera.options.other_application
     if other is None:
         raise NotObserved("no other application was named: --camera-other-application")
     with camera.session() as client:
-        if camera.active(client) == other:
-            camera.load(client, camera.application)
-        if camera.active(client) == other:
+        if camera.active_application(client) == other:
+            camera.load_application(client, camera.application)
+        if camera.active_application(client) == other:
             raise NotObserved(f"application {other} is the active one: name another application")
-        camera.stop(client)
-        mark, began = len(client.received), time.monotonic()
-        answer = client.answer(
-            m.SwitchApplication(application=other), within=camera.options.switch_timeout
+        camera.ensure_stopped(client)
+        start_index, started_at = len(client.received), time.monotonic()
+        answer = client.ask(
+            m.SwitchApplication(application=other), timeout=camera.options.switch_timeout
         )
-        took = answer.at - began
-        _wait_not_busy(camera, client, mark)
-        frames = client.received[mark:]
-        camera.measured["switch"] = took
-        return Switch(other, frames, answer, camera.active(client), took)
+        seconds = answer.at - started_at
+        _wait_until_not_busy(camera, client, start_index)
+        frames = client.received[start_index:]
+        camera.measured_times["switch"] = seconds
+        return ObservedSwitch(other, frames, answer, camera.active_application(client), seconds)
 
 
-def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
+def _wait_until_not_busy(camera: CameraUnderTest, client: RawClient, start_index: int) -> None:
     """Wait for a status without BUSY if the last one had it."""
     busy = camera.wire.bits.busy
-    words = camera.wire.statuses(client.received[mark:])
+    words = camera.wire.status_words(client.received[start_index:])
     if busy and any(word & busy for word in words) and words[-1] & busy:
-        client.until(
+        client.wait_for_frame(
             lambda frame: (
                 frame.message_id == MessageId.STATUS
-                and not camera.wire.numbers(frame.body)[0] & busy
+                and not camera.wire.read_numbers(frame.body)[0] & busy
             ),
             camera.options.timeout,
             "a status without BUSY after the switch",
         )
 
 
-class Downtime(NamedTuple):
+class ObservedRestart(NamedTuple):
     """A restart."""
 
     seconds: float  # seconds from the request to the first answered Connect
@@ -313,40 +336,44 @@ class Downtime(NamedTuple):
     running: bool  # run mode afterwards
 
 
-@_once
-def downtime(camera: CameraUnderTest) -> Downtime:
+@_observe_once
+def observe_restart(camera: CameraUnderTest) -> ObservedRestart:
     """Restart the camera and wait until it answers again.
 
     Raises:
         NotObserved: a restart is not allowed.
         Differs: the camera does not go away, or does not come back.
     """
-    camera.require(Allow.REBOOT)
+    camera.require_allowed(Allow.REBOOT)
     with camera.session() as client:
-        began = client.send(m.Reboot())
-        _wait_gone(camera, client)
-    deadline = began + camera.options.reboot_timeout
+        started_at = client.send(m.Reboot())
+        _wait_until_gone(camera, client)
+    deadline = started_at + camera.options.reboot_timeout
     while time.monotonic() < deadline:
         tried_at = time.monotonic()
-        if _answers(camera):
-            seconds = time.monotonic() - began
+        if _is_connect_answered(camera):
+            seconds = time.monotonic() - started_at
             with camera.session() as client:
-                return Downtime(seconds, camera.active(client), camera.running(client))
+                return ObservedRestart(
+                    seconds, camera.active_application(client), camera.is_running(client)
+                )
         time.sleep(
             max(0.0, tried_at + min(REBOOT_POLL_INTERVAL, camera.options.quiet) - time.monotonic())
         )
-    camera.gone = f"it did not come back within {camera.options.reboot_timeout:g} s of a reboot"
-    raise Differs("the camera is back after a reboot", camera.gone)
+    camera.gone_reason = (
+        f"it did not come back within {camera.options.reboot_timeout:g} s of a reboot"
+    )
+    raise Differs("the camera is back after a reboot", camera.gone_reason)
 
 
-def _wait_gone(camera: CameraUnderTest, client: RawClient) -> None:
+def _wait_until_gone(camera: CameraUnderTest, client: RawClient) -> None:
     deadline = time.monotonic() + camera.options.timeout
     try:
         while time.monotonic() < deadline:
             client.send(m.Query())
-            if client.next(camera.patience) is None:
+            if client.next_frame(camera.silence_timeout) is None:
                 return
-    except EndedError:
+    except LinkClosedError:
         return
     raise Differs(
         "the camera restarts: the session ends",
@@ -354,11 +381,11 @@ def _wait_gone(camera: CameraUnderTest, client: RawClient) -> None:
     )
 
 
-def _answers(camera: CameraUnderTest) -> bool:
-    """Return True if a Connect is answered now."""
+def _is_connect_answered(camera: CameraUnderTest) -> bool:
+    """Return True if the camera answers a Connect now."""
     try:
         with camera.link() as client:
-            client.answer(m.Connect(), within=max(camera.options.quiet, REBOOT_POLL_INTERVAL))
-    except (NotObserved, Differs, EndedError):
+            client.ask(m.Connect(), timeout=max(camera.options.quiet, REBOOT_POLL_INTERVAL))
+    except (NotObserved, Differs, LinkClosedError):
         return False
     return True

@@ -40,13 +40,13 @@ class Allow(enum.Flag):
     TRIGGER = enum.auto()
     """Inspect; devices at the camera's outputs react."""
     SWITCH = enum.auto()
-    """Load an application; the one from before is loaded again."""
+    """Load an application; the application that was active before is loaded again."""
     CLOCK = enum.auto()
     """Set the clock; restored to the second."""
     NUMBER = enum.auto()
     """Set the number of the next run, which cannot be read, and so not be restored."""
     INPUT = enum.auto()
-    """Send input data; the queue is left empty, or out of step until the application is loaded."""
+    """Send input data; the camera's queue may keep data until an application is loaded."""
     ERRORS = enum.auto()
     """Reset error bits that stay set; they cannot be restored."""
     REBOOT = enum.auto()
@@ -54,7 +54,7 @@ class Allow(enum.Flag):
 
     @classmethod
     def read(cls, text: str) -> Allow:
-        """Read a list with commas: names add to the three defaults, ``nothing`` removes those.
+        """Read names with commas: they are added to the defaults, which ``nothing`` removes.
 
         Raises:
             ConfigurationError: a name is unknown.
@@ -84,16 +84,16 @@ class ConformanceOptions:
     """The options of a judgement. Times are seconds.
 
     Attributes:
-        url: the camera's address; a dialect that is not in it is found out.
+        url: the camera's address; if it does not name the dialect, the dialect is found out.
         application: id of the application to trigger, None for the active one.
         other_application: id of another application that may be loaded, None for none.
         allow: actions that are allowed at the camera.
         timeout: longest time for an answer, a status or a result.
-        quiet: time without a message for which a silent camera is listened to.
+        quiet: time without a message after which the camera counts as silent.
         switch_timeout: longest time for loading an application.
         reboot_timeout: longest time for a restart.
-        sequence_offset: place of the sequence number, an int32, in the application's results,
-            counted after the application's id; None if they have none.
+        sequence_offset: offset of the sequence number, an int32, in the application's results,
+            counted from the end of the application's id; None if the results have no number.
         input_data: input data that the application accepts, None for none.
 
     Raises:
@@ -137,14 +137,14 @@ class ConformanceOptions:
             )
 
 
-def _read_hex(text: str) -> bytes:
+def _parse_hex(text: str) -> bytes:
     try:
         return bytes.fromhex(text)
     except ValueError as exc:
         raise ConfigurationError(f"--camera-input: {text!r} is not hex: {exc}") from exc
 
 
-READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
+OPTION_PARSERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "--camera-application": ("application", int),
     "--camera-other-application": ("other_application", int),
     "--camera-allow": ("allow", Allow.read),
@@ -153,6 +153,6 @@ READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "--camera-switch-timeout": ("switch_timeout", float),
     "--camera-reboot-timeout": ("reboot_timeout", float),
     "--camera-sequence-offset": ("sequence_offset", int),
-    "--camera-input": ("input_data", _read_hex),
+    "--camera-input": ("input_data", _parse_hex),
 }
-"""Field of each option of the command line, and the function that reads the option."""
+"""Field of :class:`ConformanceOptions` for each command-line option, and the option's parser."""

@@ -1,4 +1,4 @@
-"""A link to the camera: a socket, a deadline for every wait, a record of every message."""
+"""A link to the camera: a socket, with a timeout for each wait and a log of all messages."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from typing import Self
 
 MAX_RECEIVED_BYTES = 1 << 24
-"""Largest number of bytes of bodies that one client keeps: 256 of the largest results. More end the
-experiment."""
+"""Largest number of bytes of bodies that one client keeps: 256 of the largest results. More bytes
+end the experiment."""
 
-MAX_TRAIL = 60
-"""Largest number of lines of the record that a report shows: the last ones."""
+MAX_LOG_LINES = 60
+"""Largest number of lines of the message log that a report shows: the last ones."""
 
 CLOSE_TIMEOUT = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""
@@ -33,7 +33,7 @@ STATUS_POLL_INTERVAL = 0.01
 """Seconds between two requests for a status that does not come unasked."""
 
 
-class EndedError(Exception):
+class LinkClosedError(Exception):
     """The camera has closed the link, or is gone."""
 
 
@@ -44,41 +44,41 @@ class RawClient:
     Leaving it sends Disconnect if there may be a session, and closes the socket.
 
     Raises:
-        OSError: no connection.
+        OSError: there is no connection.
     """
 
     wire: RawDialect
     _address: tuple[str, int]
     _tcp: bool
     _timeout: float  # seconds for the connection, and for an answer
-    _quiet: float  # seconds of silence that count as no answer
-    _trail: deque[str]  # record of all messages
+    _quiet: float  # seconds without a message that count as no answer
+    _message_log: deque[str]  # record of all messages
     _on_change: Callable[[], None]  # called before a message that changes the camera's state
 
     def __post_init__(self) -> None:
         self.received: list[ReceivedFrame] = []  # every frame that came, in order
         self.status: int | None = None  # the last status word, None if none came
         self.ended: bool = False  # the camera has ended the link
-        self._began = time.monotonic()
+        self._opened_at = time.monotonic()
         self._buffer = b""
-        self._kept = 0
+        self._received_bytes = 0
         self._may_have_session = False
         self._socket = self._open()
 
     def _open(self) -> socket.socket:
         if self._tcp:
-            opened = socket.create_connection(self._address, timeout=self._timeout)
-            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return opened
+            sock = socket.create_connection(self._address, timeout=self._timeout)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return sock
         addresses = socket.getaddrinfo(*self._address, type=socket.SOCK_DGRAM)
-        family, kind, proto, _, where = addresses[0]
-        opened = socket.socket(family, kind, proto)
+        family, kind, proto, _, address = addresses[0]
+        sock = socket.socket(family, kind, proto)
         try:
-            opened.connect(where)
+            sock.connect(address)
         except OSError:
-            opened.close()
+            sock.close()
             raise
-        return opened
+        return sock
 
     def __enter__(self) -> Self:
         return self
@@ -87,25 +87,25 @@ class RawClient:
         self.close()
 
     def close(self) -> None:
-        """End the session if there may be one, and close the socket; bounded."""
-        with contextlib.suppress(OSError, EndedError), self._socket:
+        """End the session if there may be one, and close the socket, within ``CLOSE_TIMEOUT``."""
+        with contextlib.suppress(OSError, LinkClosedError), self._socket:
             if self.ended:
                 return
             if self._may_have_session:
-                self._write(self.wire.request(m.Disconnect()))
+                self._write(self.wire.encode_request(m.Disconnect()))
             if self._tcp:
-                # closing a socket with unread bytes sends a reset, which may overtake
+                # closing a socket with unread bytes sends RST, which may overtake the Disconnect
                 self._socket.shutdown(socket.SHUT_WR)
                 deadline = time.monotonic() + CLOSE_TIMEOUT
-                while (left := deadline - time.monotonic()) > 0:
-                    self._socket.settimeout(left)
+                while (remaining := deadline - time.monotonic()) > 0:
+                    self._socket.settimeout(remaining)
                     if not self._socket.recv(1 << 16):
                         break
 
     # ------------------------------------------------------------------ out
 
     def send(self, *messages: m.Message) -> float:
-        """Send requests, in one write on TCP and a datagram each on UDP; return the time.
+        """Send requests and return the time; TCP gets one write, UDP a datagram for each request.
 
         Raises:
             EndedError: the link is down.
@@ -115,51 +115,51 @@ class RawClient:
                 self._may_have_session = True
             elif isinstance(message, m.Disconnect):
                 self._may_have_session = False
-            elif isinstance(message, _CHANGES):
+            elif isinstance(message, _STATE_CHANGES):
                 self._on_change()
-        return self.write(*[self.wire.request(message) for message in messages])
+        return self.write(*[self.wire.encode_request(message) for message in messages])
 
     def write(self, *data: bytes) -> float:
-        """Send any bytes; as :meth:`send`."""
+        """Send any bytes, and return the time as :meth:`send` does."""
         for frame in data:
-            self._note(">", self.wire.spell_request(frame))
-        at = time.monotonic()
+            self._note(">", self.wire.describe_request(frame))
+        sent_at = time.monotonic()
         for frame in [b"".join(data)] if self._tcp else data:
             self._write(frame)
-        return at
+        return sent_at
 
     def _write(self, data: bytes) -> None:
         if self.ended:
-            raise EndedError("the camera has ended the link")
+            raise LinkClosedError("the camera has ended the link")
         self._socket.settimeout(self._timeout)
         try:
             self._socket.sendall(data)
         except OSError as exc:
-            raise self._end(exc) from exc
+            raise self._mark_ended(exc) from exc
 
     # ------------------------------------------------------------------ in
 
-    def next(self, within: float) -> ReceivedFrame | None:
-        """Return the next frame, None if none comes within so many seconds.
+    def next_frame(self, timeout: float) -> ReceivedFrame | None:
+        """Return the next frame, None if none comes within ``timeout`` seconds.
 
         Raises:
             EndedError: the camera ends the link.
             Differs: the camera sends bytes that make no frame.
         """
-        deadline = time.monotonic() + within
+        deadline = time.monotonic() + timeout
         while True:
-            frame = self._cut()
+            frame = self._take_frame()
             if frame is not None:
                 return frame
-            left = deadline - time.monotonic()
-            if left <= 0 or not self._receive(left):
+            remaining = deadline - time.monotonic()
+            if remaining <= 0 or not self._receive(remaining):
                 return None
 
-    def _cut(self) -> ReceivedFrame | None:
+    def _take_frame(self) -> ReceivedFrame | None:
         if not self._buffer:
             return None
         try:
-            parts = self.wire.cut(self._buffer)
+            parts = self.wire.parse_frame(self._buffer)
             if not self._tcp and (parts is None or parts[2] != len(self._buffer)):
                 raise BadBytesError(
                     f"a datagram is not one whole frame: {hex_excerpt(self._buffer)}"
@@ -173,119 +173,124 @@ class RawClient:
         message_id, body, size = parts
         self._buffer = self._buffer[size:]
         frame = ReceivedFrame(time.monotonic(), message_id, body)
-        self._note("<", self.wire.spell(frame))
-        self._kept += len(body)
-        if self._kept > MAX_RECEIVED_BYTES:
+        self._note("<", self.wire.describe(frame))
+        self._received_bytes += len(body)
+        if self._received_bytes > MAX_RECEIVED_BYTES:
             raise NotObserved(f"the camera sent more than {MAX_RECEIVED_BYTES} bytes meanwhile")
         self.received.append(frame)
-        if message_id == MessageId.STATUS and len(body) >= self.wire.word:
-            self.status = self.wire.numbers(body)[0]
+        if message_id == MessageId.STATUS and len(body) >= self.wire.word_size:
+            self.status = self.wire.read_numbers(body)[0]
         return frame
 
-    def _receive(self, within: float) -> bool:
+    def _receive(self, timeout: float) -> bool:
         if self.ended:
-            raise EndedError("the camera has ended the link")
-        self._socket.settimeout(within)
+            raise LinkClosedError("the camera has ended the link")
+        self._socket.settimeout(timeout)
         try:
             data = self._socket.recv(1 << 17)
         except TimeoutError:
             return False
         except OSError as exc:
-            raise self._end(exc) from exc
+            raise self._mark_ended(exc) from exc
         if self._tcp and not data:
-            raise self._end(None)
+            raise self._mark_ended(None)
         self._buffer += data
         return True
 
-    def _end(self, exc: OSError | None) -> EndedError:
+    def _mark_ended(self, exc: OSError | None) -> LinkClosedError:
         self.ended = True
-        how = f"the camera has ended the link: {exc or 'it is closed'}"
-        self._note("!", how)
-        return EndedError(how)
+        text = f"the camera has ended the link: {exc or 'it is closed'}"
+        self._note("!", text)
+        return LinkClosedError(text)
 
-    def _note(self, mark: str, text: str) -> None:
-        self._trail.append(f"{time.monotonic() - self._began:8.3f} {mark} {text}")
+    def _note(self, sign: str, text: str) -> None:
+        self._message_log.append(f"{time.monotonic() - self._opened_at:8.3f} {sign} {text}")
 
     # ------------------------------------------------------------------ waits
 
-    def until(
+    def wait_for_frame(
         self,
-        fits: Callable[[ReceivedFrame], object] | int,
-        within: float,
+        wanted: Callable[[ReceivedFrame], object] | int,
+        timeout: float,
         expected: str,
         *,
-        mark: int = -1,
+        start_index: int = -1,
     ) -> ReceivedFrame:
-        """Return the first frame that fits, of those after ``mark`` and those that come now.
+        """Return the first wanted frame among received frames and those that come now.
 
         Args:
-            fits: id of the wanted message, or a function that is true for the wanted frame.
-            within: seconds from now.
+            wanted: id of the wanted message, or a function that is true for the wanted frame.
+            timeout: seconds from now.
             expected: text of the difference if no such frame comes.
-            mark: a length of :attr:`received`; default: only frames that come now.
+            start_index: index of the first frame of :attr:`received` to look at; without it, only
+                frames that come now are looked at.
 
         Raises:
             Differs: the answer does not come in time.
             EndedError: the camera ends the link.
         """
-        is_it = fits if callable(fits) else lambda frame: frame.message_id == fits
-        first = len(self.received) if mark < 0 else mark
-        for frame in self.received[first:]:
-            if is_it(frame):
+        matches = wanted if callable(wanted) else lambda frame: frame.message_id == wanted
+        first_index = len(self.received) if start_index < 0 else start_index
+        for frame in self.received[first_index:]:
+            if matches(frame):
                 return frame
-        deadline = time.monotonic() + within
-        while (left := deadline - time.monotonic()) > 0:
-            heard_now = self.next(left)
-            if heard_now is not None and is_it(heard_now):
-                return heard_now
-        raise Differs(f"{expected} within {within:g} s", self.words(first))
+        deadline = time.monotonic() + timeout
+        while (remaining := deadline - time.monotonic()) > 0:
+            next_frame = self.next_frame(remaining)
+            if next_frame is not None and matches(next_frame):
+                return next_frame
+        raise Differs(f"{expected} within {timeout:g} s", self.describe_received(first_index))
 
-    def answer(self, request: m.Message, *, within: float | None = None) -> ReceivedFrame:
-        """Send a request and return its answer, which has its id; raises as :meth:`until`."""
+    def ask(self, request: m.Message, *, timeout: float | None = None) -> ReceivedFrame:
+        """Send a request, return the next frame with its id; raise as :meth:`wait_for_frame`."""
         message_id = self.wire.dialect.message_id(request)
-        mark = len(self.received)
+        start_index = len(self.received)
         self.send(request)
-        within = self._timeout if within is None else within
-        return self.until(message_id, within, f"an answer to {type(request).__name__}", mark=mark)
+        timeout = self._timeout if timeout is None else timeout
+        return self.wait_for_frame(
+            message_id, timeout, f"an answer to {type(request).__name__}", start_index=start_index
+        )
 
-    def trigger(self, expected: str = "a result", *, within: float | None = None) -> ReceivedFrame:
-        """Send a trigger and return the next result; raises as :meth:`until`."""
-        mark = len(self.received)
+    def trigger(self, expected: str = "a result", *, timeout: float | None = None) -> ReceivedFrame:
+        """Send a trigger and return the next result; raises as :meth:`wait_for_frame`."""
+        start_index = len(self.received)
         self.send(m.Trigger())
-        within = self._timeout if within is None else within
-        return self.until(MessageId.RESULT_CONTAINER, within, expected, mark=mark)
+        timeout = self._timeout if timeout is None else timeout
+        return self.wait_for_frame(
+            MessageId.RESULT_CONTAINER, timeout, expected, start_index=start_index
+        )
 
     def fence(self) -> list[ReceivedFrame]:
-        """Send a Query and return the frames before its answer: all that were on their way.
+        """Send a Query and return the frames that come before its answer.
 
         Raises:
             Differs: the Query is not answered.
             EndedError: the camera ends the link.
         """
-        mark = len(self.received)
-        self.answer(m.Query())
-        return self.received[mark:-1]
+        start_index = len(self.received)
+        self.ask(m.Query())
+        return self.received[start_index:-1]
 
     def listen(self, seconds: float) -> list[ReceivedFrame]:
-        """Return the frames that come in so many seconds; the end of the link ends it."""
-        mark, deadline = len(self.received), time.monotonic() + seconds
-        with contextlib.suppress(EndedError):
-            while (left := deadline - time.monotonic()) > 0:
-                self.next(left)
-        return self.received[mark:]
+        """Return the frames that come in ``seconds``, or until the link ends."""
+        start_index, deadline = len(self.received), time.monotonic() + seconds
+        with contextlib.suppress(LinkClosedError):
+            while (remaining := deadline - time.monotonic()) > 0:
+                self.next_frame(remaining)
+        return self.received[start_index:]
 
-    def words(self, first: int = 0) -> str:
-        """Describe the frames from a place of :attr:`received` on, for a difference."""
-        shown = [self.wire.spell(frame) for frame in self.received[first:]]
-        if len(shown) > 5:
-            shown = [*shown[:4], f"{len(shown) - 4} more"]
+    def describe_received(self, start_index: int = 0) -> str:
+        """Return the frames of :attr:`received` from an index on as text, at most five of them."""
+        texts = [self.wire.describe(frame) for frame in self.received[start_index:]]
+        if len(texts) > 5:
+            texts = [*texts[:4], f"{len(texts) - 4} more"]
         end = ["the end of the link"] if self.ended else []
-        return "; ".join(shown + end) or "nothing"
+        return "; ".join(texts + end) or "nothing"
 
     # ------------------------------------------------------------------ the status
 
-    def look(self) -> int:
-        """Return the present status word: by a request if possible, else the last one.
+    def read_status(self) -> int:
+        """Return the present status word: of ``bid`` on request, of others the last received one.
 
         Raises:
             NotObserved: no status came since Connect.
@@ -298,21 +303,21 @@ class RawClient:
             raise NotObserved("the camera has sent no status")
         return self.status
 
-    def wait_status(self, fits: Callable[[int], object], within: float, expected: str) -> int:
-        """Wait for a status and return it; raises as :meth:`until` and :meth:`look`."""
-        deadline = time.monotonic() + within
-        word = self.look()
-        while not fits(word):
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise Differs(f"{expected} within {within:g} s", f"the status stays {word:#x}")
+    def wait_status(self, is_wanted: Callable[[int], object], timeout: float, expected: str) -> int:
+        """Wait for a wanted status word and return it; raise as :meth:`read_status`, or Differs."""
+        deadline = time.monotonic() + timeout
+        word = self.read_status()
+        while not is_wanted(word):
+            remaining = deadline - time.monotonic()
+            if remaining <= 0:
+                raise Differs(f"{expected} within {timeout:g} s", f"the status stays {word:#x}")
             if self.wire.is_bid:
                 self.listen(STATUS_POLL_INTERVAL)
-                word = self.look()
+                word = self.read_status()
             else:
-                self.next(left)
+                self.next_frame(remaining)
                 word = word if self.status is None else self.status
         return word
 
 
-_CHANGES = (m.Start, m.Stop, m.SwitchApplication, m.Reboot)
+_STATE_CHANGES = (m.Start, m.Stop, m.SwitchApplication, m.Reboot)

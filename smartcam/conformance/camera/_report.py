@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 EQUAL_TIME_SHARE = 0.2
-"""Part by which a measured time may differ from a quirk's default and still count as equal."""
+"""Relative difference up to which a measured time counts as equal to a quirk's default."""
 
 EQUAL_TIME_SECONDS = 0.02
-"""Seconds by which a measured time may differ and still count as equal."""
+"""Difference in seconds up to which a measured time counts as equal to a quirk's default."""
 
 
 class CameraReport:
@@ -39,7 +39,7 @@ class CameraReport:
         self.camera: CameraUnderTest = camera
 
     def add(self, finding: CameraFinding) -> None:
-        """Add the outcome of a check or question; if it is repeated, the last outcome counts."""
+        """Add a finding; it replaces an earlier finding of the same check or question."""
         self.findings = [older for older in self.findings if older.item.name != finding.item.name]
         self.findings.append(finding)
 
@@ -81,19 +81,24 @@ class CameraReport:
 
     def text(self) -> str:
         """Return the report as text for people."""
-        lines = [*self._head(), *self._differences(), *self._answers(), *self._unseen()]
+        lines = [
+            *self._summary_lines(),
+            *self._difference_lines(),
+            *self._answer_lines(),
+            *self._unobserved_lines(),
+        ]
         return "\n".join([*lines, "", *self.yaml().splitlines(), ""])
 
-    def _head(self) -> list[str]:
-        camera, before = self.camera, self.camera.before
+    def _summary_lines(self) -> list[str]:
+        camera, state_before = self.camera, self.camera.state_before
         lines = [f"camera: {self.url}"]
-        if before is not None:
-            run = "in run mode" if before.running else "stopped"
-            lines.append(f"found with application {before.application}, {run}; left so")
-        if camera.left:
-            lines[-1] = f"NOT LEFT AS IT WAS: {camera.left}"
-        if camera.gone:
-            lines.append(f"THE CAMERA IS GONE: {camera.gone}")
+        if state_before is not None:
+            run = "in run mode" if state_before.running else "stopped"
+            lines.append(f"found with application {state_before.application}, {run}; left so")
+        if camera.not_restored:
+            lines[-1] = f"NOT LEFT AS IT WAS: {camera.not_restored}"
+        if camera.gone_reason:
+            lines.append(f"THE CAMERA IS GONE: {camera.gone_reason}")
         count = Counter(
             finding.outcome for finding in self.findings if isinstance(finding.item, Check)
         )
@@ -101,12 +106,14 @@ class CameraReport:
             f"checks: {count[CheckOutcome.AS_DOCUMENTED]} as documented, "
             f"{count[CheckOutcome.DIFFERS]} not, {count[CheckOutcome.NOT_OBSERVED]} not observed"
         )
-        if camera.measured:
-            times = ", ".join(f"{name} {1000 * s:.1f} ms" for name, s in camera.measured.items())
+        if camera.measured_times:
+            times = ", ".join(
+                f"{name} {1000 * s:.1f} ms" for name, s in camera.measured_times.items()
+            )
             lines.append(f"times: {times}")
         return lines
 
-    def _differences(self) -> list[str]:
+    def _difference_lines(self) -> list[str]:
         lines: list[str] = []
         for difference in self.differing:
             lines += [
@@ -118,23 +125,23 @@ class CameraReport:
             ]
         return ["", "differs from the documented device:", *lines] if lines else []
 
-    def _answers(self) -> list[str]:
+    def _answer_lines(self) -> list[str]:
         lines = [
-            f"  {finding.item.name}: {_plain(finding.value)}  "
-            f"({finding.item.about}{_decides(finding)})"
+            f"  {finding.item.name}: {_yaml_text(finding.value)}  "
+            f"({finding.item.about}{_contradictions_text(finding)})"
             for finding in self.findings
             if finding.outcome is CheckOutcome.OBSERVED
         ]
         return ["", "open questions, answered:", *lines] if lines else []
 
-    def _unseen(self) -> list[str]:
+    def _unobserved_lines(self) -> list[str]:
         reasons: dict[str, list[str]] = {}
         for finding in self.findings:
             if finding.outcome is CheckOutcome.NOT_OBSERVED:
                 reasons.setdefault(finding.text, []).append(finding.item.name)
         lines: list[str] = []
-        for why, names in reasons.items():
-            lines.append(f"  because {why}:")
+        for reason, names in reasons.items():
+            lines.append(f"  because {reason}:")
             lines += textwrap.wrap(
                 ", ".join(names),
                 96,
@@ -145,7 +152,7 @@ class CameraReport:
         return ["", "not observed:", *lines] if lines else []
 
     def yaml(self) -> str:
-        """Return the quirks as a part of a scenario file; unobserved ones are comments."""
+        """Return the quirks as a part of a scenario file; quirks without a value are comments."""
         lines: list[str] = []
         for finding in self.findings:
             item = finding.item
@@ -153,7 +160,7 @@ class CameraReport:
                 continue
             if finding.outcome is CheckOutcome.OBSERVED:
                 note = "  # as in the emulator" if _is_default(item.quirk, finding.value) else ""
-                lines.append(f"  {item.quirk}: {_plain(finding.value)}{note}")
+                lines.append(f"  {item.quirk}: {_yaml_text(finding.value)}{note}")
             elif finding.outcome is not CheckOutcome.NOT_APPLICABLE:
                 comment = "no setting fits" if finding.failed else "not observed"
                 lines.append(f"  # {item.quirk}: {comment}")
@@ -165,17 +172,17 @@ class CameraReport:
 
     def as_json(self) -> dict[str, Any]:
         """Return the report as values for JSON."""
-        camera, before = self.camera, self.camera.before
+        camera, state_before = self.camera, self.camera.state_before
         return {
             "smartcam": smartcam.__version__,
             "url": self.url,
             "transport": camera.transport,
             "dialect": camera.known_dialect or None,
-            "before": None if before is None else before._asdict(),
-            "left": camera.left or None,
-            "gone": camera.gone or None,
+            "before": None if state_before is None else state_before._asdict(),
+            "left": camera.not_restored or None,
+            "gone": camera.gone_reason or None,
             "allowed": camera.options.allow.names,
-            "measured_seconds": {name: round(s, 6) for name, s in camera.measured.items()},
+            "measured_seconds": {name: round(s, 6) for name, s in camera.measured_times.items()},
             "quirks": self.quirks,
             "checks": [
                 finding.as_json() for finding in self.findings if isinstance(finding.item, Check)
@@ -197,13 +204,13 @@ class CameraReport:
             raise ConfigurationError(f"--camera-report {path}: {exc}") from exc
 
 
-def _plain(value: object) -> str:
+def _yaml_text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _decides(finding: CameraFinding) -> str:
-    documents = finding.item.documents
-    return f"; {', '.join(documents)}" if documents else ""
+def _contradictions_text(finding: CameraFinding) -> str:
+    contradictions = finding.item.contradictions
+    return f"; {', '.join(contradictions)}" if contradictions else ""
 
 
 def _is_default(quirk: str, value: object) -> bool:

@@ -1,7 +1,7 @@
 """The checks and questions about a camera, and their outcomes.
 
-A *check* compares the camera with a documented fact, and fails if it differs. A *question* is open
-in the documents; its answer is a value, mostly of a field of
+A *check* compares the camera with a documented fact, and fails if the camera differs. A *question*
+is open in the documents; its answer is a value, mostly of a field of
 :class:`~smartcam.emulator.Quirks`.
 """
 
@@ -29,7 +29,7 @@ class CheckOutcome(enum.Enum):
     AS_DOCUMENTED = "as documented"
     DIFFERS = "differs"
     OBSERVED = "observed"
-    UNDESCRIBED = "undescribed"
+    UNDESCRIBED = "undescribed"  # a question failed: no value of its quirk describes the camera
     NOT_OBSERVED = "not observed"
     NOT_APPLICABLE = "not applicable"
 
@@ -40,20 +40,20 @@ class Item:
 
     name: str  # in reports and for ``-k``
     about: str  # documented fact or question, one sentence
-    # source and grade, ``"SC-A28, published"``, by dialect; ``""`` is for the others
+    # source and grade, ``"SC-A28, published"``, by dialect; key ``""`` is for all other dialects
     sources: Mapping[str, str]
-    # runs it: a check returns nothing or a remark, a question returns the value
+    # function to call: for a check it returns None or a remark, for a question the value
     run: Callable[[CameraUnderTest], Any]
-    needs: Allow = Allow.NOTHING  # actions on the camera that it needs
-    dialects: tuple[str, ...] = EVERY_DIALECT  # dialects that it applies to
-    transports: tuple[str, ...] = ("tcp", "udp")  # transports that it applies to
-    documents: tuple[str, ...] = ()  # contradictions in ``docs/unknowns.md`` that it decides
+    needs: Allow = Allow.NOTHING  # actions on the camera that the item needs
+    dialects: tuple[str, ...] = EVERY_DIALECT  # dialects that the item applies to
+    transports: tuple[str, ...] = ("tcp", "udp")  # transports that the item applies to
+    contradictions: tuple[str, ...] = ()  # ids in ``docs/unknowns.md`` that the outcome decides
 
     def source(self, dialect: str) -> tuple[str, str]:
-        """Return the source for a dialect, and the grade."""
+        """Return the source for a dialect, and the source's grade."""
         text = self.sources.get(dialect) or self.sources[""]
-        place, _, grade = text.rpartition(", ")
-        return place, grade
+        source, _, grade = text.rpartition(", ")
+        return source, grade
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +74,7 @@ class Question(Item):
         return self.name if self.name in Quirks.model_fields else None
 
 
-NAMES = (
+CAPITALIZED_WORDS = (
     *("BUSY", "Connect", "Get", "Overtriggered", "Query", "Reset", "Set", "Start", "Stop"),
     "Waiting",
 )
@@ -82,31 +82,31 @@ NAMES = (
 
 
 def check(
-    sources: str | Mapping[str, str], *, about: str = "", **more: Any
+    sources: str | Mapping[str, str], *, about: str = "", **fields: Any
 ) -> Callable[[Callable[[CameraUnderTest], Any]], Check]:
-    """Make the decorated function a check, with the function's name and docstring.
+    """Turn the decorated function into a check, with the function's name and docstring.
 
-    ``_items.py`` finds it if its module is in ``_MODULES`` there, in the file's order.
-    The arguments are fields of :class:`Item`: ``sources`` as a text is for every dialect, ``about``
-    replaces a docstring's line that is too short.
+    ``_items.py`` collects the checks of the modules in its ``_MODULES``, in the order of the files.
+    The arguments are fields of :class:`Item`. ``sources`` may be one text for every dialect;
+    ``about`` replaces the docstring where one line is too short for the fact.
     """
     return lambda run: Check(
-        name=run.__name__.replace("_", "-"), **_described(run, sources, about), **more
+        name=run.__name__.replace("_", "-"), **_item_fields(run, sources, about), **fields
     )
 
 
 def question(
-    sources: str | Mapping[str, str], **more: Any
+    sources: str | Mapping[str, str], **fields: Any
 ) -> Callable[[Callable[[CameraUnderTest], Any]], Question]:
-    """Make the decorated function a question, as :func:`check`."""
-    return lambda run: Question(name=run.__name__, **_described(run, sources), **more)
+    """Turn the decorated function into a question, as :func:`check` does."""
+    return lambda run: Question(name=run.__name__, **_item_fields(run, sources), **fields)
 
 
-def _described(
+def _item_fields(
     run: Callable[[CameraUnderTest], Any], sources: str | Mapping[str, str], about: str = ""
 ) -> dict[str, Any]:
     text = (inspect.getdoc(run) or "").removesuffix(".")
-    if not text.startswith(NAMES):
+    if not text.startswith(CAPITALIZED_WORDS):
         text = text[:1].lower() + text[1:]
     by_dialect = sources if isinstance(sources, Mapping) else {"": sources}
     return {"run": run, "about": about or text, "sources": by_dialect}
@@ -114,7 +114,7 @@ def _described(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFinding:
-    """A check or a question with its outcome."""
+    """The outcome of a check or a question."""
 
     item: Item
     outcome: CheckOutcome
@@ -122,14 +122,14 @@ class CameraFinding:
     grade: str  # grade of the source
     value: Any = None  # the answer to a question; None for a check
     text: str = ""  # a remark, or the reason why nothing was observed
-    expected: str = ""  # expected behaviour, if it differs
-    observed: str = ""  # observed behaviour, if it differs
-    wire: tuple[str, ...] = ()  # messages on the wire, if it differs
-    seconds: float = 0.0  # duration
+    expected: str = ""  # expected behaviour, if the item failed
+    observed: str = ""  # observed behaviour, if the item failed
+    wire: tuple[str, ...] = ()  # messages on the wire, if the item failed
+    seconds: float = 0.0  # duration of the check or question
 
     @property
     def failed(self) -> bool:
-        """True if the camera differs from the documents here."""
+        """True if the camera differs from the documents, or no value of the quirk describes it."""
         return self.outcome in {CheckOutcome.DIFFERS, CheckOutcome.UNDESCRIBED}
 
     def as_json(self) -> dict[str, Any]:
@@ -140,7 +140,7 @@ class CameraFinding:
             "source": self.source,
             "grade": self.grade,
             "outcome": self.outcome.value,
-            "decides": list(self.item.documents),
+            "decides": list(self.item.contradictions),
             "seconds": round(self.seconds, 3),
         }
         if isinstance(self.item, Question):

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from smartcam.conformance._dialects import SMART
 from smartcam.conformance.camera._observations import inspection_time
 from smartcam.conformance.camera._options import Allow
-from smartcam.conformance.camera._raw_client import EndedError
+from smartcam.conformance.camera._raw_client import LinkClosedError
 from smartcam.conformance.camera._results import check
 from smartcam.conformance.camera._verdicts import Differs, NotObserved
-from smartcam.conformance.camera._wire import of_kind
+from smartcam.conformance.camera._wire import frames_with_id
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
 
@@ -20,40 +20,40 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._wire import ReceivedFrame
 
 TRANSIT_TIME = 0.02
-"""Seconds, at least, that messages which were sent before a Disconnect may take to arrive."""
+"""Seconds after a Disconnect in which messages that the camera had sent before may still arrive."""
 
 PIECE_INTERVAL = 0.005
-"""Seconds between the bytes of a message that is sent in pieces, so that each has a segment."""
+"""Seconds between the bytes of a message, so that TCP sends each byte in a segment of its own."""
 
-_NARROWED = "the bodies of the dialects with 32 bits narrowed, inferred"
+_NARROWED_SOURCE = "the bodies of the dialects with 32 bits narrowed, inferred"
 
 
-@check({"": "SC-A29, published", "b16": _NARROWED, "bid": "ID-a 226, published"})
+@check({"": "SC-A29, published", "b16": _NARROWED_SOURCE, "bid": "ID-a 226, published"})
 def connect_is_answered(camera: CameraUnderTest) -> None:
     """Connect is answered with the protocol version, 1."""
-    began = time.monotonic()
+    started_at = time.monotonic()
     try:
         try:
             with camera.link() as client:
-                answer = client.answer(m.Connect())
-        except (Differs, EndedError):
+                answer = client.ask(m.Connect())
+        except (Differs, LinkClosedError):
             # the first attempt after an old session may fail (T 3.1.4, published)
             with camera.link() as client:
                 client.send(m.Disconnect())
-                answer = client.answer(m.Connect())
-    except (Differs, EndedError, NotObserved) as exc:
-        camera.gone = str(exc)
-        outcome = exc.came if isinstance(exc, Differs) else str(exc)
+                answer = client.ask(m.Connect())
+    except (Differs, LinkClosedError, NotObserved) as exc:
+        camera.gone_reason = str(exc)
+        outcome = exc.observed if isinstance(exc, Differs) else str(exc)
         raise Differs("an answer to Connect", outcome) from exc
-    camera.measured["connect"] = answer.at - began
-    numbers = camera.wire.numbers(answer.body)
-    coded = camera.wire.is_bid or (camera.dialect == "b16" and len(answer.body) == 4)
-    expected = (0, 1) if coded else (1,)
-    size = len(expected) * camera.wire.word
+    camera.measured_times["connect"] = answer.at - started_at
+    numbers = camera.wire.read_numbers(answer.body)
+    has_code = camera.wire.is_bid or (camera.dialect == "b16" and len(answer.body) == 4)
+    expected = (0, 1) if has_code else (1,)
+    size = len(expected) * camera.wire.word_size
     if numbers != expected or len(answer.body) != size:
         raise Differs(
-            f"the version 1{' after the code 0' if coded else ''}, {size} bytes",
-            camera.wire.spell(answer),
+            f"the version 1{' after the code 0' if has_code else ''}, {size} bytes",
+            camera.wire.describe(answer),
         )
 
 
@@ -61,34 +61,37 @@ def connect_is_answered(camera: CameraUnderTest) -> None:
 def status_follows_connect(camera: CameraUnderTest) -> None:
     """A status comes after the answer to Connect."""
     with camera.link() as client:
-        client.answer(m.Connect())
-        status = client.until(
-            MessageId.STATUS, camera.options.timeout, "a status after the answer to Connect", mark=0
+        client.ask(m.Connect())
+        status = client.wait_for_frame(
+            MessageId.STATUS,
+            camera.options.timeout,
+            "a status after the answer to Connect",
+            start_index=0,
         )
-        flaw = camera.wire.flaw(status)
+        flaw = camera.wire.find_flaw(status)
         if flaw is not None:
-            raise Differs("a status as documented", f"{flaw}: {camera.wire.spell(status)}")
+            raise Differs("a status as documented", f"{flaw}: {camera.wire.describe(status)}")
 
 
 @check("SC-A30, SC-B33, published", dialects=("handbook", "thesis"))
 def endian_field_is_0(camera: CameraUnderTest) -> None:
     """The second word of the status is 0: result containers are little endian."""
     with camera.session() as client:
-        status = of_kind(client.received, MessageId.STATUS)[0]
-    if camera.wire.numbers(status.body)[1:2] != (0,):
-        raise Differs("the endian field 0: little endian", camera.wire.spell(status))
+        status = frames_with_id(client.received, MessageId.STATUS)[0]
+    if camera.wire.read_numbers(status.body)[1:2] != (0,):
+        raise Differs("the endian field 0: little endian", camera.wire.describe(status))
 
 
-@check({"": "SC-B34, published", "b16": _NARROWED, "bid": "ID-b 216, published"})
+@check({"": "SC-B34, published", "b16": _NARROWED_SOURCE, "bid": "ID-b 216, published"})
 def query_is_answered(camera: CameraUnderTest) -> None:
     """Query is answered with the id of the active application."""
     with camera.session() as client:
-        answer = client.answer(m.Query())
-    numbers = camera.wire.numbers(answer.body)
-    coded = camera.wire.dialect.coded
-    if camera.wire.flaw(answer) or not numbers[-1] or (coded and numbers[0] != 2):
-        code = "the code 2 and " if coded else ""
-        raise Differs(f"{code}the id of an application, 1 or more", camera.wire.spell(answer))
+        answer = client.ask(m.Query())
+    numbers = camera.wire.read_numbers(answer.body)
+    has_code = camera.wire.dialect.coded
+    if camera.wire.find_flaw(answer) or not numbers[-1] or (has_code and numbers[0] != 2):
+        code = "the code 2 and " if has_code else ""
+        raise Differs(f"{code}the id of an application, 1 or more", camera.wire.describe(answer))
 
 
 @check("SC-A28, SC-C40, published")
@@ -96,7 +99,7 @@ def silent_before_connect(camera: CameraUnderTest) -> None:
     """Before Connect neither results nor statuses come."""
     with camera.link() as client:
         if client.listen(camera.options.quiet):
-            raise Differs("nothing before Connect", client.words())
+            raise Differs("nothing before Connect", client.describe_received())
 
 
 @check("no document, inferred")
@@ -105,19 +108,19 @@ def deaf_before_connect(camera: CameraUnderTest) -> None:
     with camera.link() as client:
         client.send(m.Query())
         if client.listen(camera.options.quiet):
-            raise Differs("no answer to a Query before Connect", client.words())
+            raise Differs("no answer to a Query before Connect", client.describe_received())
 
 
-@check({"": "SC-A28, SC-A29, published", "b16": "KB-msg, published"}, documents=("C3",))
+@check({"": "SC-A28, SC-A29, published", "b16": "KB-msg, published"}, contradictions=("C3",))
 def silent_after_disconnect(camera: CameraUnderTest) -> None:
     """After Disconnect nothing comes, of a smart camera not even an answer to it."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.received)
+        start_index = len(client.received)
         client.send(m.Disconnect())
         frames = _without_answer(camera, client.listen(camera.options.quiet))
         if frames:
-            raise Differs("nothing after Disconnect", client.words(mark))
+            raise Differs("nothing after Disconnect", client.describe_received(start_index))
 
 
 @check("no document, inferred")
@@ -125,11 +128,13 @@ def deaf_after_disconnect(camera: CameraUnderTest) -> None:
     """Requests after Disconnect are ignored."""
     with camera.session() as client:
         client.fence()
-        mark = len(client.received)
+        start_index = len(client.received)
         client.send(m.Disconnect())
         client.send(m.Query())
         if _without_answer(camera, client.listen(camera.options.quiet)):
-            raise Differs("no answer to a Query after Disconnect", client.words(mark))
+            raise Differs(
+                "no answer to a Query after Disconnect", client.describe_received(start_index)
+            )
 
 
 def _without_answer(camera: CameraUnderTest, frames: list[ReceivedFrame]) -> list[ReceivedFrame]:
@@ -142,17 +147,17 @@ def _without_answer(camera: CameraUnderTest, frames: list[ReceivedFrame]) -> lis
 @check("SC-A29, published", needs=Allow.TRIGGER)
 def no_result_after_disconnect(camera: CameraUnderTest) -> None:
     """The result of a trigger before Disconnect does not come after it."""
-    takes = inspection_time(camera)
+    inspection_seconds = inspection_time(camera)
     with camera.session() as client:
-        camera.ready(client)
-        mark = len(client.received)
+        camera.ensure_ready(client)
+        start_index = len(client.received)
         client.send(m.Trigger())
         ended_at = client.send(m.Disconnect())
-        frames = client.listen(takes + camera.options.quiet)
-        grace = max(TRANSIT_TIME, 2 * camera.measured.get("query", 0.0))
-        results = of_kind(frames, MessageId.RESULT_CONTAINER)
+        frames = client.listen(inspection_seconds + camera.options.quiet)
+        grace = max(TRANSIT_TIME, 2 * camera.measured_times.get("query", 0.0))
+        results = frames_with_id(frames, MessageId.RESULT_CONTAINER)
         if any(result.at - ended_at > grace for result in results):
-            raise Differs("no result after Disconnect", client.words(mark))
+            raise Differs("no result after Disconnect", client.describe_received(start_index))
     if results:
         raise NotObserved("the result was on its way already")
 
@@ -163,8 +168,8 @@ def disconnect_without_session_is_harmless(camera: CameraUnderTest) -> None:
     with camera.link() as client:
         client.send(m.Disconnect())
         try:
-            client.answer(m.Connect())
-        except EndedError as exc:
+            client.ask(m.Connect())
+        except LinkClosedError as exc:
             raise Differs("a session after a Disconnect without one", str(exc)) from exc
 
 
@@ -172,22 +177,22 @@ def disconnect_without_session_is_harmless(camera: CameraUnderTest) -> None:
 def state_survives_session(camera: CameraUnderTest) -> None:
     """Application and run mode stay when a session ends."""
     with camera.session() as client:
-        was = (camera.active(client), camera.running(client))
+        before = (camera.active_application(client), camera.is_running(client))
     with camera.session() as client:
-        now = (camera.active(client), camera.running(client))
-    if was != now:
-        raise Differs(f"application and run mode as before: {was}", str(now))
+        after = (camera.active_application(client), camera.is_running(client))
+    if before != after:
+        raise Differs(f"application and run mode as before: {before}", str(after))
 
 
 @check("SC-A28, MV24, published", transports=("udp",))
 def newcomer_wins(camera: CameraUnderTest) -> None:
     """The Connect of a second client ends the session of the first."""
     with camera.session() as first, camera.link() as second:
-        second.answer(m.Connect())
-        mark = len(first.received)
-        first.write(camera.wire.request(m.Query()))
+        second.ask(m.Connect())
+        start_index = len(first.received)
+        first.write(camera.wire.encode_request(m.Query()))
         if first.listen(camera.options.quiet):
-            raise Differs("silence for the client that was there before", first.words(mark))
+            raise Differs("silence for the first client", first.describe_received(start_index))
         second.fence()
 
 
@@ -195,10 +200,12 @@ def newcomer_wins(camera: CameraUnderTest) -> None:
 def messages_share_a_segment(camera: CameraUnderTest) -> None:
     """Several requests in one segment are all answered."""
     with camera.session() as client:
-        mark = len(client.received)
+        start_index = len(client.received)
         client.send(m.Query(), m.Query(), m.Query())
-        client.until(
-            lambda _: len(of_kind(client.received[mark:], MessageId.QUERY_APPLICATION)) == 3,
+        client.wait_for_frame(
+            lambda _: (
+                len(frames_with_id(client.received[start_index:], MessageId.QUERY_APPLICATION)) == 3
+            ),
             camera.options.timeout,
             "three answers to three Queries in one segment",
         )
@@ -208,13 +215,13 @@ def messages_share_a_segment(camera: CameraUnderTest) -> None:
 def a_message_may_come_in_pieces(camera: CameraUnderTest) -> None:
     """A request that comes byte by byte is answered."""
     with camera.session() as client:
-        mark = len(client.received)
-        for byte in camera.wire.request(m.Query()):
+        start_index = len(client.received)
+        for byte in camera.wire.encode_request(m.Query()):
             client.write(bytes([byte]))
             client.listen(PIECE_INTERVAL)
-        client.until(
+        client.wait_for_frame(
             MessageId.QUERY_APPLICATION,
             camera.options.timeout,
             "an answer to a Query that is sent byte by byte",
-            mark=mark,
+            start_index=start_index,
         )

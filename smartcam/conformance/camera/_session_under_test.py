@@ -1,4 +1,4 @@
-"""The camera under test: sessions, states that a check needs, and the restored state."""
+"""The camera under test: opens sessions, brings the camera into states, restores its state."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 from smartcam.conformance.camera._options import Allow
-from smartcam.conformance.camera._raw_client import MAX_TRAIL, EndedError, RawClient
+from smartcam.conformance.camera._raw_client import MAX_LOG_LINES, LinkClosedError, RawClient
 from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import RawDialect
 from smartcam.doctor._inside import trials as probe_trials
@@ -43,35 +43,37 @@ class StateBefore(NamedTuple):
     """The camera's state that is restored at the end."""
 
     application: int  # id of the active one
-    running: bool  # whether the camera is in run mode
+    running: bool  # True if the camera is in run mode
 
 
 class CameraUnderTest:
-    """One camera and the facts learned about it so far.
+    """One camera and the facts observed so far.
 
     Raises:
-        ConfigurationError: the address cannot work, or is no BVS camera's.
+        ConfigurationError: the address cannot work, or is not the address of a BVS camera.
     """
 
     def __init__(self, options: ConformanceOptions) -> None:
         self.options: ConformanceOptions = options
-        self.before: StateBefore | None = None  # state to restore; None until the first session
-        self.gone: str = ""  # reason why the camera is gone, "" while it is there
-        self.left: str = ""  # state that could not be restored; "" if everything was
+        self.state_before: StateBefore | None = (
+            None  # state to restore; None until the first session
+        )
+        self.gone_reason: str = ""  # reason why the camera is gone, "" while it answers
+        self.not_restored: str = ""  # state that could not be restored; "" if everything was
         # messages on the wire since the last forget_trail()
-        self.trail: deque[str] = deque(maxlen=MAX_TRAIL)
+        self.message_log: deque[str] = deque(maxlen=MAX_LOG_LINES)
         # undocumented frames of the camera, as texts, each kind once
         self.flaws: dict[str, str] = {}
-        self.measured: dict[str, float] = {}  # times in seconds, by their names
+        self.measured_times: dict[str, float] = {}  # times in seconds, by their names
         self._address = parse_address(options.url)
         if self._address.protocol != "bvs":
             raise ConfigurationError(
                 f"{options.url!r} is not the address of a BVS camera: bvs://HOST"
             )
         self._wire: RawDialect | None = None
-        self._learned: dict[str, Any] = {}
+        self._observations: dict[str, Any] = {}
         self._allow = options.allow
-        self._dirty = False
+        self._state_changed = False
 
     # ------------------------------------------------------------------ properties
 
@@ -112,40 +114,40 @@ class CameraUnderTest:
     def _detect(self) -> FramedDialect:
         address = self._address
         if address.dialect is None:
-            spoken = self.once("dialect", lambda: asyncio.run(_probe(address)))
-            if isinstance(spoken, str):
-                raise Differs("an answer to Connect in one of the dialects", spoken)
-            address = spoken
+            detected = self.observe_once("dialect", lambda: asyncio.run(_probe(address)))
+            if isinstance(detected, str):
+                raise Differs("an answer to Connect in one of the dialects", detected)
+            address = detected
         dialect = load_protocol("bvs").dialects[cast("str", address.dialect)]
         return cast("FramedDialect", dialect).with_quirks(address.quirks)
 
-    def learn_quirk(self, name: str, *, on: bool) -> None:
-        """Note whether the camera deviates from its dialect in this way."""
+    def learn_quirk(self, name: str, *, is_present: bool) -> None:
+        """Add a quirk to the camera's dialect, or remove it."""
         dialect = self.wire.dialect
-        names = {*dialect.quirks, name} if on else {*dialect.quirks} - {name}
+        names = {*dialect.quirks, name} if is_present else {*dialect.quirks} - {name}
         plain = cast("FramedDialect", load_protocol("bvs").dialects[dialect.name])
         self._wire = RawDialect(plain.with_quirks(names))
 
     @property
-    def patience(self) -> float:
-        """Seconds to wait for an answer that may not come, if no other answer can show that."""
+    def silence_timeout(self) -> float:
+        """Seconds to wait for an answer that may not come, if no fence can show its absence."""
         return 4 * self.options.quiet
 
-    def once(self, name: str, observe: Callable[[], T]) -> T:
-        """Make an observation once; return its result again, or raise its exception again."""
-        if name not in self._learned:
+    def observe_once(self, name: str, observe: Callable[[], T]) -> T:
+        """Make an observation in the first call; later, return its result or raise its error."""
+        if name not in self._observations:
             try:
-                self._learned[name] = observe()
-            except (Differs, NotObserved, EndedError) as exc:
-                self._learned[name] = exc
-        learned = self._learned[name]
-        if isinstance(learned, Exception):
-            raise learned
-        return cast("T", learned)
+                self._observations[name] = observe()
+            except (Differs, NotObserved, LinkClosedError) as exc:
+                self._observations[name] = exc
+        observation = self._observations[name]
+        if isinstance(observation, Exception):
+            raise observation
+        return cast("T", observation)
 
-    def forget_trail(self) -> None:
-        """Begin a new record of messages on the wire."""
-        self.trail.clear()
+    def clear_message_log(self) -> None:
+        """Forget the messages of earlier checks."""
+        self.message_log.clear()
 
     # ------------------------------------------------------------------ links
 
@@ -157,21 +159,21 @@ class CameraUnderTest:
             NotObserved: there is no connection.
         """
         try:
-            client = self.open()
+            client = self.open_link()
         except OSError as exc:
-            where = f"{self._address.host}:{self._address.port}"
-            raise NotObserved(f"there is no connection to {where}: {exc}") from exc
+            address_text = f"{self._address.host}:{self._address.port}"
+            raise NotObserved(f"there is no connection to {address_text}: {exc}") from exc
         try:
             with client:
                 yield client
         finally:
             for frame in client.received:
                 self._learn_code(frame)
-                flaw = self.wire.flaw(frame)
+                flaw = self.wire.find_flaw(frame)
                 if flaw is not None:
-                    self.flaws.setdefault(flaw, self.wire.spell(frame))
+                    self.flaws.setdefault(flaw, self.wire.describe(frame))
 
-    def open(self) -> RawClient:
+    def open_link(self) -> RawClient:
         """Open a link to the camera; the caller closes it.
 
         Raises:
@@ -183,100 +185,102 @@ class CameraUnderTest:
             self.transport == "tcp",
             self.options.timeout,
             self.options.quiet,
-            self.trail,
-            self._will_change,
+            self.message_log,
+            self._note_state_change,
         )
 
-    def _will_change(self) -> None:
-        self._dirty = True
+    def _note_state_change(self) -> None:
+        self._state_changed = True
 
     @contextlib.contextmanager
     def session(self) -> Iterator[RawClient]:
-        """Open a session; a smart camera's first status has been received.
+        """Open a session; from a smart camera, also receive the first status.
 
         Raises:
             NotObserved: the camera gives no session.
         """
-        if self.gone:
-            raise NotObserved(f"the camera is gone: {self.gone}")
+        if self.gone_reason:
+            raise NotObserved(f"the camera is gone: {self.gone_reason}")
         with contextlib.ExitStack() as stack:
-            client = self._connect(stack)
-            if self.before is None:
-                self._remember(client)
+            client = self._open_session(stack)
+            if self.state_before is None:
+                self._save_state(client)
             yield client
 
-    def _connect(self, stack: contextlib.ExitStack) -> RawClient:
-        why = ""
-        for number in range(SESSION_TRIES):
+    def _open_session(self, stack: contextlib.ExitStack) -> RawClient:
+        reason = ""
+        for index in range(SESSION_TRIES):
             attempt = contextlib.ExitStack()
             try:
                 client = attempt.enter_context(self.link())
-                if number:
+                if index:
                     client.send(m.Disconnect())
-                self.greet(client)
-            except (NotObserved, Differs, EndedError) as exc:
+                self.start_session(client)
+            except (NotObserved, Differs, LinkClosedError) as exc:
                 attempt.close()
-                why = str(exc)
+                reason = str(exc)
             else:
                 stack.enter_context(attempt.pop_all())
                 return client
-        self.gone = why
-        raise NotObserved(f"there is no session: {why}")
+        self.gone_reason = reason
+        raise NotObserved(f"there is no session: {reason}")
 
-    def greet(self, client: RawClient) -> ReceivedFrame:
-        """Connect on a link and return the answer; also wait for a status that comes unasked.
+    def start_session(self, client: RawClient) -> ReceivedFrame:
+        """Send Connect and return its answer; from a smart camera, also wait for a status.
 
         Raises:
             Differs: the camera does not answer.
             EndedError: the camera ends the link.
         """
-        answer = client.answer(m.Connect())
+        answer = client.ask(m.Connect())
         self._learn_code(answer)
         client.wire = self.wire
         if not self.wire.is_bid:
-            client.until(MessageId.STATUS, self.options.timeout, "a status after Connect", mark=0)
+            client.wait_for_frame(
+                MessageId.STATUS, self.options.timeout, "a status after Connect", start_index=0
+            )
         return answer
 
     def _learn_code(self, frame: ReceivedFrame) -> None:
         """Learn whether ``b16`` answers have a code, from the length of the answer to Connect."""
         if self.dialect == "b16" and frame.message_id == MessageId.CONNECT:
-            self.learn_quirk("code", on=len(frame.body) == 4)
+            self.learn_quirk("code", is_present=len(frame.body) == 4)
 
     # ------------------------------------------------------------------ its state
 
-    def _remember(self, client: RawClient) -> None:
-        began = time.monotonic()
-        application = self.active(client)
-        self.measured["query"] = time.monotonic() - began
-        self.before = StateBefore(application, self.running(client))
+    def _save_state(self, client: RawClient) -> None:
+        asked_at = time.monotonic()
+        application = self.active_application(client)
+        self.measured_times["query"] = time.monotonic() - asked_at
+        self.state_before = StateBefore(application, self.is_running(client))
 
-    def active(self, client: RawClient) -> int:
+    def active_application(self, client: RawClient) -> int:
         """Return the active application's id.
 
         Raises:
             Differs: the camera does not answer with it.
         """
-        answer = client.answer(m.Query())
-        numbers = self.wire.numbers(answer.body)
-        at = 1 if self.wire.dialect.coded else 0
-        if len(numbers) <= at:
-            raise Differs("the active application's id", self.wire.spell(answer))
-        return numbers[at]
+        answer = client.ask(m.Query())
+        numbers = self.wire.read_numbers(answer.body)
+        code_count = 1 if self.wire.dialect.coded else 0
+        if len(numbers) <= code_count:
+            raise Differs("the active application's id", self.wire.describe(answer))
+        return numbers[code_count]
 
-    def running(self, client: RawClient) -> bool:
+    def is_running(self, client: RawClient) -> bool:
         """Return True if the camera is in run mode; a BVS ID always is."""
-        return self.wire.is_bid or bool(client.look() & self.wire.bits.running)
+        return self.wire.is_bid or bool(client.read_status() & self.wire.bits.running)
 
     @property
     def application(self) -> int:
         """Id of the application to trigger."""
         if self.options.application is not None:
             return self.options.application
-        if self.before is None:
+        if self.state_before is None:
             raise NotObserved("there was no session yet")
-        return self.before.application
+        return self.state_before.application
 
-    def require(self, needs: Allow) -> None:
+    def require_allowed(self, needs: Allow) -> None:
         """Check that an action is allowed.
 
         Raises:
@@ -286,77 +290,77 @@ class CameraUnderTest:
         if missing:
             raise NotObserved(f"--camera-allow does not have {' and '.join(missing.names)}")
 
-    def stop(self, client: RawClient) -> None:
-        """Make sure that the camera is not in run mode.
+    def ensure_stopped(self, client: RawClient) -> None:
+        """Stop the camera if it is in run mode.
 
         Raises:
             NotObserved: Stop is not allowed.
             Differs: the camera does not stop.
         """
         bits = self.wire.bits
-        if self.wire.is_bid or not client.look() & bits.running:
+        if self.wire.is_bid or not client.read_status() & bits.running:
             return
-        self.require(Allow.RUN)
+        self.require_allowed(Allow.RUN)
         client.send(m.Stop())
         client.wait_status(
             lambda word: not word & bits.running, self.options.timeout, "a status without Running"
         )
 
-    def start(self, client: RawClient) -> None:
-        """Make sure that the camera is in run mode; raises as :meth:`stop`."""
+    def ensure_running(self, client: RawClient) -> None:
+        """Start the camera unless it is in run mode; raises as :meth:`ensure_stopped`."""
         bits = self.wire.bits
-        if self.wire.is_bid or client.look() & bits.running:
+        if self.wire.is_bid or client.read_status() & bits.running:
             return
-        self.require(Allow.RUN)
+        self.require_allowed(Allow.RUN)
         client.send(m.Start())
         client.wait_status(
             lambda word: word & bits.running, self.options.timeout, "a status with Running"
         )
 
-    def load(self, client: RawClient, application: int) -> list[ReceivedFrame]:
-        """Load an application; return the frames from the request to its end.
+    def load_application(self, client: RawClient, application: int) -> list[ReceivedFrame]:
+        """Load an application; return the frames until the switch is complete.
 
         Raises:
             NotObserved: the switch is not allowed, or the camera refuses it.
             Differs: the switch is not answered, or leads to another application.
         """
-        if self.active(client) == application:
+        if self.active_application(client) == application:
             return []
-        self.require(Allow.SWITCH)
-        self.stop(client)
-        mark = len(client.received)
-        answer = client.answer(
-            m.SwitchApplication(application=application), within=self.options.switch_timeout
+        self.require_allowed(Allow.SWITCH)
+        self.ensure_stopped(client)
+        start_index = len(client.received)
+        answer = client.ask(
+            m.SwitchApplication(application=application), timeout=self.options.switch_timeout
         )
-        code, now = (*self.wire.numbers(answer.body), -1, -1)[:2]
+        code, active = (*self.wire.read_numbers(answer.body), -1, -1)[:2]
         if code:
             raise NotObserved(
-                f"the camera does not load application {application}: {self.wire.spell(answer)}"
+                f"the camera does not load application {application}: {self.wire.describe(answer)}"
             )
-        if now != application:
-            raise Differs(f"application {application} in the answer", self.wire.spell(answer))
+        if active != application:
+            raise Differs(f"application {application} in the answer", self.wire.describe(answer))
         bits = self.wire.bits
         client.wait_status(
             lambda word: word & bits.ready if self.wire.is_bid else not word & bits.busy,
             self.options.switch_timeout,
             "a status that is not busy",
         )
-        return client.received[mark:]
+        return client.received[start_index:]
 
-    def ready(self, client: RawClient) -> None:
-        """Make sure that the application is loaded and waits for a trigger.
+    def ensure_ready(self, client: RawClient) -> None:
+        """Load and start the application, and wait until it waits for a trigger.
 
         Raises:
             NotObserved: a switch is not allowed, or the application needs no trigger.
-            Differs: the camera does not do it.
+            Differs: the camera does not load or start the application.
         """
-        self.load(client, self.application)
-        self.start(client)
-        self.once_waiting(client)
+        self.load_application(client, self.application)
+        self.ensure_running(client)
+        self.wait_until_waiting(client)
 
-    def once_waiting(self, client: RawClient) -> None:
-        """Wait until the camera waits for a trigger; raises as :meth:`ready`."""
-        if self._learned.get("runs free") == self.application:
+    def wait_until_waiting(self, client: RawClient) -> None:
+        """Wait until the camera waits for a trigger; raises as :meth:`ensure_ready`."""
+        if self._observations.get("runs free") == self.application:
             raise NotObserved(f"application {self.application} runs without triggers")
         waiting = self.wire.bits.waiting
         try:
@@ -366,46 +370,48 @@ class CameraUnderTest:
                 "a status with Waiting for Trigger",
             )
         except Differs as exc:
-            self._learned["runs free"] = self.application
+            self._observations["runs free"] = self.application
             raise NotObserved(
                 f"application {self.application} did not wait for a trigger within "
-                f"{self.options.timeout:g} s: {exc.came}"
+                f"{self.options.timeout:g} s: {exc.observed}"
             ) from exc
 
     # ------------------------------------------------------------------ afterwards
 
-    def restore(self, *, again: bool = False) -> None:
-        """Restore the active application and whether it runs; never raises.
+    def restore(self, *, retry: bool = False) -> None:
+        """Restore the active application and the run mode, and never raise.
 
-        Bounded: two sessions, in which each wait has its own limit. A state that cannot be restored
-        is named in :attr:`left`. ``again``: try it even if it failed before.
+        It tries up to two sessions. If both fail, :attr:`not_restored` gets the reason, and later
+        calls do nothing unless ``retry`` is set.
         """
-        before, why = self.before, ""
-        if not self._dirty or before is None or (self.left and not again):
+        before, reason = self.state_before, ""
+        if not self._state_changed or before is None or (self.not_restored and not retry):
             return
-        gone, self.gone = self.gone, ""
+        old_reason, self.gone_reason = self.gone_reason, ""
         for _ in range(RESTORE_TRIES):
             try:
                 with self.session() as client:
-                    self._put_back(client, before)
-            except (NotObserved, Differs, EndedError) as exc:
-                why = str(exc)
-                if self.gone:
+                    self._restore_state(client, before)
+            except (NotObserved, Differs, LinkClosedError) as exc:
+                reason = str(exc)
+                if self.gone_reason:
                     break
             else:
-                self._dirty = False
-                self.left = ""
+                self._state_changed = False
+                self.not_restored = ""
                 return
-        self.gone = self.gone or gone
+        self.gone_reason = self.gone_reason or old_reason
         run = "running" if before.running else "stopped"
-        self.left = f"application {before.application}, {run}, could not be put back: {why}"
+        self.not_restored = (
+            f"application {before.application}, {run}, could not be put back: {reason}"
+        )
 
-    def _put_back(self, client: RawClient, before: StateBefore) -> None:
+    def _restore_state(self, client: RawClient, before: StateBefore) -> None:
         allowed = self._allow
-        self._allow |= Allow.RUN | Allow.SWITCH  # our own changes may be undone
+        self._allow |= Allow.RUN | Allow.SWITCH  # needed to undo our own changes
         try:
-            self.load(client, before.application)
-            (self.start if before.running else self.stop)(client)
+            self.load_application(client, before.application)
+            (self.ensure_running if before.running else self.ensure_stopped)(client)
         finally:
             self._allow = allowed
 

@@ -7,11 +7,16 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
 from smartcam.conformance._dialects import SMART
-from smartcam.conformance.camera._observations import downtime, inspection_time, no_id, switch
+from smartcam.conformance.camera._observations import (
+    has_no_id,
+    inspection_time,
+    observe_restart,
+    observe_switch,
+)
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._results import check
 from smartcam.conformance.camera._verdicts import Differs, NotObserved
-from smartcam.conformance.camera._wire import of_kind
+from smartcam.conformance.camera._wire import frames_with_id
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
 
@@ -23,10 +28,10 @@ if TYPE_CHECKING:
 UNKNOWN_APPLICATION = 0xFFFD
 """An id that most probably no application has; it fits 16 bits."""
 
-SECONDS_APART = timedelta(seconds=3)
-"""Time by which a clock may be off right after it was set: transmission, and the next second."""
+CLOCK_TOLERANCE = timedelta(seconds=3)
+"""Largest difference of a clock right after it was set: the transmission, and a new second."""
 
-A_DATE = datetime(2016, 6, 25, 10, 11, 12, tzinfo=UTC)
+EXAMPLE_DATE = datetime(2016, 6, 25, 10, 11, 12, tzinfo=UTC)
 """The date of the published examples (MV30, ID-b 218). The camera has no time zone."""
 
 
@@ -39,52 +44,55 @@ _SWITCH = {"": "SC-B34, published", "b16": _NARROWED, "bid": "ID-a 229, publishe
 @check(_SWITCH, needs=Allow.SWITCH)
 def application_0_is_refused(camera: CameraUnderTest) -> None:
     """A switch to the id 0 is refused, and the active application stays."""
-    _refuses(camera, 0)
+    _check_refusal(camera, 0)
 
 
 @check(_SWITCH, needs=Allow.SWITCH)
 def unknown_application_is_refused(camera: CameraUnderTest) -> None:
     """A switch to an id that no application has is refused, and the active one stays."""
-    _refuses(camera, UNKNOWN_APPLICATION)
+    _check_refusal(camera, UNKNOWN_APPLICATION)
 
 
-def _refuses(camera: CameraUnderTest, application: int) -> None:
+def _check_refusal(camera: CameraUnderTest, application: int) -> None:
     with camera.session() as client:
         code = 0x1A if camera.wire.dialect.coded else 1
-        active = camera.active(client)
-        camera.stop(client)
-        answer = client.answer(m.SwitchApplication(application=application))
-        if camera.wire.numbers(answer.body) != (code, active):
+        active = camera.active_application(client)
+        camera.ensure_stopped(client)
+        answer = client.ask(m.SwitchApplication(application=application))
+        if camera.wire.read_numbers(answer.body) != (code, active):
             raise Differs(
                 f"the code {code:#x} and the application that stays active, {active}",
-                camera.wire.spell(answer),
+                camera.wire.describe(answer),
             )
-        if camera.active(client) != active:
-            raise Differs(f"application {active} stays active", client.words())
+        if camera.active_application(client) != active:
+            raise Differs(f"application {active} stays active", client.describe_received())
 
 
 @check(_SWITCH, needs=Allow.SWITCH)
 def switch_loads_the_application(camera: CameraUnderTest) -> str:
     """A switch is answered when it is done, with the id that is active then."""
-    seen = switch(camera)
-    if camera.wire.numbers(seen.answer.body) != (0, seen.application):
-        raise Differs(f"the code 0 and the id {seen.application}", camera.wire.spell(seen.answer))
-    if seen.active != seen.application:
+    observed = observe_switch(camera)
+    if camera.wire.read_numbers(observed.answer.body) != (0, observed.application):
         raise Differs(
-            f"application {seen.application} is active", f"Query reports application {seen.active}"
+            f"the code 0 and the id {observed.application}", camera.wire.describe(observed.answer)
         )
-    return f"{seen.seconds:.3f} s"
+    if observed.active != observed.application:
+        raise Differs(
+            f"application {observed.application} is active",
+            f"Query reports application {observed.active}",
+        )
+    return f"{observed.seconds:.3f} s"
 
 
 @check("SC-B33, published", needs=Allow.SWITCH, dialects=SMART)
 def busy_during_a_switch(camera: CameraUnderTest) -> None:
     """BUSY is set during a switch."""
-    seen = switch(camera)
+    observed = observe_switch(camera)
     busy = camera.wire.bits.busy
-    words = camera.wire.statuses(seen.frames)
+    words = camera.wire.status_words(observed.frames)
     if not any(word & busy for word in words) or words[-1] & busy:
-        shown = "; ".join(map(camera.wire.spell, seen.frames))
-        raise Differs("a status with BUSY during the switch, and one without it after", shown)
+        frames_text = "; ".join(map(camera.wire.describe, observed.frames))
+        raise Differs("a status with BUSY during the switch, and one without it after", frames_text)
 
 
 @check(
@@ -95,51 +103,52 @@ def busy_during_a_switch(camera: CameraUnderTest) -> None:
 )
 def second_switch_meanwhile(camera: CameraUnderTest) -> None:
     """Ask for a second switch, and for the active application, while the first is under way."""
-    other = switch(camera).application
+    other = observe_switch(camera).application
     with camera.session() as client:
-        active = camera.active(client)
+        active = camera.active_application(client)
         if active == other:
-            camera.load(client, camera.application)
-            active = camera.active(client)
-        camera.stop(client)
-        mark = len(client.received)
+            camera.load_application(client, camera.application)
+            active = camera.active_application(client)
+        camera.ensure_stopped(client)
+        start_index = len(client.received)
         request = m.SwitchApplication(application=other)
         client.send(request, request, m.Query())
-        first = client.until(
+        first = client.wait_for_frame(
             MessageId.QUERY_APPLICATION,
             camera.options.switch_timeout,
             "an answer to a Query during a switch",
-            mark=mark,
+            start_index=start_index,
         )
-        done = (0, other)
-        client.until(
+        switch_done = (0, other)
+        client.wait_for_frame(
             lambda message: (
-                camera.wire.numbers(message.body) == done
+                camera.wire.read_numbers(message.body) == switch_done
                 and message.message_id == MessageId.SWITCH_APPLICATION
             ),
             camera.options.switch_timeout,
             "the answer to the first switch",
-            mark=mark,
+            start_index=start_index,
         )
         client.listen(camera.options.quiet)
-        _judge_second(camera, client, mark, first, active)
+        _judge_second_switch(camera, client, start_index, first, active)
 
 
-def _judge_second(
-    camera: CameraUnderTest, client: RawClient, mark: int, query: ReceivedFrame, active: int
+def _judge_second_switch(
+    camera: CameraUnderTest, client: RawClient, start_index: int, query: ReceivedFrame, active: int
 ) -> None:
-    switched = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
-    answers = [camera.wire.numbers(message.body) for message in switched]
-    numbers = camera.wire.numbers(query.body)
+    switched = frames_with_id(client.received[start_index:], MessageId.SWITCH_APPLICATION)
+    answers = [camera.wire.read_numbers(message.body) for message in switched]
+    numbers = camera.wire.read_numbers(query.body)
     if camera.wire.is_bid:
         if numbers != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:
             raise Differs(
                 f"the code 0x16 and 0 to the Query, 0x16 and {active} to the second switch",
-                client.words(mark),
+                client.describe_received(start_index),
             )
     elif numbers[-1] != active or len(answers) != 1:
         raise Differs(
-            f"the id of before, {active}, and no answer to the second switch", client.words(mark)
+            f"the old application's id, {active}, and no answer to the second switch",
+            client.describe_received(start_index),
         )
 
 
@@ -147,27 +156,29 @@ def _judge_second(
 
 
 def _read_clock(camera: CameraUnderTest, client: RawClient) -> datetime:
-    answer = client.answer(m.GetClock())
-    numbers = camera.wire.numbers(answer.body)
+    answer = client.ask(m.GetClock())
+    numbers = camera.wire.read_numbers(answer.body)
     if camera.wire.dialect.coded:
         code, numbers = numbers[0], numbers[1:]
         if code != 6:
-            raise Differs("the code 6", camera.wire.spell(answer))
+            raise Differs("the code 6", camera.wire.describe(answer))
     try:
         year, month, day, hour, minute, second = numbers
         return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError as exc:
-        raise Differs("year, month, day, hour, minute, second", camera.wire.spell(answer)) from exc
+        raise Differs(
+            "year, month, day, hour, minute, second", camera.wire.describe(answer)
+        ) from exc
 
 
-def _set_clock(camera: CameraUnderTest, client: RawClient, when: datetime) -> None:
+def _set_clock(camera: CameraUnderTest, client: RawClient, time: datetime) -> None:
     request = m.SetClock(
-        year=when.year,
-        month=when.month,
-        day=when.day,
-        hour=when.hour,
-        minute=when.minute,
-        second=when.second,
+        year=time.year,
+        month=time.month,
+        day=time.day,
+        hour=time.hour,
+        minute=time.minute,
+        second=time.second,
     )
     _send_setting(camera, client, request, (0,))
 
@@ -179,12 +190,12 @@ def _send_setting(
     if not camera.wire.is_bid:
         message_id = camera.wire.dialect.message_id(request)
         client.send(request)
-        if of_kind(client.fence(), message_id):
-            raise Differs(f"no answer to {type(request).__name__}", client.words())
+        if frames_with_id(client.fence(), message_id):
+            raise Differs(f"no answer to {type(request).__name__}", client.describe_received())
         return
-    answer = client.answer(request)
-    if camera.wire.numbers(answer.body) != code:
-        raise Differs(f"the code {code[0]:#x}", camera.wire.spell(answer))
+    answer = client.ask(request)
+    if camera.wire.read_numbers(answer.body) != code:
+        raise Differs(f"the code {code[0]:#x}", camera.wire.describe(answer))
 
 
 @check({"": "MV29, published", "b16": _NARROWED, "bid": "ID-b 218, published"})
@@ -200,14 +211,14 @@ def clock_is_told(camera: CameraUnderTest) -> str:
 def clock_is_set(camera: CameraUnderTest) -> None:
     """The clock goes on from the time that is set."""
     with camera.session() as client:
-        was, began = _read_clock(camera, client), time.monotonic()
+        old_time, read_at = _read_clock(camera, client), time.monotonic()
         try:
-            _set_clock(camera, client, A_DATE)
-            now = _read_clock(camera, client)
+            _set_clock(camera, client, EXAMPLE_DATE)
+            new_time = _read_clock(camera, client)
         finally:
-            _set_clock(camera, client, was + timedelta(seconds=time.monotonic() - began))
-        if not A_DATE <= now < A_DATE + SECONDS_APART:
-            raise Differs(f"{A_DATE:%Y-%m-%d %H:%M:%S} or a moment later", f"{now:%c}")
+            _set_clock(camera, client, old_time + timedelta(seconds=time.monotonic() - read_at))
+        if not EXAMPLE_DATE <= new_time < EXAMPLE_DATE + CLOCK_TOLERANCE:
+            raise Differs(f"{EXAMPLE_DATE:%Y-%m-%d %H:%M:%S} or a moment later", f"{new_time:%c}")
 
 
 @check({"": "MV30, published", "bid": "ID-a 52, derived"}, needs=Allow.CLOCK)
@@ -215,18 +226,18 @@ def impossible_date_is_harmless(camera: CameraUnderTest) -> None:
     """A time that is not valid is dropped or converted; a BVS ID refuses it."""
     request = m.SetClock(year=2016, month=13, day=32, hour=25, minute=61, second=61)
     with camera.session() as client:
-        was, began = _read_clock(camera, client), time.monotonic()
+        old_time, read_at = _read_clock(camera, client), time.monotonic()
         try:
             _send_setting(camera, client, request, (0x10,))
             _read_clock(camera, client)  # raises if it is no date
         finally:
-            _set_clock(camera, client, was + timedelta(seconds=time.monotonic() - began))
+            _set_clock(camera, client, old_time + timedelta(seconds=time.monotonic() - read_at))
 
 
 # ---------------------------------------------------------------------- number, input, reboot
 
 
-def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
+def read_next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     """Trigger once and return the four bytes of the sequence number in the result.
 
     Raises:
@@ -237,12 +248,12 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
         raise NotObserved(
             "the place of the sequence number in a result is not known: --camera-sequence-offset"
         )
-    camera.once_waiting(client)
+    camera.wait_until_waiting(client)
     result = client.trigger()
-    begin = offset + (0 if "no_id" in camera.wire.dialect.quirks else camera.wire.word)
+    begin = offset + (0 if "no_id" in camera.wire.dialect.quirks else camera.wire.word_size)
     field = result.body[begin : begin + 4]
     if len(field) < 4:
-        raise NotObserved(f"a result has no four bytes at {offset}: {camera.wire.spell(result)}")
+        raise NotObserved(f"a result has no four bytes at {offset}: {camera.wire.describe(result)}")
     return field
 
 
@@ -250,24 +261,24 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     {"": "SC-C50, inferred", "b16": "SC-C50, published"},
     needs=Allow.NUMBER | Allow.TRIGGER,
     dialects=SMART,
-    documents=("C6",),
+    contradictions=("C6",),
 )
 def sequence_number_is_set(camera: CameraUnderTest) -> None:
     """Set sequence number is the number of the next run; the next run has one more."""
     number = 0x01020304
-    no_id(camera)  # raises if the number's place is unknown
+    has_no_id(camera)  # raises if the number's place is unknown
     little, big = number.to_bytes(4, "little"), number.to_bytes(4, "big")
     with camera.session() as client:
-        camera.ready(client)
-        client.write(camera.wire.frame(MessageId.SET_SEQUENCE_NUMBER, little))
-        first = next_number(camera, client)
-        second = next_number(camera, client)
+        camera.ensure_ready(client)
+        client.write(camera.wire.make_frame(MessageId.SET_SEQUENCE_NUMBER, little))
+        first = read_next_number(camera, client)
+        second = read_next_number(camera, client)
     if camera.dialect == "b16" and first == big:
         return  # the question big_endian_number reports it
-    following = (number + 1).to_bytes(4, "little")
-    if (first, second) != (little, following):
+    next_number = (number + 1).to_bytes(4, "little")
+    if (first, second) != (little, next_number):
         raise Differs(
-            f"{little.hex(' ')} and, in the next run, {following.hex(' ')}",
+            f"{little.hex(' ')} and, in the next run, {next_number.hex(' ')}",
             f"{first.hex(' ')} and {second.hex(' ')}",
         )
 
@@ -281,32 +292,33 @@ def input_data_is_taken(camera: CameraUnderTest) -> None:
     data = camera.options.input_data
     if data is None:
         raise NotObserved("it is not known what input data the application takes: --camera-input")
-    takes = inspection_time(camera)
+    inspection_seconds = inspection_time(camera)
     bits = camera.wire.bits
     with camera.session() as client:
-        camera.ready(client)
-        mark = len(client.received)
+        camera.ensure_ready(client)
+        start_index = len(client.received)
         for _ in range(2):  # the first trigger clears the bit's history
             _send_setting(camera, client, m.SetInput(data=data), (0,))
-            camera.once_waiting(client)
-            mark = len(client.received)
-            within = takes + camera.options.timeout
-            client.trigger("a result of a trigger with input data", within=within)
-        if client.look() & bits.input_container:
+            camera.wait_until_waiting(client)
+            start_index = len(client.received)
+            timeout = inspection_seconds + camera.options.timeout
+            client.trigger("a result of a trigger with input data", timeout=timeout)
+        if client.read_status() & bits.input_container:
             raise Differs(
-                "no Input Container where each trigger had its input data", client.words(mark)
+                "no Input Container where each trigger had its input data",
+                client.describe_received(start_index),
             )
 
 
-@check("MV31, published", needs=Allow.REBOOT, dialects=SMART, documents=("C9",))
+@check("MV31, published", needs=Allow.REBOOT, dialects=SMART, contradictions=("C9",))
 def reboot_restarts_the_camera(camera: CameraUnderTest) -> str:
     """0x43 restarts the camera: the session ends, and it comes back."""
-    return f"{downtime(camera).seconds:.1f} s"
+    return f"{observe_restart(camera).seconds:.1f} s"
 
 
 @check("no document, inferred", needs=Allow.REBOOT, dialects=SMART)
 def stopped_after_a_reboot(camera: CameraUnderTest) -> None:
     """A camera that has restarted is stopped."""
-    seen = downtime(camera)
-    if seen.running:
-        raise Differs("the last application, stopped", f"application {seen.application} runs")
+    observed = observe_restart(camera)
+    if observed.running:
+        raise Differs("the last application, stopped", f"application {observed.application} runs")

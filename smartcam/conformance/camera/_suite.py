@@ -9,7 +9,7 @@ import pytest
 
 from smartcam.conformance.camera._items import ITEMS
 from smartcam.conformance.camera._judging import judge_item
-from smartcam.conformance.camera._options import READERS, ConformanceOptions
+from smartcam.conformance.camera._options import OPTION_PARSERS, ConformanceOptions
 from smartcam.conformance.camera._report import CameraReport
 from smartcam.conformance.camera._results import CameraFinding, CheckOutcome, Item
 from smartcam.conformance.camera._session_under_test import CameraUnderTest
@@ -18,17 +18,17 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-NO_CAMERA = (
+SKIP_NO_CAMERA = (
     "no camera was named: pytest --pyargs smartcam.conformance.camera --camera-url bvs://HOST"
 )
 
-SHARED = (
+SKIP_PARALLEL = (
     "a camera serves one client, and pytest-xdist would start several: give -n0, or leave -n out"
 )
 
 
 class _Reports:
-    """Shows the reports at the end of the run; a pytest plugin while there are reports."""
+    """A pytest plugin that shows the reports at the end of the run."""
 
     NAME: ClassVar[str] = "smartcam-conformance"
 
@@ -42,17 +42,17 @@ class _Reports:
             terminalreporter.write_line(report.text())
             if path is None:
                 continue
-            where = path if not number else f"{path}.{number + 1}"
+            report_path = path if not number else f"{path}.{number + 1}"
             try:
-                report.write(where)
+                report.write(report_path)
             except ConfigurationError as exc:
                 terminalreporter.write_line(str(exc), red=True)
             else:
-                terminalreporter.write_line(f"the report as JSON: {where}")
+                terminalreporter.write_line(f"the report as JSON: {report_path}")
 
 
-def _reports(config: pytest.Config) -> _Reports:
-    """Return the plugin that shows the reports at the end; it is registered when first needed."""
+def _get_reports(config: pytest.Config) -> _Reports:
+    """Return the plugin that shows the reports; the first call registers it with pytest."""
     reports = config.pluginmanager.get_plugin(_Reports.NAME)
     if not isinstance(reports, _Reports):
         reports = _Reports()
@@ -61,7 +61,7 @@ def _reports(config: pytest.Config) -> _Reports:
 
 
 class CameraConformance:
-    """Runs all checks and questions on a camera: subclass it and give the camera's address.
+    """Run all checks and questions on a camera: subclass it and give the camera's address.
 
     ::
 
@@ -97,12 +97,12 @@ class CameraConformance:
         """The report for the tests of this class; they are skipped without a camera."""
         config = request.config
         if not camera_address:
-            pytest.skip(NO_CAMERA)
+            pytest.skip(SKIP_NO_CAMERA)
         if hasattr(config, "workerinput") and camera_address == config.getoption(
             "--camera-url", None
         ):
-            pytest.skip(SHARED)
-        reports = _reports(config).reports
+            pytest.skip(SKIP_PARALLEL)
+        reports = _get_reports(config).reports
         key = f"{type(self).__module__}.{type(self).__qualname__} {camera_address}"
         if key not in reports:
             try:
@@ -111,17 +111,17 @@ class CameraConformance:
                 pytest.exit(str(exc), returncode=pytest.ExitCode.USAGE_ERROR)
             reports[key] = CameraReport(camera)
             suite = request.node.getparent(pytest.Class)
-            suite.addfinalizer(partial(camera.restore, again=True))
+            suite.addfinalizer(partial(camera.restore, retry=True))
         return reports[key]
 
     def _make_options(self, config: pytest.Config, url: str) -> ConformanceOptions:
         fields: dict[str, Any] = {}
-        for option, (field, read) in READERS.items():
+        for option, (field, parse) in OPTION_PARSERS.items():
             text = config.getoption(option, None)
             if text is None:
                 continue
             try:
-                fields[field] = read(text)
+                fields[field] = parse(text)
             except ConfigurationError:
                 raise
             except ValueError as exc:
@@ -137,14 +137,14 @@ class CameraConformance:
         finding = judge_item(camera_report.camera, item)
         camera_report.add(finding)
         if finding.failed:
-            pytest.fail(_words(finding), pytrace=False)
+            pytest.fail(_failure_text(finding), pytrace=False)
         elif finding.outcome is CheckOutcome.NOT_OBSERVED:
             pytest.skip(f"not observed, because {finding.text}")
         elif finding.outcome is CheckOutcome.NOT_APPLICABLE:
             pytest.skip(finding.text)
 
 
-def _words(finding: CameraFinding) -> str:
+def _failure_text(finding: CameraFinding) -> str:
     return "\n".join(
         [
             f"{finding.item.about} ({finding.source}, {finding.grade})",

@@ -10,16 +10,16 @@ class Differs(Exception):  # noqa: N818 - it is a verdict on the camera
     """The camera behaves differently than documented."""
 
     expected: str  # documented behaviour
-    came: str  # observed behaviour
+    observed: str  # observed behaviour
 
     def __str__(self) -> str:
         """Return both behaviours as text."""
-        return f"expected: {self.expected}; came: {self.came}"
+        return f"expected: {self.expected}; came: {self.observed}"
 
 
 class Undescribed(Differs):
-    """No setting of a quirk describes the answer to its question."""
+    """No value of a question's quirk describes the observed behaviour; the question fails."""
 
 
 class NotObserved(Exception):  # noqa: N818 - it is a verdict on the experiment
-    """The camera could not be observed; the text is the reason, to follow "because"."""
+    """The behaviour could not be observed; the text is the reason, as a clause after "because"."""

@@ -1,7 +1,7 @@
-"""Frames as bytes: requests by the dialect's table, received frames by independent code.
+"""Encode requests with the dialect's table, and decode received frames with independent code.
 
-The library's own codecs rest on the same table, so only the header's form and the ids are taken
-from it; numbers are read from the bytes by this module.
+The library decodes with the same table, so a fault of the table would stay hidden. Here only the
+header's form and the message ids come from the table; this module reads the numbers itself.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ MAX_BODY_BYTES = 1 << 20
 """Largest number of bytes of a body: the camera sends about 64 kB (HAL 15, published)."""
 
 
-_REFUSALS = frozenset({(0x10,), (0x13,), (0x16,), (0x1A,)})
+_REFUSAL_CODES = frozenset({(0x10,), (0x13,), (0x16,), (0x1A,)})
 """Result codes of BVS ID that may be the whole body of an answer (ID-a 52, published)."""
 
 
 class BadBytesError(Exception):
-    """Received bytes are not a frame of this dialect; the text says why."""
+    """Received bytes are not a frame of this dialect; the text gives the reason."""
 
 
 class ReceivedFrame(NamedTuple):
@@ -41,14 +41,14 @@ class ReceivedFrame(NamedTuple):
     body: bytes  # the bytes after the header
 
 
-def of_kind(frames: Iterable[ReceivedFrame], message_id: int) -> list[ReceivedFrame]:
-    """Return the frames that have an id."""
+def frames_with_id(frames: Iterable[ReceivedFrame], message_id: int) -> list[ReceivedFrame]:
+    """Return the frames whose message id is ``message_id``."""
     return [frame for frame in frames if frame.message_id == message_id]
 
 
 @dataclass(frozen=True, slots=True)
 class Bits:
-    """Masks of a status word's bits by meaning; 0 if no bit has it.
+    """Masks of a status word's bits by meaning; 0 if no bit has the meaning.
 
     Source: SC-A30, SC-B33 (published) for smart cameras; ID-b 210 and the example of ID-a 227
     (published and derived) for BVS ID.
@@ -78,7 +78,7 @@ class RawDialect:
     def __init__(self, dialect: FramedDialect) -> None:
         self.dialect: FramedDialect = dialect
         self.bits: Bits = BITS[dialect.name]
-        self.word: int = 4 if dialect.word == "I" else 2  # bytes of an ordinary number
+        self.word_size: int = 4 if dialect.word == "I" else 2  # bytes of an ordinary number
 
     @property
     def magic(self) -> bytes:
@@ -92,33 +92,33 @@ class RawDialect:
 
     # ------------------------------------------------------------------ out
 
-    def request(self, message: Message) -> bytes:
+    def encode_request(self, message: Message) -> bytes:
         """Return a request's bytes by the table."""
         return self.dialect.encode(message)
 
-    def frame(self, message_id: int, body: bytes = b"", *, length: int | None = None) -> bytes:
+    def make_frame(self, message_id: int, body: bytes = b"", *, length: int | None = None) -> bytes:
         """Return any frame; ``length`` replaces the correct value of the length field."""
         return self.dialect.header.pack(message_id, len(body) if length is None else length) + body
 
     # ------------------------------------------------------------------ in
 
-    def cut(self, buffer: bytes) -> tuple[int, bytes, int] | None:
-        """Return message id, body and total bytes of the first frame; None while it is incomplete.
+    def parse_frame(self, buffer: bytes) -> tuple[int, bytes, int] | None:
+        """Return message id, body and total size of the first frame; None while it is incomplete.
 
         Raises:
             BadBytesError: no frame begins with these bytes.
         """
-        magic, word = self.magic, self.word
+        magic, word_size = self.magic, self.word_size
         if not magic.startswith(buffer[: len(magic)]):
             raise BadBytesError(
                 f"no frame of {self.dialect.name} begins with {hex_excerpt(buffer)}: "
                 f"expected {magic.hex(' ')}"
             )
-        begin = len(magic) + 2 * word
+        begin = len(magic) + 2 * word_size
         if len(buffer) < begin:
             return None
-        first = int.from_bytes(buffer[len(magic) : len(magic) + word], "little")
-        second = int.from_bytes(buffer[len(magic) + word : begin], "little")
+        first = int.from_bytes(buffer[len(magic) : len(magic) + word_size], "little")
+        second = int.from_bytes(buffer[len(magic) + word_size : begin], "little")
         message_id, length = (second, first) if magic else (first, second)
         length -= 4 if self.dialect.name == "thesis" else 0  # the length counts the message id
         if not 0 <= length <= MAX_BODY_BYTES:
@@ -126,46 +126,46 @@ class RawDialect:
         end = begin + length
         return (message_id, buffer[begin:end], end) if end <= len(buffer) else None
 
-    def numbers(self, body: bytes) -> tuple[int, ...]:
-        """Return a body as ordinary numbers, without surplus bytes."""
-        code = "I" if self.word == 4 else "H"
-        count = len(body) // self.word
+    def read_numbers(self, body: bytes) -> tuple[int, ...]:
+        """Return a body as numbers of ``word_size`` bytes; surplus bytes at the end are ignored."""
+        code = "I" if self.word_size == 4 else "H"
+        count = len(body) // self.word_size
         return struct.unpack_from(f"<{count}{code}", body)
 
-    def statuses(self, frames: Iterable[ReceivedFrame]) -> list[int]:
-        """Return the status words among frames."""
-        bodies = (frame.body for frame in of_kind(frames, MessageId.STATUS))
-        return [int.from_bytes(body[: self.word], "little") for body in bodies]
+    def status_words(self, frames: Iterable[ReceivedFrame]) -> list[int]:
+        """Return the status word of each status among frames."""
+        bodies = (frame.body for frame in frames_with_id(frames, MessageId.STATUS))
+        return [int.from_bytes(body[: self.word_size], "little") for body in bodies]
 
     # ------------------------------------------------------------------ in words
 
-    def spell(self, frame: ReceivedFrame) -> str:
+    def describe(self, frame: ReceivedFrame) -> str:
         """Return a frame of the camera in readable form, with hex."""
-        return self._spell(Sender.CAMERA, frame.message_id, frame.body)
+        return self._describe(Sender.CAMERA, frame.message_id, frame.body)
 
-    def spell_request(self, data: bytes) -> str:
+    def describe_request(self, data: bytes) -> str:
         """Return a sent frame in readable form, with hex; only hex if the bytes are not a frame."""
         try:
-            parts = self.cut(data)
+            parts = self.parse_frame(data)
         except BadBytesError:
             parts = None
         if parts is None or parts[2] != len(data):
             return hex_excerpt(data)
-        return self._spell(Sender.CLIENT, parts[0], parts[1], data)
+        return self._describe(Sender.CLIENT, parts[0], parts[1], data)
 
-    def _spell(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
+    def _describe(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
         spelled = self.dialect.spell(sender, LibraryFrame(message_id, body))
         fields = ", ".join(f"{name}={value}" for name, value in (spelled.fields or {}).items())
-        shown = f"{spelled.message}({fields})" if len(fields) <= 100 else spelled.message
+        label = f"{spelled.message}({fields})" if len(fields) <= 100 else spelled.message
         if not self.dialect.knows(sender, message_id):
-            shown = f"id {message_id:#04x}"
-        return f"{shown}: {hex_excerpt(raw or spelled.data)}"
+            label = f"id {message_id:#04x}"
+        return f"{label}: {hex_excerpt(raw or spelled.data)}"
 
-    def flaw(self, frame: ReceivedFrame) -> str | None:
-        """Return the difference of a camera's frame from the documents; None without one."""
-        if self.is_bid and self.numbers(frame.body) in _REFUSALS:
+    def find_flaw(self, frame: ReceivedFrame) -> str | None:
+        """Return in what a frame's id or length differs from the documents; None if it does not."""
+        if self.is_bid and self.read_numbers(frame.body) in _REFUSAL_CODES:
             return None  # a refusal may be only its code, for any request
-        size = self._sizes().get(frame.message_id)
+        size = self._body_sizes().get(frame.message_id)
         if size is None:
             return f"message {frame.message_id:#04x} is not one that a camera sends"
         least, exact = size
@@ -175,9 +175,9 @@ class RawDialect:
             return f"{name} has {len(frame.body)} bytes of body: expected {least}{more}"
         return None
 
-    def _sizes(self) -> Mapping[int, tuple[int, bool]]:
+    def _body_sizes(self) -> Mapping[int, tuple[int, bool]]:
         """Return the body length of each message that a camera sends, and whether it is exact."""
-        word = self.word
+        word = self.word_size
         code_bytes = word if self.dialect.coded else 0
         table: dict[int, tuple[int, bool]] = {
             MessageId.CONNECT: (code_bytes + word, True),

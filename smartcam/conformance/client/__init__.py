@@ -1,4 +1,4 @@
-"""Judge clients: an emulated camera gives them tasks, misbehaves, and observes their messages.
+"""Judge clients: give them tasks with an emulated camera that misbehaves, and check their messages.
 
 In a test file of the client's author::
 
@@ -11,8 +11,8 @@ or without one::
 
     pytest --pyargs smartcam.conformance.client --client-command "./mydriver {host} {port} {task}"
 
-:data:`CHECKS` has all checks: a scene (a camera and a task), a rule, and the source of the camera's
-expectation. Importing this is light, since names are resolved when they are first used.
+:data:`CHECKS` has all checks: each has a scene (a camera and a task), a rule and the rule's source.
+Importing this is light, since names are resolved when they are first used.
 """
 
 from __future__ import annotations

@@ -36,10 +36,10 @@ class ClientCheck:
 
     name: str  # name of the check, in reports and for ``-k``
     scene: Scene  # the camera and the task
-    rule: Callable[[ClientRun], str | None]  # function that returns the fault, or None
+    rule: Callable[[ClientRun], str | None]  # returns the client's mistake, or None
     expects: str  # behaviour that the camera's documents require of a client
     source: str  # source in the documents, with its grade
-    grade: Grade = Grade.MUST  # severity
+    grade: Grade = Grade.MUST  # weight of a breach
     dialects: tuple[str, ...] = EVERY_DIALECT  # dialects that the check is about
 
     def applies(self, dialect: str, transport: str) -> bool:
@@ -50,8 +50,8 @@ class ClientCheck:
         )
 
 
-_BOUND = "a client that waits without a bound stops the machine it works for"
-_SILENCE = "every refusal but one is silence"
+_NEEDS_BOUND = "a client that waits without a bound stops the machine it works for"
+_MOSTLY_SILENT = "every refusal but one is silence"
 
 CHECKS: tuple[ClientCheck, ...] = (
     # ------------------------------------------------------------------ the conversation
@@ -266,35 +266,35 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_without_a_result",
         scene=SCENES["no_result"],
         rule=rules.fails,
-        expects="nothing answers a trigger; " + _BOUND,
+        expects="nothing answers a trigger; " + _NEEDS_BOUND,
         source="SC-A28, published",
     ),
     ClientCheck(
         name="fails_where_busy_never_falls",
         scene=SCENES["busy_for_ever"],
         rule=rules.fails,
-        expects="while BUSY is set no inspection begins; " + _BOUND,
+        expects="while BUSY is set no inspection begins; " + _NEEDS_BOUND,
         source="SC-A30, published; the rest: inferred",
     ),
     ClientCheck(
         name="ends_where_the_camera_is_stopped",
         scene=SCENES["stopped"],
         rule=rules.ends,
-        expects="a stopped application ignores triggers; " + _SILENCE,
+        expects="a stopped application ignores triggers; " + _MOSTLY_SILENT,
         source="MV31, published",
     ),
     ClientCheck(
         name="fails_where_connect_is_not_answered",
         scene=SCENES["no_connect_answer"],
         rule=rules.fails,
-        expects="a camera is silent to what it does not understand; " + _BOUND,
+        expects="a camera is silent to what it does not understand; " + _NEEDS_BOUND,
         source="SC-A28, derived",
     ),
     ClientCheck(
         name="ends_where_query_is_not_answered",
         scene=SCENES["no_query_answer"],
         rule=rules.ends,
-        expects="a camera is silent to what it does not understand; " + _BOUND,
+        expects="a camera is silent to what it does not understand; " + _NEEDS_BOUND,
         source="SC-A28, derived",
     ),
     ClientCheck(
@@ -323,7 +323,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_where_the_camera_is_gone",
         scene=SCENES["half_open"],
         rule=rules.fails,
-        expects="a pulled cable shows as silence only; " + _BOUND,
+        expects="a pulled cable shows as silence only; " + _NEEDS_BOUND,
         source="ID-a 52, published: a dead TCP peer is not noticed promptly",
     ),
     ClientCheck(
@@ -337,14 +337,14 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_where_garbage_comes",
         scene=SCENES["garbage"],
         rule=rules.fails,
-        expects="after bytes that make no frame nothing can be trusted; " + _BOUND,
+        expects="after bytes that make no frame nothing can be trusted; " + _NEEDS_BOUND,
         source="inferred",
     ),
     ClientCheck(
         name="fails_where_a_length_is_impossible",
         scene=SCENES["length_bomb"],
         rule=rules.fails,
-        expects="a container has about 64 kB at most; " + _BOUND,
+        expects="a container has about 64 kB at most; " + _NEEDS_BOUND,
         source="HAL 15, published",
     ),
 )

@@ -23,7 +23,7 @@ class ClientFinding(NamedTuple):
     camera: str  # dialect and transport
     scene: str  # special condition of the camera
     task: str  # task of the client
-    wrong: str  # fault of the client
+    wrong: str  # mistake of the client
     expects: str  # behaviour that the documents require of a client
     source: str  # source in the documents
     wire: tuple[str, ...]  # messages on the wire, one line each
@@ -82,10 +82,10 @@ def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
     """
     reporter.section("smartcam: the client")
     for grade in Grade:
-        graded = [finding for finding in findings if finding.grade == grade.value]
-        if not graded:
+        findings_of_grade = [finding for finding in findings if finding.grade == grade.value]
+        if not findings_of_grade:
             continue
-        reporter.write_line(f"{grade.value}: {len(graded)}")
-        for finding in graded:
-            short = f"{finding.check} ({finding.camera}): {finding.wrong}"
-            reporter.write_line(str(finding) if grade is Grade.SHOULD else short)
+        reporter.write_line(f"{grade.value}: {len(findings_of_grade)}")
+        for finding in findings_of_grade:
+            summary = f"{finding.check} ({finding.camera}): {finding.wrong}"
+            reporter.write_line(str(finding) if grade is Grade.SHOULD else summary)

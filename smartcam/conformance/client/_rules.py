@@ -1,7 +1,7 @@
-"""Rules for a client, checked against its messages and its results.
+"""Rules that a client's messages and results must follow.
 
-Each rule gets a :class:`~smartcam.conformance.client._runs.ClientRun` and returns the mistake as
-text, or None.
+Each rule is a function that gets a :class:`~smartcam.conformance.client._runs.ClientRun` and
+returns the client's mistake as text, or None if the client follows the rule.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from smartcam.conformance.client._runs import ClientRun, RecordedMessage
 
 STATUS_GRACE = 0.05
-"""Seconds that a status may take to reach the client, which cannot know it earlier."""
+"""Seconds after a status was sent in which the client may not have received it yet."""
 
 
-def _wrong_results(run: ClientRun) -> str | None:
+def _find_wrong_result(run: ClientRun) -> str | None:
     """Return the first mistake in the client's results; too few results are no mistake."""
-    scene, sent, last = run.scene, run.sent_turns, -1
+    scene, sent_turns, last_turn = run.scene, run.sent_turns, -1
     for number, data in enumerate(run.outcome.results, 1):
         label = f"result {number}, {data[:32].hex(' ') or 'empty'},"
         content = read_container(data)
@@ -32,21 +32,21 @@ def _wrong_results(run: ClientRun) -> str | None:
         application, turn = content
         if application != scene.application:
             return f"{label} is of application {application}, not of {scene.application}"
-        if turn not in sent:
+        if turn not in sent_turns:
             return f"{label} was never sent"
         if turn in scene.stale:
             return f"{label} is of an inspection that was under way before the client's trigger"
-        if turn == last:
+        if turn == last_turn:
             return f"{label} is of the same inspection as the one before"
-        if turn < last:
+        if turn < last_turn:
             return f"{label} is of an earlier inspection than the one before"
-        last = turn
-    if len(run.outcome.results) > scene.wanted:
-        return f"it gave {len(run.outcome.results)} results, {scene.wanted} were wanted"
+        last_turn = turn
+    if len(run.outcome.results) > scene.result_count:
+        return f"it gave {len(run.outcome.results)} results, {scene.result_count} were wanted"
     return None
 
 
-def _end(run: ClientRun) -> str:
+def _end_text(run: ClientRun) -> str:
     error = run.outcome.error
     return "it says that all is well" if error is None else f"it failed: {error}"
 
@@ -54,32 +54,32 @@ def _end(run: ClientRun) -> str:
 def ends(run: ClientRun) -> str | None:
     """The client ends in time, with the right results or with an error."""
     outcome = run.outcome
-    if not outcome.ended:
+    if not outcome.ended_in_time:
         return f"it was still under way after {run.timeout:g} s"
-    wrong = _wrong_results(run)
-    if wrong is None and outcome.error is None and len(outcome.results) < run.scene.wanted:
+    mistake = _find_wrong_result(run)
+    if mistake is None and outcome.error is None and len(outcome.results) < run.scene.result_count:
         count = len(outcome.results)
-        return f"it says that all is well, and gave {count} of {run.scene.wanted} results"
-    return wrong
+        return f"it says that all is well, and gave {count} of {run.scene.result_count} results"
+    return mistake
 
 
 def fails(run: ClientRun) -> str | None:
     """The client ends in time, with an error and without a result."""
     outcome = run.outcome
-    if outcome.ended and (outcome.results or outcome.error is None):
+    if outcome.ended_in_time and (outcome.results or outcome.error is None):
         count = len(outcome.results)
-        return f"{_end(run)}, and gave {count} result{'s' if count != 1 else ''}"
+        return f"{_end_text(run)}, and gave {count} result{'s' if count != 1 else ''}"
     return ends(run)
 
 
 def gives_results(run: ClientRun) -> str | None:
-    """The client gives exactly the results that its task is about."""
-    wrong = ends(run)
-    if wrong is None and run.outcome.error is not None:
-        return _end(run)
-    if wrong is None and len(run.outcome.results) < run.scene.wanted:
-        return f"it gave {len(run.outcome.results)} of {run.scene.wanted} results"
-    return wrong
+    """The client gives exactly the results that its task asks for."""
+    mistake = ends(run)
+    if mistake is None and run.outcome.error is not None:
+        return _end_text(run)
+    if mistake is None and len(run.outcome.results) < run.scene.result_count:
+        return f"it gave {len(run.outcome.results)} of {run.scene.result_count} results"
+    return mistake
 
 
 def sends_whole_messages(run: ClientRun) -> str | None:
@@ -94,37 +94,41 @@ def sends_whole_messages(run: ClientRun) -> str | None:
 
 def connects_first(run: ClientRun) -> str | None:
     """The client sends only Connect, and Disconnect before it, until the answer to Connect."""
-    answered: set[str] = set()
+    connected_peers: set[str] = set()
     for message in run.messages:
         if isinstance(message.message, m.ConnectAnswer):
-            answered.add(message.peer)
+            connected_peers.add(message.peer)
         elif (
             message.sender is Sender.CLIENT
-            and message.peer not in answered
+            and message.peer not in connected_peers
             and not isinstance(message.message, (m.Connect, m.Disconnect))
         ):
-            return f"{_name(message)} came before Connect was answered"
-    if not answered:
+            return f"{_message_name(message)} came before Connect was answered"
+    if not connected_peers:
         return "it did not connect"
     return None
 
 
 def disconnects(run: ClientRun) -> str | None:
-    """The client's last word is Disconnect."""
-    last: dict[str, RecordedMessage] = {}
+    """The client's last message is Disconnect."""
+    last_messages: dict[str, RecordedMessage] = {}
     for message in run.messages:
         if message.sender is Sender.CLIENT:
-            last[message.peer] = message
-    if not last:
+            last_messages[message.peer] = message
+    if not last_messages:
         return "it did not connect"
-    left = [request for request in last.values() if not isinstance(request.message, m.Disconnect)]
-    return f"its last word was {_name(left[0])}" if left else None
+    unfinished = [
+        request
+        for request in last_messages.values()
+        if not isinstance(request.message, m.Disconnect)
+    ]
+    return f"its last word was {_message_name(unfinished[0])}" if unfinished else None
 
 
 def asks_one_at_a_time(run: ClientRun) -> str | None:
-    """The client has one request of a kind open at a time: answers do not name their request.
+    """The client has at most one open request of a kind, since answers do not name their request.
 
-    A trigger may stand between two Queries, or two Get status: their answers come in order.
+    After a trigger it may send a second Query or Get status: their answers come in order.
     """
     open_requests: set[tuple[str, type[m.Message]]] = set()
     for recorded in run.messages:
@@ -132,9 +136,11 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
         if isinstance(message, Request) and message.answer and run.dialect.answers(type(message)):
             key = (recorded.peer, message.answer)
             if key in open_requests:
-                return f"{_name(recorded)} came although the one before was not answered yet"
+                return (
+                    f"{_message_name(recorded)} came although the one before was not answered yet"
+                )
             open_requests.add(key)
-        if isinstance(message, m.Trigger):  # a trigger may stand between two queries
+        if isinstance(message, m.Trigger):  # then a second query is allowed
             open_requests -= {(recorded.peer, m.QueryAnswer), (recorded.peer, m.StatusReport)}
         elif message is not None and recorded.sender is Sender.CAMERA:
             open_requests.discard((recorded.peer, type(message)))
@@ -144,8 +150,8 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
 def triggers_as_told(run: ClientRun) -> str | None:
     """The client sends the number of triggers in its task."""
     count = sum(isinstance(request.message, m.Trigger) for _, request in run.requests)
-    if count != run.scene.wanted:
-        return f"it sent {count} triggers, {run.scene.wanted} were asked for"
+    if count != run.scene.result_count:
+        return f"it sent {count} triggers, {run.scene.result_count} were asked for"
     return None
 
 
@@ -156,13 +162,15 @@ def never_triggers(run: ClientRun) -> str | None:
 
 
 def triggers_when_waiting(run: ClientRun) -> str | None:
-    """The client triggers while the last status that was sent has Waiting for Trigger."""
-    for place, request in run.requests:
+    """The client triggers only while the camera's last status has Waiting for Trigger."""
+    for index, request in run.requests:
         if isinstance(request.message, m.Trigger):
-            status = run.status_before(place)
+            status = run.status_before(index)
             if status is None or Status.WAITING_FOR_TRIGGER not in status:
-                shown = "no status had been sent" if status is None else f"the status was {status}"
-                return f"Trigger came when {shown}"
+                status_text = (
+                    "no status had been sent" if status is None else f"the status was {status}"
+                )
+                return f"Trigger came when {status_text}"
     return None
 
 
@@ -174,7 +182,7 @@ def stops_first(run: ClientRun) -> str | None:
             running = isinstance(request.message, m.Start)
         elif isinstance(request.message, m.SwitchApplication):
             if running and run.dialect.name in SMART:
-                return f"{_name(request)} came while the application ran"
+                return f"{_message_name(request)} came while the application ran"
             return None
     return "it did not send SwitchApplication"
 
@@ -189,21 +197,25 @@ def waits_for_switch(run: ClientRun) -> str | None:
             return None
         elif switching is not None and _is_command(message):
             seconds = message.time - switching.time
-            return (
-                f"{_name(message)} came {seconds:.3f} s after SwitchApplication, before its answer"
-            )
+            name = _message_name(message)
+            return f"{name} came {seconds:.3f} s after SwitchApplication, before its answer"
     return None if switching is not None else "it did not send SwitchApplication"
 
 
 def is_quiet_while_busy(run: ClientRun) -> str | None:
-    """The client gives no command while the last status that was sent has BUSY."""
-    since: float | None = None
+    """The client gives no command while the camera's last status has BUSY."""
+    busy_since: float | None = None
     for message in run.messages:
         if isinstance(message.message, m.StatusReport) and not message.lost:
             busy = Status.BUSY in message.message.status
-            since = None if not busy else message.time if since is None else since
-        elif since is not None and _is_command(message) and message.time - since > STATUS_GRACE:
-            return f"{_name(message)} came {message.time - since:.3f} s after BUSY was sent"
+            busy_since = None if not busy else message.time if busy_since is None else busy_since
+        elif (
+            busy_since is not None
+            and _is_command(message)
+            and message.time - busy_since > STATUS_GRACE
+        ):
+            seconds = message.time - busy_since
+            return f"{_message_name(message)} came {seconds:.3f} s after BUSY was sent"
     return None
 
 
@@ -213,5 +225,5 @@ def _is_command(recorded: RecordedMessage) -> bool:
     return recorded.sender is Sender.CLIENT and not isinstance(recorded.message, harmless)
 
 
-def _name(recorded: RecordedMessage) -> str:
+def _message_name(recorded: RecordedMessage) -> str:
     return recorded.hex if recorded.message is None else type(recorded.message).__name__

@@ -1,4 +1,4 @@
-"""One task in one scene: its outcome, and the messages on the wire."""
+"""Run one client's task in one scene, and record its outcome and the messages on the wire."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class RecordedMessage(NamedTuple):
     sender: Sender  # side that sent it
     peer: str  # address and port of the client
     message: Message | None  # decoded message; None for bytes that are no message of the dialect
-    text: str  # the message with its fields, ``?`` for none
-    hex: str  # the frame as it passed, or the bytes
-    error: str | None = None  # reason why the camera ignored it, if it did
-    lost: bool = False  # whether the message was lost on the way
+    text: str  # the message with its fields, ``?`` for bytes that are no message
+    hex: str  # the frame, or the other bytes
+    error: str | None = None  # reason why the camera ignored the message, None if it did not
+    lost: bool = False  # True if a fault kept the message from the client
 
     def __str__(self) -> str:
         """Return the message as a line: seconds, direction, message, bytes."""
@@ -51,7 +51,7 @@ class RecordedMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientRun:
-    """A task that a client has tried to do.
+    """A client's attempt at a task.
 
     Attributes:
         scene: the camera.
@@ -71,7 +71,7 @@ class ClientRun:
 
     @property
     def requests(self) -> Iterator[tuple[int, RecordedMessage]]:
-        """The client's messages, with their places in ``messages``."""
+        """The client's messages, each with its index in ``messages``."""
         return (
             (n, message)
             for n, message in enumerate(self.messages)
@@ -80,7 +80,7 @@ class ClientRun:
 
     @property
     def sent_turns(self) -> list[int]:
-        """Turns of the results that really came from the application, in order."""
+        """Run numbers of the results that the scene's application sent, in order."""
         turns: list[int] = []
         for message in self.messages:
             if isinstance(message.message, ResultContainer) and not message.lost:
@@ -89,9 +89,9 @@ class ClientRun:
                     turns.append(content[1])
         return turns
 
-    def status_before(self, place: int) -> Status | None:
-        """Return the last status that the camera had sent before a place, None for none."""
-        for message in reversed(self.messages[:place]):
+    def status_before(self, index: int) -> Status | None:
+        """Return the last status that the camera sent before message ``index``, if there is one."""
+        for message in reversed(self.messages[:index]):
             if isinstance(message.message, StatusReport) and not message.lost:
                 return message.message.status
         return None
@@ -104,7 +104,7 @@ class ClientRun:
         return [f"... {left_out} before" if left_out > 0 else "", *lines][left_out <= 0 :]
 
 
-async def perform(
+async def run_scene(
     client: Client,
     scene: Scene,
     *,
@@ -126,9 +126,9 @@ async def perform(
 
     Cancellation: camera and client are ended.
     """
-    check_kind(client, Client, "client", "a client", "perform")
-    check_kind(scene, Scene, "scene", "a Scene", "perform")
-    timeout = check_seconds(timeout, "timeout", "perform", above=True)
+    check_kind(client, Client, "client", "a client", "run_scene")
+    check_kind(scene, Scene, "scene", "a Scene", "run_scene")
+    timeout = check_seconds(timeout, "timeout", "run_scene", above=True)
     async with EmulatedCamera(
         APPLICATIONS,
         builtins=False,
@@ -149,10 +149,13 @@ async def perform(
             transport=transport,
             dialect=dialect,
         )
-        began = camera.clock.now
+        started_at = camera.clock.now
         outcome = await client.perform(task, timeout)
-        await _settle(camera)
-        messages = tuple(_message_of(camera.spoken, entry, began) for entry in _merged(camera.log))
+        await _wait_for_last_message(camera)
+        messages = tuple(
+            _record_entry(camera.spoken, entry, started_at)
+            for entry in _join_ignored_frames(camera.log)
+        )
     return ClientRun(
         scene=scene,
         task=task,
@@ -163,58 +166,58 @@ async def perform(
     )
 
 
-async def _settle(camera: EmulatedCamera) -> None:
-    """Wait until the camera has received the client's last message."""
-    end = time.monotonic() + CLIENT_END_TIMEOUT
-    seen = -1
-    while time.monotonic() < end:
-        # each turn of the loop handles datagrams and deliveries that are there already
+async def _wait_for_last_message(camera: EmulatedCamera) -> None:
+    """Wait until the client has no connection, or, on UDP, sends no more messages."""
+    deadline = time.monotonic() + CLIENT_END_TIMEOUT
+    log_length = -1
+    while time.monotonic() < deadline:
+        # each turn of the loop handles data that the sockets have received already
         for _ in range(5):
             await asyncio.sleep(0)
-        if not camera.links or (camera.transport == "udp" and len(camera.log) == seen):
+        if not camera.links or (camera.transport == "udp" and len(camera.log) == log_length):
             return
-        seen = len(camera.log)
+        log_length = len(camera.log)
         await asyncio.sleep(0.01)
 
 
-def _merged(log: Iterable[LogEntry]) -> list[LogEntry]:
-    """Join the entry of an ignored frame with the entry that gives the reason."""
+def _join_ignored_frames(log: Iterable[LogEntry]) -> list[LogEntry]:
+    """Join each entry of an ignored frame with the next entry, which has the reason."""
     merged: list[LogEntry] = []
     for entry in log:
-        before = merged[-1] if merged else None
+        previous = merged[-1] if merged else None
         if (
             entry.error is not None
-            and before is not None
-            and before.direction == entry.direction
-            and before.peer == entry.peer
-            and before.message_id is not None
-            and before.error is None
-            and before.hex == entry.hex
+            and previous is not None
+            and previous.direction == entry.direction
+            and previous.peer == entry.peer
+            and previous.message_id is not None
+            and previous.error is None
+            and previous.hex == entry.hex
         ):
-            merged[-1] = before._replace(error=entry.error)
+            merged[-1] = previous._replace(error=entry.error)
         else:
             merged.append(entry)
     return merged
 
 
-def _message_of(dialect: FramedDialect, entry: LogEntry, began: float) -> RecordedMessage:
+def _record_entry(dialect: FramedDialect, entry: LogEntry, started_at: float) -> RecordedMessage:
     data = entry.wire
     if data is None and entry.message_id is not None:
         payload = bytes.fromhex(entry.hex)
         data = dialect.encode_frame(Frame(entry.message_id, payload)).hex(" ")
     return RecordedMessage(
-        entry.time - began,
+        entry.time - started_at,
         Sender.CLIENT if entry.direction == "in" else Sender.CAMERA,
         entry.peer,
         entry.message,
-        _text(dialect, entry.message),
+        _message_text(dialect, entry.message),
         entry.hex if data is None else data,
         entry.error,
         entry.wire == "" or (entry.fault or "").endswith(("not sent", "connection ended")),
     )
 
 
-def _text(dialect: FramedDialect, message: Message | None) -> str:
+def _message_text(dialect: FramedDialect, message: Message | None) -> str:
     if message is None:
         return "?"
     fields: list[str] = []

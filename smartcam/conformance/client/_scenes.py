@@ -1,4 +1,4 @@
-"""Define scenes: a camera with a fault, and the task of a client in it."""
+"""Define scenes: each is a camera, mostly with a fault, and a task for a client."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ APPLICATION, OTHER, FREE_RUNNING, MISSING = 21, 3, 9, 99
 an id that no application has."""
 
 HOLD_SECONDS = 0.25
-"""Seconds for which a message is held back; a client's time-outs are longer."""
+"""Seconds for which a message is held back: less than the timeouts of clients."""
 
 BUSY_SECONDS = 1.0
-"""Seconds of BUSY after a switch's answer: long enough for a client that starts slowly to see
-it."""
+"""Seconds of BUSY after a switch's answer: enough for a slow client to get the status with BUSY."""
 
 WAITING_STATUS = 0x280
 """Status with Running and Waiting for Trigger."""
@@ -48,7 +47,7 @@ def read_container(data: bytes) -> tuple[int, int] | None:
     return application, turn
 
 
-def _application(number: int, **other: Any) -> dict[str, Any]:
+def _make_application(number: int, **other: Any) -> dict[str, Any]:
     def values(run: Run) -> dict[str, int]:
         return {"application": number, "turn": run.turn}
 
@@ -63,20 +62,20 @@ def _application(number: int, **other: Any) -> dict[str, Any]:
 
 
 APPLICATIONS: tuple[dict[str, Any], ...] = (
-    _application(APPLICATION),
-    _application(OTHER),
-    _application(FREE_RUNNING, rate=50.0, processing_time=0.005),
+    _make_application(APPLICATION),
+    _make_application(OTHER),
+    _make_application(FREE_RUNNING, rate=50.0, processing_time=0.005),
 )
 """Applications that are stored on the camera."""
 
 
-def _none(dialect: FramedDialect) -> Sequence[BaseFault]:
+def _no_faults(dialect: FramedDialect) -> Sequence[BaseFault]:
     return ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """A camera with a fault, and the task of a client.
+    """A camera, mostly with a fault, and a task for a client.
 
     Attributes:
         name: name of the scene.
@@ -84,10 +83,10 @@ class Scene:
         verb: verb of the task.
         number: number of the task.
         active: application that is loaded at first.
-        running: whether the camera is in run mode at first.
-        faults: the faults, in a dialect.
+        running: True if the camera is in run mode at first.
+        faults: function that returns the faults for a dialect.
         quirks: quirks of the camera.
-        stale: runs of the application that the client did not trigger.
+        stale: run numbers of inspections that the client did not trigger.
         dialects: dialects in which the scene makes sense.
         transports: transports over which the scene makes sense.
     """
@@ -98,15 +97,15 @@ class Scene:
     number: int | None = None
     active: int = APPLICATION
     running: bool = True
-    faults: Callable[[FramedDialect], Sequence[BaseFault]] = _none
+    faults: Callable[[FramedDialect], Sequence[BaseFault]] = _no_faults
     quirks: Mapping[str, Any] = field(default_factory=dict[str, Any])
     stale: frozenset[int] = frozenset()
     dialects: tuple[str, ...] = EVERY_DIALECT
     transports: tuple[str, ...] = ("tcp", "udp")
 
     @property
-    def wanted(self) -> int:
-        """Number of results that the task is about."""
+    def result_count(self) -> int:
+        """Number of results that the task asks for."""
         return 1 if self.verb == "switch" else self.number or 1
 
     @property
@@ -115,34 +114,34 @@ class Scene:
         return self.number or 0 if self.verb == "switch" else self.active
 
 
-def _unknown_messages(dialect: FramedDialect) -> Sequence[BaseFault]:
+def _insert_unknown_messages(dialect: FramedDialect) -> Sequence[BaseFault]:
     data = dialect.encode_frame(Frame(0x77, b"new in this firmware"))
     # not before the answer to Connect: until then the camera sends nothing (SC-A28, published)
     between = ("StatusReport", "QueryAnswer", "ResultContainer")
     return [f.Insert(data=data, on=name, where="before", times=None) for name in between]
 
 
-def _unknown_bits(dialect: FramedDialect) -> Sequence[BaseFault]:
+def _set_unknown_bit(dialect: FramedDialect) -> Sequence[BaseFault]:
     offset = dialect.header.size  # the status word's lowest byte
     return [f.Corrupt(on="StatusReport", offset=offset, xor=0x40, times=None)]
 
 
-def _other_result(dialect: FramedDialect) -> Sequence[BaseFault]:
+def _insert_other_result(dialect: FramedDialect) -> Sequence[BaseFault]:
     fields: dict[str, int | str] = {"application": MISSING, "data": container(MISSING, 0).hex()}
     return [f.Insert(message="ResultContainer", fields=fields, on="ResultContainer")]
 
 
-def _status_between(dialect: FramedDialect) -> Sequence[BaseFault]:
+def _insert_status(dialect: FramedDialect) -> Sequence[BaseFault]:
     fields: dict[str, int | str] = {"status": WAITING_STATUS}
     return [f.Insert(message="StatusReport", fields=fields, on="QueryAnswer", times=None)]
 
 
-def _bytes(dialect: FramedDialect) -> Sequence[BaseFault]:
+def _split_every_byte(dialect: FramedDialect) -> Sequence[BaseFault]:
     longest = dialect.header.size + 16
     return [f.Split(after=after, pause=0.001, times=None) for after in range(1, longest)]
 
 
-def _bomb(dialect: FramedDialect) -> Sequence[BaseFault]:
+def _announce_impossible_length(dialect: FramedDialect) -> Sequence[BaseFault]:
     header = dialect.header
     number = dialect.encode_frame(Frame(0x20, b""))[: len(header.magic)]
     size = b"\xff" * (4 if header.code == "I" else 2)
@@ -151,14 +150,14 @@ def _bomb(dialect: FramedDialect) -> Sequence[BaseFault]:
     return [f.Insert(data=data, on="ResultContainer", where="instead", times=None)]
 
 
-def _always(*faults: BaseFault) -> Callable[[FramedDialect], Sequence[BaseFault]]:
+def _fixed_faults(*faults: BaseFault) -> Callable[[FramedDialect], Sequence[BaseFault]]:
     return lambda dialect: faults
 
 
 GARBAGE = bytes(range(0x9B, 0xDB))
-"""Bytes that begin no frame: as a 16-bit header they announce 40,348 bytes."""
+"""Bytes that are no frame; read as a 16-bit header, they announce a body of 40,348 bytes."""
 
-_BROKEN: tuple[tuple[str, str, BaseFault], ...] = (
+_SINGLE_FAULT_SCENES: tuple[tuple[str, str, BaseFault], ...] = (
     (
         "overtriggered",
         "every trigger is dropped, Overtriggered is set",
@@ -202,20 +201,20 @@ SCENES: Mapping[str, Scene] = {
         Scene(
             name="byte_by_byte",
             about="each byte comes by itself",
-            faults=_bytes,
+            faults=_split_every_byte,
             transports=("tcp",),
         ),
         Scene(
             name="coalesced",
             about="messages come together in one segment",
-            faults=_always(f.Coalesce(count=2, seconds=0.05, times=None)),
+            faults=_fixed_faults(f.Coalesce(count=2, seconds=0.05, times=None)),
             number=3,
             transports=("tcp",),
         ),
         Scene(
             name="inspection_under_way",
             about="a sensor has triggered the camera right before the client's trigger",
-            faults=_always(
+            faults=_fixed_faults(
                 f.LateResult(seconds=HOLD_SECONDS), f.DigitalInput(on="Connect", when="before")
             ),
             stale=frozenset({0}),
@@ -223,33 +222,33 @@ SCENES: Mapping[str, Scene] = {
         Scene(
             name="result_of_another",
             about="a result of another application comes first",
-            faults=_other_result,
+            faults=_insert_other_result,
         ),
         Scene(
             name="sent_twice",
             about="the first inspection sends its result twice",
-            faults=_always(f.ExtraResult()),
+            faults=_fixed_faults(f.ExtraResult()),
             number=3,
         ),
         Scene(
             name="status_between",
             about="a status comes between a Query and its answer",
-            faults=_status_between,
+            faults=_insert_status,
         ),
         Scene(
             name="unknown_messages",
             about="messages with an unknown id come in between",
-            faults=_unknown_messages,
+            faults=_insert_unknown_messages,
         ),
         Scene(
             name="unknown_bits",
             about="the status has a bit set that has no name",
-            faults=_unknown_bits,
+            faults=_set_unknown_bit,
         ),
         Scene(
             name="busy_after_switch",
             about="BUSY is still set when the switch is answered",
-            faults=_always(
+            faults=_fixed_faults(
                 f.BusyForEver(seconds=BUSY_SECONDS, on="SwitchApplication", when="after")
             ),
             verb="switch",
@@ -259,7 +258,7 @@ SCENES: Mapping[str, Scene] = {
         Scene(
             name="late_switch_answer",
             about="the switch is answered after BUSY has fallen",
-            faults=_always(f.Delay(on="SwitchAnswer", seconds=HOLD_SECONDS, overtaken=True)),
+            faults=_fixed_faults(f.Delay(on="SwitchAnswer", seconds=HOLD_SECONDS, overtaken=True)),
             verb="switch",
             number=OTHER,
         ),
@@ -275,18 +274,21 @@ SCENES: Mapping[str, Scene] = {
             running=False,
             dialects=SMART,
         ),
-        *(Scene(name=name, about=about, faults=_always(fault)) for name, about, fault in _BROKEN),
+        *(
+            Scene(name=name, about=about, faults=_fixed_faults(fault))
+            for name, about, fault in _SINGLE_FAULT_SCENES
+        ),
         Scene(
             name="garbage",
             about="bytes that make no frame come in place of each result",
-            faults=_always(
+            faults=_fixed_faults(
                 f.Insert(data=GARBAGE, on="ResultContainer", where="instead", times=None)
             ),
         ),
         Scene(
             name="length_bomb",
             about="a header announces as many bytes as it can, and they never come",
-            faults=_bomb,
+            faults=_announce_impossible_length,
         ),
     )
 }

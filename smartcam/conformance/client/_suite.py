@@ -1,4 +1,4 @@
-"""The suite: a test for each check, to be inherited or to be run from the shell."""
+"""The suite for pytest: one test for each check; subclass it, or run it from the shell."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import pytest
 
-from smartcam.conformance._pytest_options import PROPERTY
+from smartcam.conformance._pytest_options import FINDING_PROPERTY
 from smartcam.conformance.client._checks import CHECKS, ClientCheck, Grade
 from smartcam.conformance.client._report import judge
-from smartcam.conformance.client._runs import ClientRun, perform
+from smartcam.conformance.client._runs import ClientRun, run_scene
 from smartcam.conformance.client._tasks import Client, CommandClient, FunctionClient
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import BVS
@@ -88,7 +88,7 @@ class ClientConformance:
     def perform(self, task: Task) -> Iterable[bytes] | Awaitable[Iterable[bytes]]:
         """Do a task; override it for a client in Python, plain or asynchronous.
 
-        It runs in a thread of its own, an asynchronous one in a loop of its own.
+        It runs in a thread of its own; an asynchronous method gets an event loop there.
 
         Args:
             task: the task.
@@ -139,7 +139,7 @@ class ClientConformance:
         finding = judge(check, run)
         if finding is None:
             return
-        record_property(PROPERTY, finding.as_json())
+        record_property(FINDING_PROPERTY, finding.as_json())
         if check.grade is Grade.MUST:
             pytest.fail(str(finding), pytrace=False)
 
@@ -165,7 +165,9 @@ class ClientConformance:
                     '"./mine {host} {port} {task}"'
                 )
             return asyncio.run(
-                perform(client, check.scene, dialect=dialect, transport=transport, timeout=timeout)
+                run_scene(
+                    client, check.scene, dialect=dialect, transport=transport, timeout=timeout
+                )
             )
         except ConfigurationError as exc:
             pytest.fail(str(exc), pytrace=False)

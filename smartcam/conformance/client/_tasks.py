@@ -36,7 +36,7 @@ MAX_OUTPUT_BYTES = 1 << 20
 """Largest number of bytes of a command's output that are read; a client that prints more has
 failed."""
 
-SHOWN_LENGTH = 2000
+MAX_SHOWN_LENGTH = 2000
 """Largest number of characters of a command's output that a report shows."""
 
 END_TIMEOUT = 2.0
@@ -47,7 +47,7 @@ Verb = Literal["trigger", "switch", "watch"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """A task for a client; each one is done in a session of its own.
+    """A task for a client, to be done in a session of its own.
 
     - ``trigger [N]``: connect, trigger the active application once, or N times one after the other,
       print each result, disconnect.
@@ -84,20 +84,20 @@ class Task:
 
 
 class Outcome(NamedTuple):
-    """The outcome of a task at a client.
+    """The outcome of a client's task.
 
     Attributes:
         results: data of the results that the client gave, in order.
         error: the client's text about its failure; None if the client reports success.
-        ended: whether the client ended in time.
-        supported: whether the client supports the task.
+        ended_in_time: True if the client ended in time.
+        supported: True if the client supports the task.
         seconds: duration of the task.
         output: further output of the client, shortened.
     """
 
     results: tuple[bytes, ...] = ()
     error: str | None = None
-    ended: bool = True
+    ended_in_time: bool = True
     supported: bool = True
     seconds: float = 0.0
     output: str = ""
@@ -115,7 +115,7 @@ class Client(ABC):
             timeout: seconds until the client is stopped.
 
         Returns:
-            The outcome; a client that fails, or does not end, is no error here.
+            The outcome, also for a client that fails or does not end.
 
         Raises:
             ConfigurationError: the client cannot be started.
@@ -141,65 +141,65 @@ class FunctionClient(Client):
         process alive; an asynchronous one is cancelled.
         """
         worker = _Worker(self._function, task)
-        began = time.monotonic()
+        started_at = time.monotonic()
         worker.start()
         try:
             async with asyncio.timeout(timeout):
-                await asyncio.shield(worker.done)
+                await asyncio.shield(worker.finished)
         except TimeoutError:
             worker.cancel()
-            await asyncio.wait({worker.done}, timeout=END_TIMEOUT if worker.cancellable else 0)
-            return Outcome(ended=False, seconds=time.monotonic() - began)
-        return worker.outcome._replace(seconds=time.monotonic() - began)
+            await asyncio.wait({worker.finished}, timeout=END_TIMEOUT if worker.cancellable else 0)
+            return Outcome(ended_in_time=False, seconds=time.monotonic() - started_at)
+        return worker.outcome._replace(seconds=time.monotonic() - started_at)
 
 
 class _Worker:
-    """Runs a function in a daemon thread; an asynchronous one in a loop of its own."""
+    """Runs a function in a daemon thread; an asynchronous function gets an event loop there."""
 
     def __init__(self, function: Perform, task: Task) -> None:
-        self.done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.finished: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.outcome = Outcome()
         self.cancellable = inspect.iscoroutinefunction(function)
         self._function = function
         self._task = task
-        self._inside: tuple[asyncio.AbstractEventLoop, asyncio.Task[Any]] | None = None
-        self._home = asyncio.get_running_loop()
+        self._loop_and_task: tuple[asyncio.AbstractEventLoop, asyncio.Task[Any]] | None = None
+        self._waiting_loop = asyncio.get_running_loop()
         self._thread = threading.Thread(target=self._run, name=f"client: {task}", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
 
     def cancel(self) -> None:
-        inside = self._inside
-        if inside is not None:
+        loop_and_task = self._loop_and_task
+        if loop_and_task is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed already
-                inside[0].call_soon_threadsafe(inside[1].cancel)
+                loop_and_task[0].call_soon_threadsafe(loop_and_task[1].cancel)
 
     def _run(self) -> None:
         try:
-            self.outcome = Outcome(results=self._results())
+            self.outcome = Outcome(results=self._run_function())
         except NotImplementedError as exc:
             self.outcome = Outcome(supported=False, output=str(exc))
         except BaseException as exc:  # noqa: BLE001 - whatever a client raises is its failure
-            self.outcome = Outcome(error=f"{type(exc).__name__}: {exc}"[:SHOWN_LENGTH])
+            self.outcome = Outcome(error=f"{type(exc).__name__}: {exc}"[:MAX_SHOWN_LENGTH])
         with contextlib.suppress(RuntimeError):  # the waiting loop is closed
-            self._home.call_soon_threadsafe(self._wake)
+            self._waiting_loop.call_soon_threadsafe(self._set_finished)
 
-    def _wake(self) -> None:
-        if not self.done.done():
-            self.done.set_result(None)
+    def _set_finished(self) -> None:
+        if not self.finished.done():
+            self.finished.set_result(None)
 
-    def _results(self) -> tuple[bytes, ...]:
+    def _run_function(self) -> tuple[bytes, ...]:
         if self.cancellable:
-            given = asyncio.run(self._await_it())
+            values = asyncio.run(self._await_function())
         else:
-            given = cast("Iterable[bytes]", self._function(self._task))
-        return tuple(bytes(result) for result in given)
+            values = cast("Iterable[bytes]", self._function(self._task))
+        return tuple(bytes(result) for result in values)
 
-    async def _await_it(self) -> Iterable[bytes]:
+    async def _await_function(self) -> Iterable[bytes]:
         current = asyncio.current_task()
         if current is not None:
-            self._inside = (asyncio.get_running_loop(), current)
+            self._loop_and_task = (asyncio.get_running_loop(), current)
         return await cast("Awaitable[Iterable[bytes]]", self._function(self._task))
 
 
@@ -225,8 +225,8 @@ class CommandClient(Client):
                 raise ConfigurationError(f"client command {text!r}: {exc}") from exc
         else:
             expected = "a text, or the program and its arguments"
-            given = check_all(command, "client command", expected)
-            words = [check_text(text, "client command") for text in given]
+            values = check_all(command, "client command", expected)
+            words = [check_text(text, "client command") for text in values]
         self._template = words
         self._cwd = None if cwd is None else str(check_path(cwd, "cwd", "client command"))
         text = " ".join(self._template)
@@ -257,7 +257,7 @@ class CommandClient(Client):
 
         A command that does not end is killed, and so are its child processes if the system can.
         """
-        arguments, began = self.arguments(task), time.monotonic()
+        arguments, started_at = self.arguments(task), time.monotonic()
         try:
             process = await asyncio.create_subprocess_exec(
                 *arguments,
@@ -271,12 +271,12 @@ class CommandClient(Client):
             raise ConfigurationError(f"client command {arguments[0]!r}: {exc.strerror}") from exc
         try:
             async with asyncio.timeout(timeout):
-                out, err = await _read(process)
+                out, err = await _read_output(process)
         except TimeoutError:
-            return Outcome(ended=False, seconds=time.monotonic() - began)
+            return Outcome(ended_in_time=False, seconds=time.monotonic() - started_at)
         finally:
-            await _end(process)
-        seconds, errors = time.monotonic() - began, _shorten(err)
+            await _kill_process(process)
+        seconds, errors = time.monotonic() - started_at, _shorten(err)
         if process.returncode == UNSUPPORTED:
             return Outcome(supported=False, seconds=seconds, output=errors)
         try:
@@ -288,19 +288,19 @@ class CommandClient(Client):
         return Outcome(results, error, seconds=seconds, output=errors)
 
 
-async def _read(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:
-    async def all_of(stream: asyncio.StreamReader | None) -> bytes:
+async def _read_output(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:
+    async def read_stream(stream: asyncio.StreamReader | None) -> bytes:
         data = b""
-        while stream is not None and (more := await stream.read(1 << 16)):
-            data += more[: MAX_OUTPUT_BYTES - len(data)]
+        while stream is not None and (chunk := await stream.read(1 << 16)):
+            data += chunk[: MAX_OUTPUT_BYTES - len(data)]
         return data
 
-    out, err = await asyncio.gather(all_of(process.stdout), all_of(process.stderr))
+    out, err = await asyncio.gather(read_stream(process.stdout), read_stream(process.stderr))
     await process.wait()
     return out, err
 
 
-async def _end(process: asyncio.subprocess.Process) -> None:
+async def _kill_process(process: asyncio.subprocess.Process) -> None:
     """Kill the process if it still runs, and close the pipes."""
     if process.returncode is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -311,14 +311,14 @@ async def _end(process: asyncio.subprocess.Process) -> None:
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(END_TIMEOUT):
             await process.wait()
-    transport = getattr(process, "_transport", None)  # closes pipes that child processes hold
-    if transport is not None:
+    transport = getattr(process, "_transport", None)
+    if transport is not None:  # also closes pipes that child processes hold open
         transport.close()
 
 
 def _shorten(data: bytes) -> str:
     text = data.decode(errors="replace").strip()
-    return text if len(text) <= SHOWN_LENGTH else text[:SHOWN_LENGTH] + "..."
+    return text if len(text) <= MAX_SHOWN_LENGTH else text[:MAX_SHOWN_LENGTH] + "..."
 
 
 def read_results(output: bytes) -> tuple[bytes, ...]:

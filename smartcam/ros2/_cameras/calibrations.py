@@ -15,8 +15,8 @@ from smartcam._thesis_calibration import (
 )
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.ros2._cameras.image_messages import stamp_fields, utc_of
-from smartcam.ros2._cameras.picture_requests import one_frame
-from smartcam.ros2._cameras.reading import reading_of
+from smartcam.ros2._cameras.picture_requests import take_frame
+from smartcam.ros2._cameras.reading import interpretation_of
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
@@ -27,26 +27,26 @@ if TYPE_CHECKING:
     from smartcam.models import Localization, Pose, Result
 
 OWN_PICTURE_TIMEOUT = 20.0
-"""Seconds of the timeout for a picture of the camera itself."""
+"""Seconds that taking a picture with the camera may take."""
 
 
-def calibrations_of(
-    given: ThesisCalibration | str | os.PathLike[str] | None, camera: str
+def open_calibrations(
+    calibrations: ThesisCalibration | str | os.PathLike[str] | None, camera: str
 ) -> ThesisCalibration | None:
-    """Return the calibrations of a camera, created if a folder is given.
+    """Return a camera's calibrations; for a path, open or create the folder of the calibrations.
 
     Raises:
         OSError: the folder cannot be created.
     """
-    if not isinstance(given, str | os.PathLike):
-        return given
+    if not isinstance(calibrations, str | os.PathLike):
+        return calibrations
     from smartcam.calibration._inside import ThesisCalibration
 
-    return ThesisCalibration(given, camera)
+    return ThesisCalibration(calibrations, camera)
 
 
 class RosCalibrationCamera:
-    """A node's camera during calibration; its results are interpreted without a calibration.
+    """The camera of a node during a calibration; results are interpreted without a calibration.
 
     Args:
         camera: the camera.
@@ -57,15 +57,17 @@ class RosCalibrationCamera:
         self.name: str = camera.name
         self.y_down: bool = camera.settings.y_down
         self.unit: str
-        self._spec, self.unit = own_localizations(reading_of(camera), camera.active_application)
+        self._spec, self.unit = own_localizations(
+            interpretation_of(camera), camera.active_application
+        )
 
     async def localize(self) -> list[Localization]:
         """Trigger; return the localizations in the camera's own frame."""
         settings = self._camera.settings
         lenient, y_down = settings.lenient, settings.y_down
-        reading: Any = Interpretation(self._spec, lenient=lenient, y_down=y_down)
+        interpretation: Any = Interpretation(self._spec, lenient=lenient, y_down=y_down)
         result: Result[Any] = await self._camera.trigger(
-            interpret_as=reading, timeout=DEFAULT_TRIGGER_TIMEOUT
+            interpret_as=interpretation, timeout=DEFAULT_TRIGGER_TIMEOUT
         )
         return checked_localizations(result.value, self.name)
 
@@ -74,12 +76,12 @@ class RosCalibrationCamera:
         camera = self._camera
         if camera.capabilities.read_image and not getattr(camera, "has_frames", False):
             await camera.trigger(interpret_as="raw")
-        frame = await one_frame(None, camera, OWN_PICTURE_TIMEOUT)
+        frame = await take_frame(None, camera, OWN_PICTURE_TIMEOUT)
         return await asyncio.to_thread(frame.grey)
 
 
-class RosCalibrationFace:
-    """The part of a camera's node that answers the five services.
+class CalibrationServices:
+    """Answers the five calibration services of a camera's node.
 
     Args:
         camera: the camera.
@@ -96,23 +98,23 @@ class RosCalibrationFace:
         return RosCalibrationCamera(self._camera)
 
     async def answer(self, name: str, message: Any) -> dict[str, Any]:
-        """Carry out a request; return the fields of its answer.
+        """Carry out a request of the service ``name``; return the fields of its answer.
 
         Raises:
             SmartCamError: the service failed.
         """
         service = CALIBRATION[name]
-        names = [field for field in service.request.model_fields if hasattr(message, field)]
-        fields = {field: _plain(getattr(message, field)) for field in names}
+        field_names = [field for field in service.request.model_fields if hasattr(message, field)]
+        fields = {field: _request_value(getattr(message, field)) for field in field_names}
         request = validated(service.request, fields, f"{self.name}: {name}")
         answer = await service.do(CalibrationCall(self, request, service.timeout))
         if "pose" in answer:
-            answer["pose"] = _stamped(answer["pose"])
+            answer["pose"] = _pose_stamped_fields(answer["pose"])
         return answer
 
 
-def _plain(value: Any) -> Any:
-    """Convert a field of a message to the field of a request."""
+def _request_value(value: Any) -> Any:
+    """Return the value of a message's field as a plain value for the request."""
     if hasattr(value, "frame_id"):
         return {"stamp": utc_of(value), "frame_id": value.frame_id}
     if hasattr(value, "tolist"):
@@ -120,7 +122,7 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, list | tuple) else value
 
 
-def _stamped(pose: Pose) -> dict[str, Any]:
+def _pose_stamped_fields(pose: Pose) -> dict[str, Any]:
     """Return ``geometry_msgs/PoseStamped``."""
     stamp: datetime = pose.header.stamp
     return {

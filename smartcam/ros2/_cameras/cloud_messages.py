@@ -24,20 +24,20 @@ POINT_BYTES: Final = 16
 """Number of bytes of a point: x, y, z and rgb."""
 
 NO_DISPARITY: Final = -1.0
-"""Value for no disparity, pixels: less than ``min_disparity``."""
+"""Value in pixels that means no disparity; it is less than ``min_disparity``."""
 
 DISPARITY_STEP: Final = 1 / 16
 """Resolution of OpenCV's matchers, pixels."""
 
 
 MAX_DEPTH_STEPS: Final = 65534.0
-"""Number of steps in a compressed depth picture between the farthest depth, 1, and the nearest."""
+"""Number of steps from the farthest depth, value 1, to the nearest in a compressed picture."""
 
 MIN_DEPTH_RANGE: Final = 1.001
-"""Least ratio of the farthest and the nearest depth in a picture, so that its steps are not 0."""
+"""Smallest ratio of farthest to nearest depth in a compressed picture, so that steps are not 0."""
 
 PNG_OPTIONS: Final = (16, 1)
-"""OpenCV's IMWRITE_PNG_COMPRESSION, and the quickest compression."""
+"""OpenCV's option IMWRITE_PNG_COMPRESSION with its value 1, the fastest compression."""
 
 
 class CloudPoints(NamedTuple):
@@ -64,8 +64,8 @@ def depth_fields(
             for depths of more than 65.535 m.
     """
     if encoding == "32FC1":
-        shown = np.where(depth > 0, depth, np.float32(np.nan)).astype(np.float32)
-        return array_fields(shown, encoding, header)
+        pixels = np.where(depth > 0, depth, np.float32(np.nan)).astype(np.float32)
+        return array_fields(pixels, encoding, header)
     return array_fields(_millimetres(depth), encoding, header)
 
 
@@ -98,8 +98,8 @@ def compressed_depth_fields(
         values = np.where(valid, np.rint(inverse), 0).astype(np.uint16)
     else:
         values = np.zeros(depth.shape, np.uint16)
-    done, png = load("cv2").imencode(".png", values, PNG_OPTIONS)
-    if not done:
+    is_encoded, png = load("cv2").imencode(".png", values, PNG_OPTIONS)
+    if not is_encoded:
         raise RosMessageError(f"depth of {depth.shape}: OpenCV makes no PNG of it")
     data = struct.pack("<iff", 0, a, b) + png.tobytes()
     return {"header": header, "format": f"{encoding}; compressedDepth png", "data": data}
@@ -108,8 +108,8 @@ def compressed_depth_fields(
 def _millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Return depths in millimetres, 0 for no depth and for depths too large for 16 bits."""
     rounded = np.rint(depth * np.float32(1000))
-    fits = (rounded > 0) & (rounded <= np.iinfo(np.uint16).max)
-    return np.where(fits, rounded, 0).astype(np.uint16)
+    is_in_range = (rounded > 0) & (rounded <= np.iinfo(np.uint16).max)
+    return np.where(is_in_range, rounded, 0).astype(np.uint16)
 
 
 def disparity_fields(
@@ -129,10 +129,10 @@ def disparity_fields(
         largest: largest disparity of the search, pixels.
     """
     height, width = disparity.shape
-    shown = np.nan_to_num(disparity, nan=NO_DISPARITY).astype(np.float32)
+    pixels = np.nan_to_num(disparity, nan=NO_DISPARITY).astype(np.float32)
     return {
         "header": header,
-        "image": array_fields(shown, "32FC1", header),
+        "image": array_fields(pixels, "32FC1", header),
         "f": focal,
         "t": baseline,
         "valid_window": {"width": width, "height": height},
@@ -142,7 +142,7 @@ def disparity_fields(
     }
 
 
-def points_of(depth: NDArray[np.float32], lens: CameraModel) -> NDArray[np.float32]:
+def depth_points(depth: NDArray[np.float32], lens: CameraModel) -> NDArray[np.float32]:
     """Return the points (H, W, 3) of a depth picture without distortion; NaN where it is 0."""
     height, width = depth.shape
     z = np.where(depth > 0, depth, np.float32(np.nan)).astype(np.float32)
@@ -171,17 +171,17 @@ def cloud_fields(
     if colours is not None:
         names.append("rgb")
         grey = colours.ndim == points.ndim - 1
-        three = np.broadcast_to(colours[..., None], points.shape) if grey else colours
-        parts = three.reshape(height, width, 3).astype(np.uint32)
-        packed = (parts[..., 0] << 16) | (parts[..., 1] << 8) | parts[..., 2]
+        rgb = np.broadcast_to(colours[..., None], points.shape) if grey else colours
+        channels = rgb.reshape(height, width, 3).astype(np.uint32)
+        packed = (channels[..., 0] << 16) | (channels[..., 1] << 8) | channels[..., 2]
         data[..., 3] = packed.astype("<u4").view("<f4")
     return {
         "header": header,
         "height": height,
         "width": width,
         "fields": [
-            {"name": name, "offset": 4 * place, "datatype": _FLOAT32, "count": 1}
-            for place, name in enumerate(names)
+            {"name": name, "offset": 4 * index, "datatype": _FLOAT32, "count": 1}
+            for index, name in enumerate(names)
         ],
         "is_bigendian": False,
         "point_step": step,
@@ -192,7 +192,7 @@ def cloud_fields(
 
 
 def cloud_from(message: Any) -> CloudPoints:
-    """Return the points of a ``sensor_msgs/PointCloud2``, row by row, without those with NaN.
+    """Return the points of a ``sensor_msgs/PointCloud2``, row by row; points with NaN are left out.
 
     Raises:
         RosMessageError: the cloud has no x, y and z, they are no floats, or there are too few
@@ -218,24 +218,24 @@ def cloud_from(message: Any) -> CloudPoints:
     return CloudPoints(points[valid], colours)
 
 
-def _column(message: Any, field: Any, kinds: str) -> NDArray[Any]:
-    """Return a field of all points, (H, W), in this machine's byte order."""
+def _column(message: Any, field: Any, allowed_kinds: str) -> NDArray[Any]:
+    """Return one field of all points as an array (H, W) in this machine's byte order."""
     name = _TYPES.get(field.datatype, "")
-    if not name or name[0] not in kinds or field.count > 1:
+    if not name or name[0] not in allowed_kinds or field.count > 1:
         raise RosMessageError(
-            f"point cloud: {field.name}: expected one number of {'/'.join(kinds)}, got "
+            f"point cloud: {field.name}: expected one number of {'/'.join(allowed_kinds)}, got "
             f"{field.count} of type {field.datatype}"
         )
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{name}")
     height, width, step, row = (message.height, message.width, message.point_step, message.row_step)
     data = memoryview(message.data).cast("B")
-    last = field.offset + dtype.itemsize
-    wanted = row * (height - 1) + step * (width - 1) + last
+    field_end = field.offset + dtype.itemsize
+    expected_bytes = row * (height - 1) + step * (width - 1) + field_end
     if not height or not width:
         return np.zeros((0, 0), dtype.newbyteorder("="))
-    if last > step or row < step * (width - 1) + last or wanted > len(data):
+    if field_end > step or row < step * (width - 1) + field_end or expected_bytes > len(data):
         raise RosMessageError(
-            f"point cloud {width}x{height}: expected {wanted} bytes with {field.name} at "
+            f"point cloud {width}x{height}: expected {expected_bytes} bytes with {field.name} at "
             f"{field.offset} of {step}, rows of {step * width}, got {len(data)}, rows of {row}"
         )
     view = np.ndarray((height, width), dtype, data, field.offset, (row, step))

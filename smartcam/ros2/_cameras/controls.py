@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 REFRESH_DELAY = 0.2
-"""Seconds from setting a feature until all features are read again."""
+"""Seconds between setting a feature and reading all features again."""
 
 
 class CameraControls:
@@ -44,19 +44,19 @@ class CameraControls:
         self._node, self._source = node, source
         self._declared: list[str] = []
         self._features: dict[str, str] = {}  # feature by parameter
-        self._refreshing: asyncio.Task[None] | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._refresh_task: asyncio.Task[None] | None = None
+        self._declare_task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Ask the device for its controls, and declare them."""
-        self._task = asyncio.get_running_loop().create_task(
-            self._run(), name=f"controls of {self._node.full_name}"
+        self._declare_task = asyncio.get_running_loop().create_task(
+            self._declare_all(), name=f"controls of {self._node.full_name}"
         )
 
     async def close(self) -> None:
         """Undeclare the parameters. Idempotent."""
-        tasks = [task for task in (self._task, self._refreshing) if task is not None]
-        self._task = self._refreshing = None
+        tasks = [task for task in (self._declare_task, self._refresh_task) if task is not None]
+        self._declare_task = self._refresh_task = None
         for task in tasks:
             task.cancel()
         if tasks:
@@ -67,7 +67,7 @@ class CameraControls:
             with contextlib.suppress(ConfigurationError):  # another program has undeclared it
                 self._node.parameters.undeclare(name)
 
-    async def _run(self) -> None:
+    async def _declare_all(self) -> None:
         try:
             source = await self._source()
             driver: Any = source.driver
@@ -112,8 +112,8 @@ class CameraControls:
             SmartCamError: the device refuses the value.
         """
         await source.features[name].set(value)
-        if self._refreshing is None or self._refreshing.done():
-            self._refreshing = asyncio.get_running_loop().create_task(
+        if self._refresh_task is None or self._refresh_task.done():
+            self._refresh_task = asyncio.get_running_loop().create_task(
                 self._refresh(source), name=f"features of {self._node.full_name}"
             )
 
@@ -132,18 +132,18 @@ class CameraControls:
                 logger.info("%s: the feature %s: %s", self._node.full_name, name, exc)
 
     def _declare(self, driver: Any, control: Any) -> None:
-        name, switch = control.name, control.kind == "boolean"
-        how: dict[str, Any] = {}
+        name, is_boolean = control.name, control.kind == "boolean"
+        bounds: dict[str, Any] = {}
         if control.kind == "integer":
-            how = {"minimum": control.least, "maximum": control.most}
-            how["step"] = control.step if control.step > 1 else None
+            bounds = {"minimum": control.least, "maximum": control.most}
+            bounds["step"] = control.step if control.step > 1 else None
         try:
             self._node.parameters.declare(
                 name,
-                bool(control.value) if switch else control.value,
+                bool(control.value) if is_boolean else control.value,
                 description=control.range,
-                on_set=partial(_set, driver, name),
-                **how,
+                on_set=partial(_set_control, driver, name),
+                **bounds,
             )
         except ConfigurationError as exc:  # another parameter has the name, or an odd range
             logger.info("%s: the control %s: %s", self._node.full_name, name, exc)
@@ -156,12 +156,12 @@ def _snake_case(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
 
 
-async def _set(driver: Any, name: str, value: int) -> None:
+async def _set_control(driver: Any, name: str, value: int) -> None:
     """Set a control.
 
     Raises:
         SmartCamError: the device refuses the value, or has another one afterwards.
     """
-    has = await driver.set_control(name, int(value))
-    if has != int(value):
-        raise ConfigurationError(f"{name}: set to {int(value)}, the device has {has}")
+    actual = await driver.set_control(name, int(value))
+    if actual != int(value):
+        raise ConfigurationError(f"{name}: set to {int(value)}, the device has {actual}")

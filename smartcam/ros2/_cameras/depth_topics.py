@@ -15,10 +15,10 @@ from smartcam.ros2._cameras.cloud_messages import (
     cloud_fields,
     compressed_depth_fields,
     depth_fields,
+    depth_points,
     disparity_fields,
-    points_of,
 )
-from smartcam.ros2._cameras.image_messages import array_fields, header_fields
+from smartcam.ros2._cameras.image_messages import array_fields, header_fields_at
 from smartcam.ros2._cameras.lens_messages import lens_fields
 from smartcam.ros2._cameras.picture_stream import SubscribedPictures, publish_newest
 from smartcam.ros2._cameras.transforms import StaticTransforms
@@ -89,11 +89,13 @@ class DepthTopics:
         self._stereo, self._node = stereo, node
         self.frame_id: str = frame_id or f"{node.name}_left_optical"
         self._encoding, self._organized = depth_encoding, organized
-        known: Any = place
-        self._place: Transform | None = getattr(known, "camera_pose", known)
-        self._parent = parent_frame
+        place_or_calibration: Any = place
+        self._place: Transform | None = getattr(
+            place_or_calibration, "camera_pose", place_or_calibration
+        )
+        self._parent_frame = parent_frame
         self._transforms = StaticTransforms(node)
-        self._nearest = 0.0
+        self._min_depth = 0.0
         self._publishers: dict[str, Any] = {}
         self._stream: SubscribedPictures[DepthFrame] | None = None
         self._thread: ThreadPoolExecutor | None = None
@@ -102,17 +104,17 @@ class DepthTopics:
         """Declare the topics; the cameras stream while there is a subscriber."""
         if self._stream is not None:
             return
-        for name, kind in TOPICS.items():
-            self._publishers[name] = self._node.publisher(f"~/{name}", kind, qos=DRIVER)
+        for name, type_name in TOPICS.items():
+            self._publishers[name] = self._node.publisher(f"~/{name}", type_name, qos=DRIVER)
         self._thread = ThreadPoolExecutor(1, "smartcam-ros2-depth")
         publishers = list(self._publishers.values())
         self._stream = SubscribedPictures(
-            self._node.full_name, publishers, self._read, self._publish
+            self._node.full_name, publishers, self._open_stereo, self._publish
         )
         self._stream.start()
 
     async def close(self) -> None:
-        """Withdraw the topics; a pair of the caller's stays open. Idempotent.
+        """Withdraw the topics; a pair that the caller opened stays open. Idempotent.
 
         Cancellation: everything is still closed.
         """
@@ -130,23 +132,23 @@ class DepthTopics:
                 thread.shutdown(wait=False, cancel_futures=True)
 
     @contextlib.asynccontextmanager
-    async def _read(self, _: float) -> AsyncIterator[StereoDepth]:
+    async def _open_stereo(self, _: float) -> AsyncIterator[StereoDepth]:
         if callable(self._stereo):
             async with self._stereo() as stereo:
-                self._learn(stereo)
+                self._use_stereo(stereo)
                 yield stereo
         else:
-            self._learn(self._stereo)
+            self._use_stereo(self._stereo)
             yield self._stereo
 
-    def _learn(self, stereo: StereoDepth) -> None:
-        """Note the values of an open pair, and publish its place."""
-        self._nearest, place = stereo.min_depth, self._place
+    def _use_stereo(self, stereo: StereoDepth) -> None:
+        """Keep the smallest depth of an open pair, and publish the left camera's transform."""
+        self._min_depth, place = stereo.min_depth, self._place
         if place is not None:
-            turn = Transform(place.source, self.frame_id, stereo.rotation.T, np.zeros(3))
-            seen = place @ turn
-            parent = self._parent or place.target
-            transform = Transform(parent, self.frame_id, seen.rotation, seen.translation)
+            rectification = Transform(place.source, self.frame_id, stereo.rotation.T, np.zeros(3))
+            rectified = place @ rectification
+            parent = self._parent_frame or place.target
+            transform = Transform(parent, self.frame_id, rectified.rotation, rectified.translation)
             self._transforms.replace([transform])
 
     async def _publish(self, frame: DepthFrame) -> None:
@@ -159,21 +161,21 @@ class DepthTopics:
             return
         loop = asyncio.get_running_loop()
         for name, publisher in publishers.items():
-            fields = await loop.run_in_executor(self._thread, self._fields, name, frame)
+            fields = await loop.run_in_executor(self._thread, self._make_fields, name, frame)
             await publish_newest(publisher, fields)
 
-    def _fields(self, name: str, frame: DepthFrame) -> dict[str, Any]:
-        header = header_fields(frame.utc, self.frame_id)
+    def _make_fields(self, name: str, frame: DepthFrame) -> dict[str, Any]:
+        header = header_fields_at(frame.utc, self.frame_id)
         focal = float(frame.camera_info.matrix[0, 0])
         if name == "disparity":
-            largest = focal * frame.baseline / self._nearest
+            largest = focal * frame.baseline / self._min_depth
             return disparity_fields(frame.disparity, header, focal, frame.baseline, largest)
         if name == "depth/image_rect":
             return depth_fields(frame.depth, header, self._encoding)
         if name == "depth/image_rect/compressedDepth":
             return compressed_depth_fields(frame.depth, header, self._encoding)
         if name == "points2":
-            return self._cloud(frame, header)
+            return self._cloud_fields(frame, header)
         if name == "left/image_rect":
             return array_fields(frame.left, "mono8" if frame.left.ndim == 2 else "rgb8", header)
         lens, projection = frame.camera_info, None
@@ -183,8 +185,8 @@ class DepthTopics:
         height, width = frame.depth.shape
         return lens_fields(lens, header, (width, height), projection=projection)
 
-    def _cloud(self, frame: DepthFrame, header: dict[str, Any]) -> dict[str, Any]:
-        points, colours = points_of(frame.depth, frame.camera_info), frame.left
+    def _cloud_fields(self, frame: DepthFrame, header: dict[str, Any]) -> dict[str, Any]:
+        points, colours = depth_points(frame.depth, frame.camera_info), frame.left
         if not self._organized:
             valid = frame.depth > 0
             points, colours = points[valid], colours[valid]

@@ -33,7 +33,7 @@ TROUBLES: Mapping[Status, tuple[int, str]] = {
     Status.INPUT_CONTAINER: (WARN, "Input Container: input data and inspections are out of step"),
     Status.OVERTRIGGERED: (WARN, "Overtriggered: a trigger was dropped"),
 }
-"""Error bits of the status, the worst first: level and text."""
+"""Level and text of each error bit of the status, the worst first."""
 
 
 class KnownState(NamedTuple):
@@ -103,20 +103,20 @@ def health(known: KnownState, *, session_alive: bool = True) -> Health:
 
 
 def status_fields(known: KnownState) -> dict[str, Any]:
-    """Return the fields of ``smartcam_msgs/msg/CameraStatus`` without its header."""
-    connected, status, how = known.connected, known.bits, health(known)
-    bad = Status.BUSY in status or Status.SYSTEM_ERROR in status
+    """Return the fields of ``smartcam_msgs/msg/CameraStatus`` except the header."""
+    connected, status, camera_health = known.connected, known.bits, health(known)
+    is_unusable = Status.BUSY in status or Status.SYSTEM_ERROR in status
     application = known.application if connected else None
     return {
         "camera_name": utf8(known.name),
         "connected": connected,
-        "ready": connected and Status.RUNNING in status and not bad,
+        "ready": connected and Status.RUNNING in status and not is_unusable,
         "busy": Status.BUSY in status,
         "running": Status.RUNNING in status,
         "application_id": max(0, application or 0),  # -1 if a camera does not report it
         "status": status.value,
         "status_names": list(status.names),
-        "error": utf8(how.text) if how.errors or not connected else "",
+        "error": utf8(camera_health.text) if camera_health.errors or not connected else "",
     }
 
 
@@ -143,6 +143,6 @@ def hardware_id(address: Address) -> str:
 
 def header_fields(at: datetime, frame_id: str) -> dict[str, Any]:
     """Return the fields of ``std_msgs/msg/Header``."""
-    since = at - EPOCH
-    seconds = since.days * 86_400 + since.seconds
-    return {"stamp": {"sec": seconds, "nanosec": since.microseconds * 1000}, "frame_id": frame_id}
+    elapsed = at - EPOCH
+    seconds = elapsed.days * 86_400 + elapsed.seconds
+    return {"stamp": {"sec": seconds, "nanosec": elapsed.microseconds * 1000}, "frame_id": frame_id}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 BILLION: Final = 1_000_000_000
 
 UNKNOWN_DURATION: Final = 1.0
-"""Seconds before its stamp within which a picture of another node may have been exposed."""
+"""Seconds before its stamp in which another node's picture is assumed to have been exposed."""
 
 _BAYER: Final = {"GR": "grbg", "RG": "rggb", "GB": "gbrg", "BG": "bggr"}
 
@@ -53,7 +53,7 @@ ENCODINGS: Final[dict[str, str]] = {
 """Encodings of ROS by the names of the pixel formats that are sent unchanged.
 
 Pixels of 10, 12 and 14 bits are sent with 16 bits and the same values. Frames of other formats are
-converted to ``rgb8`` or unpacked first: see :func:`prepared`.
+converted to ``rgb8`` or unpacked first: see :func:`to_ros_format`.
 """
 
 _FORMATS: Final[dict[str, str]] = {
@@ -80,21 +80,22 @@ _DTYPES: Final = {"U": "u", "S": "i", "F": "f"}
 def stamp_fields(utc: float) -> dict[str, int]:
     """Return a time in seconds since 1970 as the fields of ``builtin_interfaces/Time``."""
     seconds = int(max(utc, 0.0))
-    more = round(max(utc - seconds, 0.0) * BILLION)  # separate, since a sum would lose digits
-    return {"sec": seconds + more // BILLION, "nanosec": more % BILLION}
+    # separate from the seconds, since a sum would lose digits
+    nanoseconds = round(max(utc - seconds, 0.0) * BILLION)
+    return {"sec": seconds + nanoseconds // BILLION, "nanosec": nanoseconds % BILLION}
 
 
-def header_fields(utc: float, frame_id: str) -> dict[str, Any]:
+def header_fields_at(utc: float, frame_id: str) -> dict[str, Any]:
     """Return the fields of ``std_msgs/Header``."""
     return {"stamp": stamp_fields(utc), "frame_id": frame_id}
 
 
-def prepared(frame: Frame) -> Frame:
-    """Return the frame in a format that ROS has a name for; blocks.
+def to_ros_format(frame: Frame) -> Frame:
+    """Return the frame in a pixel format for which ROS has a name; blocks.
 
     A frame in such a format is returned unchanged. Samples that share bytes are unpacked to 16
     bits. Y, U and V in planes, of full range, of BT.709 or BT.2020 become RGB8 or RGB16, since ROS
-    has no names for them; so do the pixels of a JPEG, PNG or JPEG XL.
+    has no names for them. A JPEG, PNG or JPEG XL is decoded, then converted in the same way.
 
     Raises:
         FrameFormatError: the format cannot be converted, or the frame's bytes are wrong.
@@ -106,10 +107,10 @@ def prepared(frame: Frame) -> Frame:
     if name in ENCODINGS:
         return frame
     if name.startswith(("Mono", "Bayer")):
-        wanted = "Mono16" if name.startswith("Mono") else f"{name[:7]}16"
-        return with_pixels(frame, frame.array(), wanted)
+        format_name = "Mono16" if name.startswith("Mono") else f"{name[:7]}16"
+        return with_pixels(frame, frame.array(), format_name)
     if frame.format.compressed:
-        return prepared(decoded(frame, ""))
+        return to_ros_format(decoded(frame, ""))
     return converted(frame, "RGB16" if frame.format.depth > 8 else "RGB8")
 
 
@@ -117,8 +118,8 @@ def image_fields(frame: Frame, frame_id: str) -> dict[str, Any]:
     """Return the fields of ``sensor_msgs/Image``; the pixels are not copied.
 
     Raises:
-        FrameFormatError: ROS has no name for the format (:func:`prepared` converts it), or there
-            are too few bytes.
+        FrameFormatError: ROS has no name for the format (:func:`to_ros_format` converts it), or
+            there are too few bytes.
     """
     encoding = ENCODINGS.get(frame.format.name)
     if encoding is None:
@@ -129,7 +130,7 @@ def image_fields(frame: Frame, frame_id: str) -> dict[str, Any]:
         )
     frame.format.check(frame.data, frame.width, frame.height, frame.stride)
     return {
-        "header": header_fields(frame.utc, frame_id),
+        "header": header_fields_at(frame.utc, frame_id),
         "height": frame.height,
         "width": frame.width,
         "encoding": encoding,
@@ -166,23 +167,23 @@ class Compression(NamedTuple):
     """The steps from a frame to ``sensor_msgs/CompressedImage``.
 
     Attributes:
-        how: ``jpeg``, ``png``, or "" for a JPEG that is sent unchanged.
-        first: the format to which the frame is converted first; "": none.
+        codec: ``jpeg``, ``png``, or "" for a JPEG that is sent unchanged.
+        convert_to: the format to which the frame is converted before; "": no conversion.
         encoding: encoding of the pixels after decoding.
     """
 
-    how: Literal["jpeg", "png", ""]
-    first: Literal["Mono8", "RGB8", ""]
+    codec: Literal["jpeg", "png", ""]
+    convert_to: Literal["Mono8", "RGB8", ""]
     encoding: str
 
-    def text(self) -> str:
+    def format_text(self) -> str:
         """Return the message's ``format``."""
-        within = "bgr8" if self.encoding in {"rgb8", "bgr8"} else self.encoding
-        kind = "png" if self.how == "png" else "jpeg"
-        return f"{self.encoding}; {kind} compressed {within}"
+        decoded = "bgr8" if self.encoding in {"rgb8", "bgr8"} else self.encoding
+        file_type = "png" if self.codec == "png" else "jpeg"
+        return f"{self.encoding}; {file_type} compressed {decoded}"
 
 
-def compression(frame: Frame) -> Compression:
+def choose_compression(frame: Frame) -> Compression:
     """Return the compression of a frame: PNG, without loss, for depth, JPEG for all others.
 
     A JPEG has the highest 8 bits of a sample, and the colours of a Bayer pattern.
@@ -210,11 +211,11 @@ def compression(frame: Frame) -> Compression:
     return Compression("jpeg", "", "bgr8")
 
 
-def compressed_fields(frame: Frame, text: str, frame_id: str) -> dict[str, Any]:
+def compressed_fields(frame: Frame, format_text: str, frame_id: str) -> dict[str, Any]:
     """Return the fields of ``sensor_msgs/CompressedImage``."""
     return {
-        "header": header_fields(frame.utc, frame_id),
-        "format": text,
+        "header": header_fields_at(frame.utc, frame_id),
+        "format": format_text,
         "data": memoryview(frame.data).cast("B"),
     }
 
@@ -252,15 +253,15 @@ def frame_from(
         MissingExtraError: the message is compressed and the extra ``frames`` is not installed.
     """
     if hasattr(message, "encoding"):
-        form, width, height, step, data = _raw(message)
+        pixel_format, width, height, step, data = _read_image(message)
     else:
-        form, width, height, step, data = _compressed(message)
-    form.check(data, width, height, step)
+        pixel_format, width, height, step, data = _read_compressed(message)
+    pixel_format.check(data, width, height, step)
     utc = utc_of(message.header)
     now = time.monotonic()
     return Frame(
         data=data,
-        format=form,
+        format=pixel_format,
         width=width,
         height=height,
         stride=step,
@@ -274,7 +275,7 @@ def frame_from(
     )
 
 
-def _raw(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
+def _read_image(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
     width, height, step, encoding = message.width, message.height, message.step, message.encoding
     data = memoryview(message.data).cast("B")
     name = _FORMATS.get(encoding)
@@ -283,23 +284,23 @@ def _raw(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
             f"ROS image: expected one of the encodings {', '.join(_FORMATS)}, got "
             f"{encoding!r:.40}; pixels_from() reads encodings of numbers such as 32FC1"
         )
-    form = find_format(name)
-    if message.is_bigendian and form.depth > 8:
+    pixel_format = find_format(name)
+    if message.is_bigendian and pixel_format.depth > 8:
         swapped = np.ascontiguousarray(pixels_from(message), "<u2")
-        return form, width, height, form.stride(width), swapped.data.cast("B")
-    return form, width, height, step, data
+        return pixel_format, width, height, pixel_format.stride(width), swapped.data.cast("B")
+    return pixel_format, width, height, step, data
 
 
-def _compressed(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
+def _read_compressed(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
     data = memoryview(message.data).cast("B")
-    head = bytes(data[:24])
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
-        width, height = (int.from_bytes(head[at : at + 4], "big") for at in (16, 20))
+    first_bytes = bytes(data[:24])
+    if first_bytes[:8] == b"\x89PNG\r\n\x1a\n" and len(first_bytes) == 24:
+        width, height = (int.from_bytes(first_bytes[at : at + 4], "big") for at in (16, 20))
         return find_format("PNG"), width, height, 0, data
-    if head[:2] != b"\xff\xd8":
+    if first_bytes[:2] != b"\xff\xd8":
         raise FrameFormatError(
             f"ROS compressed image {message.format!r:.60}: expected a JPEG or PNG, got "
-            f"{len(data)} bytes that begin with {head[:8].hex(' ') or 'none'}"
+            f"{len(data)} bytes that begin with {first_bytes[:8].hex(' ') or 'none'}"
         )
     width, height, _ = jpeg_header(data, "MJPEG")
     return find_format("MJPEG"), width, height, 0, data
@@ -315,9 +316,9 @@ def pixels_from(message: Any) -> NDArray[Any]:
     Raises:
         FrameFormatError: there is no such encoding, or fewer bytes than the size requires.
     """
-    kind, channels = _samples(message.encoding)
+    sample_type, channels = _sample_type(message.encoding)
     order = ">" if message.is_bigendian else "<"
-    dtype = np.dtype(f"{order}{kind}")
+    dtype = np.dtype(f"{order}{sample_type}")
     width, height, step = message.width, message.height, message.step
     row = width * channels * dtype.itemsize
     data = memoryview(message.data).cast("B")
@@ -333,8 +334,8 @@ def pixels_from(message: Any) -> NDArray[Any]:
     return view if dtype.isnative else view.astype(dtype.newbyteorder("="))
 
 
-def _samples(encoding: str) -> tuple[str, int]:
-    """Return the type of an encoding's numbers, and their count for a pixel."""
+def _sample_type(encoding: str) -> tuple[str, int]:
+    """Return numpy's type of an encoding's numbers, and the count of numbers in a pixel."""
     bits, _, count = encoding.partition("C")
     if bits[:-1] in {"8", "16", "32", "64"} and bits[-1:] in _DTYPES and count in {*"1234", ""}:
         return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(count or 1)

@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 from smartcam.calibration._inside import MAX_FILE_BYTES, parse_camera_info
 from smartcam.calibration.formats import write_camera_info
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
-from smartcam.ros2._cameras.image_messages import header_fields
+from smartcam.ros2._cameras.image_messages import header_fields_at
 from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
-def as_path(url: str) -> Path | None:
+def path_from_url(url: str) -> Path | None:
     """Return the file of ``camera_info_url``: ``file:///path``, or a path; "" means no file.
 
     Raises:
@@ -58,30 +58,30 @@ class CameraLens:
         self, name: str, frame_id: str, url: str, size: Callable[[], Awaitable[tuple[int, int]]]
     ) -> None:
         self._name, self._frame_id, self._size = name, frame_id, size
-        self._path = as_path(url)
+        self._path = path_from_url(url)
         self._info: CameraInfo | None = None
-        self._read = self._path is None
+        self._is_loaded = self._path is None
         self._warned_size: tuple[int, int] | None = None
-        self._writing = asyncio.Lock()
+        self._file_lock = asyncio.Lock()
 
     async def load(self) -> None:
-        """Read the file, once; if the file is not valid, log that and ignore it."""
-        if self._read or self._path is None:
+        """Read the file if it was not read yet; log and ignore a file that is not valid."""
+        if self._is_loaded or self._path is None:
             return
-        async with self._writing:
-            if self._read:
+        async with self._file_lock:
+            if self._is_loaded:
                 return
             try:
-                self._info = await asyncio.to_thread(_read, self._path)
+                self._info = await asyncio.to_thread(_read_file, self._path)
             except FileNotFoundError:
                 logger.info("%s: %s is not there: not calibrated yet", self._name, self._path)
             except (SmartCamError, OSError) as exc:
                 logger.warning("%s ! the lens is not known: %s", self._name, exc)
-            self._read = True
+            self._is_loaded = True
 
-    def fields(self, frame: Frame) -> dict[str, Any]:
+    def camera_info_fields(self, frame: Frame) -> dict[str, Any]:
         """Return the ``sensor_msgs/CameraInfo`` of a frame."""
-        header, size = header_fields(frame.utc, self._frame_id), (frame.width, frame.height)
+        header, size = header_fields_at(frame.utc, self._frame_id), (frame.width, frame.height)
         info = self._info
         lens = frame.camera_info if info is None else info.camera
         if lens is not None and tuple(lens.size) != size:
@@ -101,35 +101,35 @@ class CameraLens:
             lens, header, size, rectification=info.rectification, projection=info.projection
         )
 
-    async def set(self, request: Any) -> dict[str, Any]:
+    async def serve_set_camera_info(self, request: Any) -> dict[str, Any]:
         """Serve ``sensor_msgs/srv/SetCameraInfo``.
 
         Cancellation: the file is either the old one or the new one, complete.
         """
         try:
-            where = await self._set(request.camera_info)
+            path = await self._write_lens(request.camera_info)
         except (SmartCamError, OSError) as exc:
             logger.warning("%s ! set_camera_info was refused: %s", self._name, exc)
             return {"success": False, "status_message": str(exc)}
-        return {"success": True, "status_message": f"written to {where}"}
+        return {"success": True, "status_message": f"written to {path}"}
 
-    async def _set(self, message: Any) -> Path:
+    async def _write_lens(self, message: Any) -> Path:
         info = lens_from(message)
         if info is None:
             raise RosMessageError("camera_info: expected a calibration, got one with K[0] = 0")
         if self._path is None:
             raise RosError(
-                "this camera has no file for it: its camera_info is that of its source; expected "
-                "camera_info_url to name one"
+                "this camera has no file for its lens: camera_info comes from the source of the "
+                "frames; expected camera_info_url to name a file"
             )
         width, height = await self._size()
         if info.camera.size != (width, height):
-            got = info.camera.size
+            lens_size = info.camera.size
             raise RosMessageError(
                 f"camera_info: expected the size of the pictures, {width}x{height}, got "
-                f"{got[0]}x{got[1]}"
+                f"{lens_size[0]}x{lens_size[1]}"
             )
-        async with self._writing:
+        async with self._file_lock:
             await asyncio.to_thread(
                 write_camera_info,
                 self._path,
@@ -138,12 +138,12 @@ class CameraLens:
                 rectification=info.rectification,
                 projection=info.projection,
             )
-            self._info, self._read, self._warned_size = info, True, None
+            self._info, self._is_loaded, self._warned_size = info, True, None
         logger.info("%s: set_camera_info: written to %s", self._name, self._path)
         return self._path
 
 
-def _read(path: Path) -> CameraInfo:
+def _read_file(path: Path) -> CameraInfo:
     with path.open("rb") as file:
         data = file.read(MAX_FILE_BYTES + 1)
     if len(data) > MAX_FILE_BYTES:

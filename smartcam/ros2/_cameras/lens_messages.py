@@ -38,14 +38,16 @@ def lens_fields(
     fields: dict[str, Any] = {"header": header, "width": size[0], "height": size[1]}
     if lens is None:
         return fields
-    turn = np.eye(3) if rectification is None else rectification
-    straight = np.column_stack([lens.matrix, np.zeros(3)]) if projection is None else projection
+    rotation = np.eye(3) if rectification is None else rectification
+    projection_matrix = (
+        np.column_stack([lens.matrix, np.zeros(3)]) if projection is None else projection
+    )
     return fields | {
         "distortion_model": lens.distortion_model,
         "d": np.array(lens.distortion, np.float64),
         "k": np.ravel(lens.matrix),
-        "r": np.ravel(turn),
-        "p": np.ravel(straight),
+        "r": np.ravel(rotation),
+        "p": np.ravel(projection_matrix),
     }
 
 
@@ -79,11 +81,11 @@ def lens_from(message: Any) -> CameraInfo | None:
         distortion=coefficients,
         distortion_model=model,  # type: ignore[arg-type]
     )
-    turn, projection = np.reshape(message.r, (3, 3)), np.reshape(message.p, (3, 4))
-    if not np.any(turn):
-        turn = np.eye(3)
+    rotation, projection = np.reshape(message.r, (3, 3)), np.reshape(message.p, (3, 4))
+    if not np.any(rotation):
+        rotation = np.eye(3)
     if not np.any(projection):
         projection = np.column_stack([lens.matrix, np.zeros(3)])
-    if not all(math.isfinite(number) for number in (*turn.ravel(), *projection.ravel())):
+    if not all(math.isfinite(number) for number in (*rotation.ravel(), *projection.ravel())):
         raise RosMessageError("camera_info: expected finite numbers in R and P")
-    return CameraInfo(lens, message.header.frame_id, turn, projection)
+    return CameraInfo(lens, message.header.frame_id, rotation, projection)

@@ -1,4 +1,4 @@
-"""The life cycle of a camera's node: the meaning of its states, and its services.
+"""The life cycle of a camera's node: what its states mean, and its services.
 
 Services and topic are as in rcl_lifecycle (``com_interface.c``).
 """
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-CAMERA_WAIT = 60.0
-"""Largest number of seconds of one wait for a camera, before the next wait begins."""
+CAMERA_TIMEOUT = 60.0
+"""Seconds of one wait for a camera's session; after them the wait is repeated."""
 
 RETRY = Backoff(initial=0.5, maximum=10.0)
 """Delays between attempts to configure a connected camera."""
@@ -69,51 +69,66 @@ class CameraLifecycle(Lifecycle):
         self._camera, self._node = camera, node
         self._application = settings.application if application is None else application
         self._autostart = autostart
-        self._starting: asyncio.Task[None] | None = None
-        self._ends: list[Any] = []
+        self._autostart_task: asyncio.Task[None] | None = None
+        self._closables: list[Any] = []
         limit = settings.connect_timeout + 2 * settings.switch_timeout + settings.request_timeout
         super().__init__(node.full_name, {"configure": self._ensure_camera}, limit)
 
     async def start(self) -> None:
-        """Serve, and go to Active with ``autostart``."""
+        """Start the services; with ``autostart``, also start the way to Active."""
         manage = getattr(self._node, "manage", None)
         if manage is not None:  # rclpy has its own life cycle, which follows this one
-            self._ends.append(manage(self, self._on_change_state))
+            self._closables.append(manage(self, self._on_change_state))
         elif is_managed(self._node):
             await self._declare()
         if self._autostart:
-            self._starting = asyncio.get_running_loop().create_task(self._start_up())
+            self._autostart_task = asyncio.get_running_loop().create_task(
+                self._activate_when_connected()
+            )
 
     async def _declare(self) -> None:
         event = self._node.publisher("~/transition_event", "lifecycle_msgs/msg/TransitionEvent")
-        self._ends.append(event)
+        self._closables.append(event)
         self._event = event
         self.listen(self._publish_transition)
         for name, (kind, handler) in self._services().items():
-            self._ends.append(self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler))
+            self._closables.append(
+                self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler)
+            )
             await asyncio.sleep(0)  # a declaration takes the engine a while
 
     def _services(self) -> dict[str, tuple[str, Callable[[Any], Awaitable[Any]]]]:
-        def answering(fields: Callable[[], dict[str, Any]]) -> Callable[[Any], Awaitable[Any]]:
+        def handler_returning(
+            fields: Callable[[], dict[str, Any]],
+        ) -> Callable[[Any], Awaitable[Any]]:
             async def answer(_request: object) -> dict[str, Any]:
                 return fields()
 
             return answer
 
         states = {"available_states": [state._asdict() for state in STATES]}
-        ways = "GetAvailableTransitions"
+        transitions_type = "GetAvailableTransitions"
         return {
             "change_state": ("ChangeState", self._on_change_state),
-            "get_state": ("GetState", answering(lambda: {"current_state": self.state._asdict()})),
-            "get_available_states": ("GetAvailableStates", answering(lambda: states)),
-            "get_available_transitions": (ways, answering(lambda: _described(self.available))),
-            "get_transition_graph": (ways, answering(lambda: _described(TRANSITIONS))),
+            "get_state": (
+                "GetState",
+                handler_returning(lambda: {"current_state": self.state._asdict()}),
+            ),
+            "get_available_states": ("GetAvailableStates", handler_returning(lambda: states)),
+            "get_available_transitions": (
+                transitions_type,
+                handler_returning(lambda: _transition_fields(self.available)),
+            ),
+            "get_transition_graph": (
+                transitions_type,
+                handler_returning(lambda: _transition_fields(TRANSITIONS)),
+            ),
         }
 
     async def _on_change_state(self, request: Any) -> dict[str, Any]:
-        wanted = request.transition
+        transition = request.transition
         try:
-            await self.change(wanted.label, wanted.id)
+            await self.change(transition.label, transition.id)
         except SmartCamError as exc:
             logger.warning("%s ! change_state: %s", self.name, exc)
             return {"success": False}
@@ -122,11 +137,11 @@ class CameraLifecycle(Lifecycle):
     def _publish_transition(self, transition: LifecycleTransition) -> None:
         self._event.publish({"timestamp": time.time_ns(), **transition.fields})
 
-    def _begins(self) -> None:
-        """End the automatic start, since another program has requested a transition."""
-        starting = self._starting
-        if starting is not None and starting is not asyncio.current_task():
-            starting.cancel()
+    def _on_transition_requested(self) -> None:
+        """End the automatic start, unless it requested the transition itself."""
+        autostart_task = self._autostart_task
+        if autostart_task is not None and autostart_task is not asyncio.current_task():
+            autostart_task.cancel()
 
     # ------------------------------------------------------------------ work
 
@@ -137,18 +152,18 @@ class CameraLifecycle(Lifecycle):
             return
         limit = camera.settings.switch_timeout
         await camera.wait_status(lambda status: not status.loading, limit)
-        await have_application(camera, application, limit)
+        await run_application(camera, application, limit)
 
-    async def _start_up(self) -> None:
+    async def _activate_when_connected(self) -> None:
         """Go to Active as soon as the camera is connected, without a time limit."""
         logged, delays = "", RETRY.delays()
         while True:
             try:
-                await self._camera.wait_connected(CAMERA_WAIT)
+                await self._camera.wait_connected(CAMERA_TIMEOUT)
                 await self.configure()
                 await self.activate()
             except (LinkError, ResponseTimeoutError) as exc:
-                why = str(exc)
+                reason = str(exc)
             except SmartCamError as exc:
                 # a further attempt would stop the shared camera each time
                 text = "%s ! it stays %s until a program configures it: %s"
@@ -156,27 +171,27 @@ class CameraLifecycle(Lifecycle):
                 return
             else:
                 return
-            level = logging.DEBUG if why == logged else logging.WARNING
-            logger.log(level, "%s ! it is not active yet: %s", self.name, why)
-            logged = why
+            level = logging.DEBUG if reason == logged else logging.WARNING
+            logger.log(level, "%s ! it is not active yet: %s", self.name, reason)
+            logged = reason
             await asyncio.sleep(next(delays))
 
     async def close(self) -> None:
-        """End the node: publish that, and then stop its services. Idempotent."""
+        """Go to Finalized, and then stop the services. Idempotent."""
         self.closed = True
-        starting, self._starting = self._starting, None
+        autostart_task, self._autostart_task = self._autostart_task, None
         try:
-            if starting is not None:
-                starting.cancel()
-                await asyncio.wait((starting,))
+            if autostart_task is not None:
+                autostart_task.cancel()
+                await asyncio.wait((autostart_task,))
             await super().close()
         finally:
-            ends, self._ends = self._ends, []
-            for end in ends:
-                end.close()
+            closables, self._closables = self._closables, []
+            for closable in closables:
+                closable.close()
 
 
-async def have_application(camera: Camera[Any], application: int, timeout: float) -> None:
+async def run_application(camera: Camera[Any], application: int, timeout: float) -> None:
     """Load and run an application; each step has ``timeout`` seconds.
 
     Raises:
@@ -194,5 +209,5 @@ def is_managed(node: Any) -> bool:
     return getattr(node, "graph", None) is not None
 
 
-def _described(transitions: Any) -> dict[str, Any]:
+def _transition_fields(transitions: Any) -> dict[str, Any]:
     return {"available_transitions": [transition.fields for transition in transitions]}

@@ -1,8 +1,8 @@
-"""Convert smartcam's values of a camera to messages of ROS; pure.
+"""Convert a camera's results to messages of ROS, without a node.
 
 Lengths are metres and angles radians on both sides, and axes are as in REP-103: a camera's plane
-has x right, y up and z towards the camera, right-handed. Poses already are in the robot's frame if
-there is a calibration.
+has x right, y up and z towards the camera, right-handed. With a calibration, smartcam's poses are
+already in the robot's frame.
 """
 
 from __future__ import annotations
@@ -15,7 +15,11 @@ import numpy as np
 from smartcam._client._inside import localizations_of
 from smartcam._json import text_of
 from smartcam.exceptions import RosMessageError
-from smartcam.ros2._cameras.reading import calibration_of, calibrations_of, frame_of_robot
+from smartcam.ros2._cameras.reading import (
+    calibration_of,
+    calibrations_by_application,
+    robot_frame_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +50,7 @@ def utf8(text: str) -> str:
 
 
 class ResultMessages:
-    """Makes the messages of results.
+    """Makes messages of ROS from results.
 
     Args:
         types: types of the messages, from the node that publishes them.
@@ -69,9 +73,13 @@ class ResultMessages:
     ) -> None:
         self.frame_id: str = frame_id
         self._camera, self._calibration = camera, calibration
-        robots = {frame_of_robot(each) for each in calibrations_of(calibration).values()}
-        self._in_ros: dict[str, str] = dict.fromkeys(robots, robot_frame) if robot_frame else {}
-        self._in_ros[camera] = frame_id
+        robots = {
+            robot_frame_of(each) for each in calibrations_by_application(calibration).values()
+        }
+        self._ros_frame_names: dict[str, str] = (
+            dict.fromkeys(robots, robot_frame) if robot_frame else {}
+        )
+        self._ros_frame_names[camera] = frame_id
         cls = {
             name: types.message(name).cls
             for name in (
@@ -93,7 +101,7 @@ class ResultMessages:
                 DETECTIONS,
             )
         }
-        self._cls: Any = type(
+        self._classes: Any = type(
             "Classes", (), {name.rpartition("/")[2]: class_ for name, class_ in cls.items()}
         )
         self._no_covariance = np.zeros(36)
@@ -112,25 +120,27 @@ class ResultMessages:
                 f"{self._camera}: expected the poses of a result in one frame, got "
                 f"{', '.join(sorted(frames))}"
             )
-        return self._frame(frames.pop() if frames else self._empty_frame(result.application))
+        return self._ros_frame_name(
+            frames.pop() if frames else self._empty_frame(result.application)
+        )
 
-    def _frame(self, frame_id: str) -> str:
-        return self._in_ros.get(frame_id, frame_id)
+    def _ros_frame_name(self, frame_id: str) -> str:
+        return self._ros_frame_names.get(frame_id, frame_id)
 
     def _empty_frame(self, application: int) -> str:
         """Return smartcam's name of the frame of a result without localizations."""
         calibration = calibration_of(self._calibration, application)
-        return frame_of_robot(calibration) or self._camera
+        return robot_frame_of(calibration) or self._camera
 
     def header(self, at: datetime, frame_id: str) -> Any:
         """Return a header."""
-        since, cls = at - EPOCH, self._cls
-        time = cls.Time(since.days * 86_400 + since.seconds, since.microseconds * 1000)
+        elapsed, cls = at - EPOCH, self._classes
+        time = cls.Time(elapsed.days * 86_400 + elapsed.seconds, elapsed.microseconds * 1000)
         return cls.Header(time, frame_id)
 
     def _pose(self, localization: Localization) -> Any:
         _, position, orientation = localization.pose
-        cls = self._cls
+        cls = self._classes
         return cls.Pose(cls.Point(*position), cls.Quaternion(*orientation))
 
     def poses(self, result: Result, parts: Sequence[Localization]) -> Any:
@@ -140,7 +150,7 @@ class ResultMessages:
             RosMessageError: the poses are in several frames.
         """
         header = self.header(result.received_at, self.frame_of(result))
-        return self._cls.PoseArray(header, [self._pose(part) for part in parts])
+        return self._classes.PoseArray(header, [self._pose(part) for part in parts])
 
     def detections(self, result: Result, parts: Sequence[Localization]) -> Any:
         """Return the ``Detection3DArray`` of a result: one hypothesis for each part.
@@ -151,7 +161,7 @@ class ResultMessages:
         Raises:
             RosMessageError: the poses are in several frames.
         """
-        cls = self._cls
+        cls = self._classes
         header = self.header(result.received_at, self.frame_of(result))
         no_size = cls.Vector3(0.0, 0.0, 0.0)
         detections = list[Any]()
@@ -168,21 +178,21 @@ class ResultMessages:
 
     def localizations(self, parts: Sequence[Localization]) -> list[Any]:
         """Return the thesis' ``Localization`` of each part."""
-        cls, made = self._cls, list[Any]()
+        cls, messages = self._classes, list[Any]()
         for part in parts:
-            stamped = part.pose.header
-            header = self.header(stamped.stamp, self._frame(stamped.frame_id))
+            pose_header = part.pose.header
+            header = self.header(pose_header.stamp, self._ros_frame_name(pose_header.frame_id))
             pose = cls.PoseStamped(header, self._pose(part))
-            made.append(cls.Localization(part.feature_id, part.quality, part.photo_index, pose))
-        return made
+            messages.append(cls.Localization(part.feature_id, part.quality, part.photo_index, pose))
+        return messages
 
     def result(self, result: Result, parts: Sequence[Localization] | None) -> Any:
-        """Return the message of a result: its container and its value.
+        """Return the message of a result: the container's bytes and the value.
 
         Args:
             result: result to send.
-            parts: localizations of the result, in metres; None if the result has none: then the
-                message has the value as JSON.
+            parts: localizations of the result, in metres. If it is None, the result has no
+                localizations, and the message has the value as JSON.
         """
         try:
             frame_id = self.frame_of(result)
@@ -194,7 +204,7 @@ class ResultMessages:
                 text = text_of(result.value)
             except Exception as exc:  # noqa: BLE001 - a plug-in's value
                 error = utf8(f"the value is no JSON: {exc!r:.200}")
-        return self._cls.Result(
+        return self._classes.Result(
             self.header(result.received_at, frame_id),
             self._camera,
             max(result.application, 0),  # -1 if a camera does not report it
@@ -208,4 +218,4 @@ class ResultMessages:
     def failed(self, error: BaseException, at: datetime) -> Any:
         """Return the message of a result that could not be interpreted."""
         header = self.header(at, self.frame_id)
-        return self._cls.Result(header, self._camera, 0, 0, error_text(error), [], "", b"")
+        return self._classes.Result(header, self._camera, 0, 0, error_text(error), [], "", b"")

@@ -9,7 +9,7 @@ import logging
 from typing import TYPE_CHECKING, Any, Protocol
 
 from smartcam._server import Server
-from smartcam.ros2._cameras.calibrations import calibrations_of
+from smartcam.ros2._cameras.calibrations import open_calibrations
 from smartcam.ros2._cameras.controls import CameraControls
 from smartcam.ros2._cameras.lifecycle import CameraLifecycle
 from smartcam.ros2._cameras.options import CameraNodeOptions
@@ -33,38 +33,42 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
 class CameraPart(Protocol):
-    """A part of a camera's node, which owns its topics and services, and its tasks."""
+    """A part of a camera's node, with topics, services and tasks of its own."""
 
     def start(self) -> Awaitable[None] | None:
         """Declare topics and services, and start."""
         ...
 
     async def close(self) -> None:
-        """End the part, within seconds; also if its start failed."""
+        """Close the part within seconds, even if ``start`` failed."""
         ...
 
 
 PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
-    lambda this: CameraParameters.of(this.camera, this.node, this.options, this.status),
-    lambda this: this.status,
-    lambda this: this.results,
-    lambda this: CameraGraph(
-        this.node, this.calibrations, owned=this.calibrations is not this.options.calibrations
+    lambda camera_node: CameraParameters.create(
+        camera_node.camera, camera_node.node, camera_node.options, camera_node.status
     ),
-    lambda this: this.services,
-    lambda this: this.rosout(),
-    lambda this: CameraPictures(
-        this.camera,
-        this.node,
-        frame_id=this.frames.optical,
-        camera_info_url=str(this.options.frames.get("camera_info_url", "")),
+    lambda camera_node: camera_node.status,
+    lambda camera_node: camera_node.results,
+    lambda camera_node: CameraGraph(
+        camera_node.node,
+        camera_node.calibrations,
+        owned=camera_node.calibrations is not camera_node.options.calibrations,
     ),
-    lambda this: this.controls(),
-    lambda this: StaticTransforms(this.node, this.frames.transforms()),
-    lambda this: this.lifecycle,
+    lambda camera_node: camera_node.services,
+    lambda camera_node: camera_node.rosout(),
+    lambda camera_node: CameraPictures(
+        camera_node.camera,
+        camera_node.node,
+        frame_id=camera_node.frames.optical,
+        camera_info_url=str(camera_node.options.frames.get("camera_info_url", "")),
+    ),
+    lambda camera_node: camera_node.controls(),
+    lambda camera_node: StaticTransforms(camera_node.node, camera_node.frames.transforms()),
+    lambda camera_node: camera_node.lifecycle,
 )
-"""Parts of a node, in the order of their start. The life cycle is the last, so that the others get
-its events."""
+"""Functions that make the parts of a node, in the order of their start. The life cycle starts last,
+so that all other parts get its events."""
 
 
 class CameraNode(Server):
@@ -90,7 +94,7 @@ class CameraNode(Server):
         self, camera: Camera[Any], node: NodeOfRos, *, options: CameraNodeOptions | None = None
     ) -> None:
         self.camera: Camera[Any] = camera
-        self.calibrations: ThesisCalibration | None = calibrations_of(
+        self.calibrations: ThesisCalibration | None = open_calibrations(
             (options or CameraNodeOptions()).calibrations, camera.name
         )
         self.node: Any = node
@@ -99,11 +103,11 @@ class CameraNode(Server):
         self.status: CameraStatus
         self.results: CameraResults
         self.services: CameraServices
-        self._renew()
+        self._create_parts()
         self._stack: contextlib.AsyncExitStack | None = None
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
 
-    def _renew(self) -> None:
+    def _create_parts(self) -> None:
         camera, node, options = self.camera, self.node, self.options
         self.lifecycle = CameraLifecycle(
             camera, node, application=options.application, autostart=options.autostart
@@ -147,12 +151,12 @@ class CameraNode(Server):
         """Return the publisher of the camera's warnings on ``/rosout``; None in ROS 1."""
         if self.node.parameters is None:
             return None
-        begins = (f"{self.camera.name} ", f"{self.camera.name}:")
+        prefixes = (f"{self.camera.name} ", f"{self.camera.name}:")
 
-        def wanted(record: logging.LogRecord) -> bool:
-            return record.getMessage().startswith(begins)
+        def is_of_camera(record: logging.LogRecord) -> bool:
+            return record.getMessage().startswith(prefixes)
 
-        return RosOut(self.node, logging.getLogger("smartcam"), wanted=wanted)
+        return RosOut(self.node, logging.getLogger("smartcam"), is_wanted=is_of_camera)
 
     def _on_transition(self, _: object) -> None:
         self.results.active = self.lifecycle.active
@@ -165,33 +169,33 @@ class CameraNode(Server):
 
         Cancellation: the node is closed.
         """
-        async with self._turn:
+        async with self._lock:
             if self._stack is not None:
                 return
             if self.lifecycle.closed:
-                self._renew()
+                self._create_parts()
             async with contextlib.AsyncExitStack() as stack:
                 await stack.enter_async_context(self.node)
-                for make in PARTS:
-                    part = make(self)
+                for make_part in PARTS:
+                    part = make_part(self)
                     if part is not None:
-                        stack.push_async_callback(_closed, part)
-                        begun = part.start()
-                        if inspect.isawaitable(begun):
-                            await begun
+                        stack.push_async_callback(_close_part, part)
+                        started = part.start()
+                        if inspect.isawaitable(started):
+                            await started
                         await asyncio.sleep(0)  # a declaration takes the engine a while
                 self._stack = stack.pop_all()
 
     async def stop(self) -> None:
         """Close all parts and the node. Idempotent, bounded."""
-        async with self._turn:
+        async with self._lock:
             stack, self._stack = self._stack, None
             if stack is not None:
                 await stack.aclose()
 
 
-async def _closed(part: CameraPart) -> None:
-    """Close a part; log a failure, so that the others are closed too."""
+async def _close_part(part: CameraPart) -> None:
+    """Close a part; log an error instead of raising it, so that the other parts are closed, too."""
     try:
         await part.close()
     except Exception:

@@ -1,4 +1,4 @@
-"""Parameters of a camera's node: the camera's settings from a fleet file, some of them settable."""
+"""Parameters of a camera's node: the camera's settings; a few of them can be set."""
 
 from __future__ import annotations
 
@@ -20,37 +20,46 @@ if TYPE_CHECKING:
     from smartcam.settings import CameraSettings
 
 SWITCH_TIMEOUT = 9.0
-"""Largest timeout of an application switch, seconds: ROS gives setting a parameter 10 seconds."""
+"""Largest timeout of an application switch in seconds: setting a parameter may take 10 seconds."""
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
 DIAGNOSTICS_PERIODS = (0.1, 3600.0)
 """Smallest and largest number of seconds between two diagnostics messages."""
 
 SETTINGS: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
-    "url": ("URL of the camera, without a password", lambda given: masked(given.address.url)),
+    "url": ("URL of the camera, without a password", lambda settings: masked(settings.address.url)),
     "interpret_as": (
         "interpretation of result containers; empty: none",
-        lambda given: as_text(given.interpret_as),
+        lambda settings: interpretation_text(settings.interpret_as),
     ),
-    "y_down": ("the camera's y axis points down", lambda given: given.y_down),
-    "lenient": ("any byte but 0 counts as true in a bool", lambda given: given.lenient),
+    "y_down": ("the camera's y axis points down", lambda settings: settings.y_down),
+    "lenient": ("any byte but 0 counts as true in a bool", lambda settings: settings.lenient),
     "restore": (
         "application and run state are restored after a reconnect",
-        lambda given: given.restore,
+        lambda settings: settings.restore,
     ),
-    "reconnect": ("the client reconnects after a loss", lambda given: given.reconnect is not None),
-    "connect_timeout": ("seconds to establish a session", lambda given: given.connect_timeout),
+    "reconnect": (
+        "the client reconnects after a loss",
+        lambda settings: settings.reconnect is not None,
+    ),
+    "connect_timeout": (
+        "seconds to establish a session",
+        lambda settings: settings.connect_timeout,
+    ),
     "switch_timeout": (
         "seconds for a switch until the camera is ready",
-        lambda given: given.switch_timeout,
+        lambda settings: settings.switch_timeout,
     ),
-    "request_timeout": ("seconds for the answer to a request", lambda given: given.request_timeout),
+    "request_timeout": (
+        "seconds for the answer to a request",
+        lambda settings: settings.request_timeout,
+    ),
     "liveness_timeout": (
         "seconds until a camera that does not answer counts as lost; 0: never",
-        lambda given: given.liveness_timeout or 0.0,
+        lambda settings: settings.liveness_timeout or 0.0,
     ),
 }
-"""Read-only parameters: the description, and a function that returns the value."""
+"""Description of each read-only parameter, and a function that returns its value."""
 
 PICTURE_PARAMETERS = {
     "video_device": "source of the frames",
@@ -61,12 +70,12 @@ PICTURE_PARAMETERS = {
 """Descriptions of the parameters of the source of frames, by v4l2_camera's names."""
 
 
-def as_text(spec: object) -> str:
+def interpretation_text(spec: object) -> str:
     """Return an interpretation in one line."""
     if spec is None:
         return ""
     if isinstance(spec, Mapping):
-        return json.dumps({str(key): as_text(value) for key, value in spec.items()})
+        return json.dumps({str(key): interpretation_text(value) for key, value in spec.items()})
     return spec if isinstance(spec, str) else type(spec).__name__
 
 
@@ -94,7 +103,7 @@ class CameraParameters:
         self._stop_listening: Callable[[], None] | None = None
 
     @classmethod
-    def of(
+    def create(
         cls, camera: Camera[Any], node: Any, options: CameraNodeOptions, status: CameraStatus
     ) -> CameraParameters | None:
         """Return the parameters of a camera; None if the node has no parameters."""
@@ -110,7 +119,7 @@ class CameraParameters:
             self._declare(name, value(settings), description, read_only=True)
         self._declare(
             "application",
-            self._active(),
+            self._active_application(),
             "the active application; 0: not known",
             minimum=0,
             maximum=MAX_APPLICATION_ID,
@@ -134,10 +143,10 @@ class CameraParameters:
         if options.frames:
             optical = CameraFrames(frame_id).optical
             self._declare("camera_frame_id", optical, "frame of pictures", read_only=True)
-        self._stop_listening = self._status.listen(self._follow)
+        self._stop_listening = self._status.listen(self._update_application)
 
-    def _declare(self, name: str, value: object, description: str, **how: Any) -> None:
-        self._parameters.declare(name, value, description=description, **how)
+    def _declare(self, name: str, value: object, description: str, **options: Any) -> None:
+        self._parameters.declare(name, value, description=description, **options)
         self._declared.append(name)
 
     async def close(self) -> None:
@@ -149,18 +158,18 @@ class CameraParameters:
             with contextlib.suppress(ConfigurationError):  # another program has undeclared it
                 self._parameters.undeclare(name)
 
-    def _active(self) -> int:
+    def _active_application(self) -> int:
         return (self._camera.active_application or 0) if self._camera.connected else 0
 
-    def _follow(self) -> None:
+    def _update_application(self) -> None:
         """Update the parameter ``application`` to the active application."""
-        self._parameters.update("application", self._active())
+        self._parameters.update("application", self._active_application())
 
     async def _switch(self, application: int) -> None:
         camera = self._camera
         settings = self._options.settings or camera.settings
-        limit = min(settings.switch_timeout, SWITCH_TIMEOUT)
+        timeout = min(settings.switch_timeout, SWITCH_TIMEOUT)
         if not camera.connected or await camera.query_application() != application:
-            await camera.switch_application(application, timeout=limit)
+            await camera.switch_application(application, timeout=timeout)
         else:
-            await camera.wait_status(lambda status: not status.loading, limit)
+            await camera.wait_status(lambda status: not status.loading, timeout)

@@ -12,7 +12,7 @@ import numpy as np
 from smartcam.exceptions import FrameFormatError, FrameTimeoutError, RosMessageError, SmartCamError
 from smartcam.frames import Frame, FrameSource, Moment, find_format
 from smartcam.frames._inside import jpeg_header, read_bitmap
-from smartcam.ros2._cameras.image_messages import image_fields, prepared
+from smartcam.ros2._cameras.image_messages import image_fields, to_ros_format
 from smartcam.ros2._cameras.messages import error_text
 
 if TYPE_CHECKING:
@@ -27,10 +27,10 @@ MAX_TIMEOUT: Final = 60.0
 """Longest ``timeout`` of a request in seconds, and the default."""
 
 
-async def one_frame(
+async def take_frame(
     frames: FrameSource | None, camera: Camera[Any] | None, timeout: float
 ) -> Frame:
-    """Return a picture: the first that is exposed after the call, or the last one of the camera.
+    """Return the first frame exposed after the call, or the picture that the camera has last taken.
 
     Raises:
         SmartCamError: no picture came in time.
@@ -49,7 +49,7 @@ def frame_of_file(data: bytes, source: str) -> Frame:
     """Return the frame of a bitmap's or a JPEG's bytes, with the present time; blocks.
 
     Raises:
-        FrameFormatError: the file is neither.
+        FrameFormatError: the bytes are neither a bitmap nor a JPEG.
     """
     if data[:2] == b"\xff\xd8":
         width, height, _ = jpeg_header(data, source)
@@ -84,14 +84,23 @@ class PictureRequests:
         node: node of the service.
         frame_id: name of the camera's optical frame.
         lens: the camera's lens.
-        take: function that returns a picture within a number of seconds.
+        take_picture: function that returns a picture within a number of seconds.
     """
 
     def __init__(
-        self, node: Any, frame_id: str, lens: CameraLens, take: Callable[[float], Awaitable[Frame]]
+        self,
+        node: Any,
+        frame_id: str,
+        lens: CameraLens,
+        take_picture: Callable[[float], Awaitable[Frame]],
     ) -> None:
-        self._node, self._frame_id, self._lens, self._take = node, frame_id, lens, take
-        self._one_at_a_time = asyncio.Lock()
+        self._node, self._frame_id, self._lens, self._take_picture = (
+            node,
+            frame_id,
+            lens,
+            take_picture,
+        )
+        self._lock = asyncio.Lock()
 
     async def serve(self, request: Any) -> dict[str, Any]:
         """Answer a request."""
@@ -109,17 +118,17 @@ class PictureRequests:
         timeout = seconds or MAX_TIMEOUT
         try:
             async with asyncio.timeout(timeout):
-                await self._one_at_a_time.acquire()
+                await self._lock.acquire()
         except TimeoutError as exc:
             raise FrameTimeoutError(
-                f"no picture in {timeout:g} s: those that were asked for before took as long"
+                f"no picture in {timeout:g} s: earlier requests took all the time"
             ) from exc
         try:
             await self._lens.load()
-            frame = await asyncio.to_thread(prepared, await self._take(timeout))
+            frame = await asyncio.to_thread(to_ros_format, await self._take_picture(timeout))
         finally:
-            self._one_at_a_time.release()
+            self._lock.release()
         return {
             "image": image_fields(frame, self._frame_id),
-            "camera_info": self._lens.fields(frame),
+            "camera_info": self._lens.camera_info_fields(frame),
         }

@@ -22,10 +22,10 @@ CHECK_INTERVAL: Final = 0.1
 """Seconds between two checks for a subscriber."""
 
 IDLE_CHECK_INTERVAL: Final = 1.0
-"""Seconds between two checks if the graph reports new subscribers."""
+"""Seconds between two checks for a subscriber if the graph also reports new subscribers."""
 
 REOPEN_BACKOFF: Final = Backoff(initial=0.5, maximum=10.0)
-"""Delays after which a source that ended is opened again, while there is a subscriber."""
+"""Delays before a source that has ended is opened again, while there is a subscriber."""
 
 
 class SubscribedPictures(Generic[Item]):
@@ -34,7 +34,7 @@ class SubscribedPictures(Generic[Item]):
     Args:
         name: name of the camera, for the log.
         publishers: publishers of the topics.
-        read: function that opens a reader whose iteration waits for a number of seconds.
+        read: function that opens a reader; the number is the timeout of each frame in seconds.
         publish: coroutine function that publishes a frame; the next frame is read after it.
 
     Attributes:
@@ -52,25 +52,27 @@ class SubscribedPictures(Generic[Item]):
         self._name, self._publishers = name, publishers
         self._read, self._publish = read, publish
         self._last_warning = ""
-        self._woken = asyncio.Event()
-        self._watches: list[Callable[[], None]] = []
+        self._subscriber_event = asyncio.Event()
+        self._stop_watching: list[Callable[[], None]] = []
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Start to check for subscribers."""
         if self._task is None:
-            watches = [getattr(publisher, "watch", None) for publisher in self._publishers]
-            if None not in watches:
-                self._watches = [watch(self._woken.set) for watch in watches if watch]
+            methods = [getattr(publisher, "watch", None) for publisher in self._publishers]
+            if None not in methods:
+                self._stop_watching = [
+                    watch(self._subscriber_event.set) for watch in methods if watch
+                ]
             self._task = asyncio.get_running_loop().create_task(
                 self._run(), name=f"pictures of {self._name}"
             )
 
-    def end(self) -> None:
+    def cancel(self) -> None:
         """Stop reading as soon as possible. Idempotent."""
-        watches, self._watches = self._watches, []
-        for end in watches:
-            end()
+        stop_watching, self._stop_watching = self._stop_watching, []
+        for stop in stop_watching:
+            stop()
         if self._task is not None:
             self._task.cancel()
 
@@ -79,7 +81,7 @@ class SubscribedPictures(Generic[Item]):
 
         Cancellation: reading still ends.
         """
-        self.end()
+        self.cancel()
         if self._task is not None:
             await asyncio.wait([self._task])
             self._task = None
@@ -92,39 +94,39 @@ class SubscribedPictures(Generic[Item]):
     async def _run(self) -> None:
         while True:
             await self._wait_for_subscriber()
-            before = self.frames
+            last_count = self.frames
             delays = REOPEN_BACKOFF.delays()
             while self.has_subscriber:
-                await self._stream()
-                if self.frames > before:
-                    before, delays = self.frames, REOPEN_BACKOFF.delays()
-                await self._pause(next(delays))
+                await self._publish_until_end()
+                if self.frames > last_count:
+                    last_count, delays = self.frames, REOPEN_BACKOFF.delays()
+                await self._wait_to_reopen(next(delays))
 
     async def _wait_for_subscriber(self) -> None:
-        """Wait for a subscriber; check seldom if the graph reports subscribers."""
+        """Wait for a subscriber; check less often if the graph reports new subscribers."""
         loop = asyncio.get_running_loop()
         check_often_until = 0.0
         while not self.has_subscriber:
             pause = (
                 CHECK_INTERVAL
-                if not self._watches or loop.time() < check_often_until
+                if not self._stop_watching or loop.time() < check_often_until
                 else IDLE_CHECK_INTERVAL
             )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
-                    await self._woken.wait()
+                    await self._subscriber_event.wait()
                 check_often_until = loop.time() + IDLE_CHECK_INTERVAL
-                self._woken.clear()
+                self._subscriber_event.clear()
                 await asyncio.sleep(0)
 
-    async def _pause(self, seconds: float) -> None:
+    async def _wait_to_reopen(self, seconds: float) -> None:
         """Wait before the source is opened again, while there is a subscriber."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while self.has_subscriber and loop.time() < end:  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(CHECK_INTERVAL)
 
-    async def _stream(self) -> None:
+    async def _publish_until_end(self) -> None:
         """Publish until there is no subscriber, or the source ends."""
         try:
             async with self._read(CHECK_INTERVAL) as reader:
@@ -150,7 +152,7 @@ class SubscribedPictures(Generic[Item]):
         self._last_warning = ""
 
     def _warn_once(self, text: str) -> None:
-        """Log an error, once until pictures come again."""
+        """Log an error unless it is the same as the last one since a picture was published."""
         if text != self._last_warning:
             self._last_warning = text
             logger.warning("%s ! %s", self._name, text)

@@ -12,13 +12,13 @@ from smartcam.exceptions import ConfigurationError, RosError, UnsupportedError
 from smartcam.frames import Codecs, FrameSource
 from smartcam.ros2._cameras.image_messages import (
     ENCODINGS,
+    choose_compression,
     compressed_fields,
-    compression,
     image_fields,
-    prepared,
+    to_ros_format,
 )
 from smartcam.ros2._cameras.lens import CameraLens
-from smartcam.ros2._cameras.picture_requests import PictureRequests, one_frame
+from smartcam.ros2._cameras.picture_requests import PictureRequests, take_frame
 from smartcam.ros2._cameras.picture_stream import SubscribedPictures, publish_newest
 from smartcam.ros2._node.qos import DRIVER
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 Value = TypeVar("Value")
 
 SIZE_TIMEOUT: Final = 10.0
-"""Seconds of the timeout for a picture that is taken for its size."""
+"""Seconds that taking a picture may take, if it is taken only to know its size."""
 
 MAX_STAMPS: Final = 16
-"""Number of remembered stamps of pictures: each stamp gets one ``camera_info``."""
+"""Number of remembered stamps, so that one ``camera_info`` is published for each stamp."""
 
 
 class CameraPictures:
@@ -76,9 +76,9 @@ class CameraPictures:
             raise ConfigurationError(f"pictures: quality: expected 1 to 100, got {quality!r}")
         self._camera, self._node, self._frames, self._quality = camera, node, frames, quality
         self.frame_id: str = frame_id or f"{node.name}_optical"
-        self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
-        self._requests = PictureRequests(node, self.frame_id, self._lens, self._take_one)
-        self._ends: list[Any] = []
+        self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._picture_size)
+        self._requests = PictureRequests(node, self.frame_id, self._lens, self._take_frame)
+        self._closables: list[Any] = []
         self._streams: list[SubscribedPictures[Frame]] = []
         self._stamps: collections.deque[float] = collections.deque(maxlen=MAX_STAMPS)
         self._size: tuple[int, int] | None = None
@@ -86,13 +86,13 @@ class CameraPictures:
         self._thread: ThreadPoolExecutor | None = None
 
     @property
-    def streams(self) -> bool:
-        """True if there are frames, and not only single pictures."""
+    def has_frames(self) -> bool:
+        """True if the camera or source delivers a stream of frames, not only single pictures."""
         if self._frames is not None:
             return True
-        known = getattr(self._camera, "has_frames", None)
-        if known is not None:
-            return bool(known)
+        has_frames = getattr(self._camera, "has_frames", None)
+        if has_frames is not None:
+            return bool(has_frames)
         try:
             self._read(1.0)
         except UnsupportedError:
@@ -107,44 +107,51 @@ class CameraPictures:
         self._codecs = Codecs(threads=1)
         self._codecs.begin()
         node = self._node
-        if self.streams:
+        if self.has_frames:
             image = node.publisher("~/image_raw", "sensor_msgs/msg/Image", qos=DRIVER)
             info = node.publisher("~/camera_info", "sensor_msgs/msg/CameraInfo", qos=DRIVER)
-            small = node.publisher(
+            compressed = node.publisher(
                 "~/image_raw/compressed", "sensor_msgs/msg/CompressedImage", qos=DRIVER
             )
-            self._ends += [image, info, small]
-            self._image, self._info, self._small = image, info, small
+            self._closables += [image, info, compressed]
+            self._image, self._info, self._compressed = image, info, compressed
             name = node.full_name
             self._streams = [
                 SubscribedPictures(name, (image, info), self._read, self._publish_raw),
                 SubscribedPictures(
-                    name, (small,), partial(self._read, encoding="jpeg"), self._publish_small
+                    name,
+                    (compressed,),
+                    partial(self._read, encoding="jpeg"),
+                    self._publish_compressed,
                 ),
             ]
-        self._ends.append(
-            node.serve("~/set_camera_info", "sensor_msgs/srv/SetCameraInfo", self._lens.set)
+        self._closables.append(
+            node.serve(
+                "~/set_camera_info",
+                "sensor_msgs/srv/SetCameraInfo",
+                self._lens.serve_set_camera_info,
+            )
         )
-        kind = "smartcam_msgs/srv/RequestImage"
-        self._ends.append(node.serve("~/request_image", kind, self._requests.serve))
+        type_name = "smartcam_msgs/srv/RequestImage"
+        self._closables.append(node.serve("~/request_image", type_name, self._requests.serve))
         for stream in self._streams:
             stream.start()
 
     async def close(self) -> None:
-        """Withdraw topics and services; a source of the caller's stays open. Idempotent.
+        """Withdraw topics and services; a source that the caller opened stays open. Idempotent.
 
         Cancellation: everything is still closed.
         """
         streams, self._streams = self._streams, []
         for stream in streams:
-            stream.end()
+            stream.cancel()
         try:
             for stream in streams:
                 await stream.close()
         finally:
-            for end in self._ends:
-                end.close()
-            self._ends.clear()
+            for closable in self._closables:
+                closable.close()
+            self._closables.clear()
             thread, self._thread = self._thread, None
             if thread is not None:
                 thread.shutdown(wait=False, cancel_futures=True)
@@ -162,16 +169,16 @@ class CameraPictures:
         quality = None if encoding == "raw" else self._quality
         return self._camera.frames(encoding=encoding, quality=quality, timeout=timeout)
 
-    async def _take_one(self, timeout: float) -> Frame:
-        frame = await one_frame(self._frames, self._camera, timeout)
+    async def _take_frame(self, timeout: float) -> Frame:
+        frame = await take_frame(self._frames, self._camera, timeout)
         self._size = (frame.width, frame.height)
         return frame
 
-    async def _size_of_pictures(self) -> tuple[int, int]:
+    async def _picture_size(self) -> tuple[int, int]:
         if self._frames is not None:
             return self._frames.format.width, self._frames.format.height
         if self._size is None:
-            await self._take_one(SIZE_TIMEOUT)
+            await self._take_frame(SIZE_TIMEOUT)
         return self._size or (0, 0)
 
     # ------------------------------------------------------------------ messages
@@ -179,39 +186,42 @@ class CameraPictures:
     async def _publish_raw(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
         if _has_subscribers(self._image):
-            ready = frame
+            converted = frame
             if frame.format.name not in ENCODINGS:
-                ready = await self._in_thread(lambda: prepared(frame))
-            await publish_newest(self._image, image_fields(ready, self.frame_id))
+                converted = await self._run_in_thread(lambda: to_ros_format(frame))
+            await publish_newest(self._image, image_fields(converted, self.frame_id))
         await self._publish_info(frame)
 
-    async def _publish_small(self, frame: Frame) -> None:
+    async def _publish_compressed(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
-        form = compression(frame)
-        small = frame
-        if form.first:
-            small = await self._codecs.converted(small, form.first)
-        if form.how == "png":
-            small = await self._codecs.png(small)
-        elif form.how == "jpeg":
-            small = await self._codecs.jpeg(small, quality=self._quality)
-        await publish_newest(self._small, compressed_fields(small, form.text(), self.frame_id))
+        compression = choose_compression(frame)
+        compressed = frame
+        if compression.convert_to:
+            compressed = await self._codecs.converted(compressed, compression.convert_to)
+        if compression.codec == "png":
+            compressed = await self._codecs.png(compressed)
+        elif compression.codec == "jpeg":
+            compressed = await self._codecs.jpeg(compressed, quality=self._quality)
+        await publish_newest(
+            self._compressed,
+            compressed_fields(compressed, compression.format_text(), self.frame_id),
+        )
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:
-        """Publish the lens of a picture; once if two streams have the picture."""
+        """Publish the lens of a picture, unless it was published for the same stamp."""
         if frame.utc in self._stamps:
             return
         self._stamps.append(frame.utc)
         if _has_subscribers(self._info):
             await self._lens.load()
-            self._info.publish(self._lens.fields(frame))
+            self._info.publish(self._lens.camera_info_fields(frame))
 
-    async def _in_thread(self, work: Callable[[], Value]) -> Value:
-        """Run a function in the thread for pictures; a started function is finished."""
+    async def _run_in_thread(self, function: Callable[[], Value]) -> Value:
+        """Run a function in the thread for pictures; once started, it runs to its end."""
         if self._thread is None:
             raise RosError("the publisher of pictures is closed")
-        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+        return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
 
 def _has_subscribers(publisher: Any) -> bool:

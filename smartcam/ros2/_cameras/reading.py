@@ -1,4 +1,4 @@
-"""Find out how a camera's results are interpreted, before they are published."""
+"""Find out how a camera's results are interpreted: by what interpreter, in which frame and unit."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ if TYPE_CHECKING:
     from smartcam.settings import Address
 
 
-def reading_of(camera: Camera[Any]) -> Interpretation:
-    """Return the camera's own interpretation; a trigger may have another for its results."""
+def interpretation_of(camera: Camera[Any]) -> Interpretation:
+    """Return the camera's interpretation, which holds unless a trigger asks for another one."""
     return camera._default  # noqa: SLF001 - smartcam's own
 
 
-def place_of(camera: Camera[Any]) -> Address:
-    """Return the address of a camera itself, as far as it is known."""
+def address_of(camera: Camera[Any]) -> Address:
+    """Return the address of the camera itself, also of one that an agent of a fleet has."""
     return camera._place  # noqa: SLF001 - smartcam's own
 
 
-def calibrations_of(given: Any) -> dict[int | None, Any]:
-    """Return the calibrations of a camera's settings by application; None: of all of them."""
-    if hasattr(given, "items") and not hasattr(given, "to_robot"):
-        return {number: value for number, value in given.items() if value is not None}
-    return {} if given is None else {None: given}
+def calibrations_by_application(argument: Any) -> dict[int | None, Any]:
+    """Return the calibrations of a camera's settings by application; key None is for all others."""
+    if hasattr(argument, "items") and not hasattr(argument, "to_robot"):
+        return {number: value for number, value in argument.items() if value is not None}
+    return {} if argument is None else {None: argument}
 
 
-def calibration_of(given: Any, application: int) -> Any:
+def calibration_of(argument: Any, application: int) -> Any:
     """Return the calibration of an application in a camera's settings; None without one."""
-    calibrations = calibrations_of(given)
+    calibrations = calibrations_by_application(argument)
     return calibrations.get(application, calibrations.get(None))
 
 
-def frame_of_robot(calibration: Any) -> str:
+def robot_frame_of(calibration: Any) -> str:
     """Return the frame of a calibration's poses; empty if the calibration has no name for it."""
-    named = getattr(calibration, "robot_frame", None) or getattr(calibration, "frame", None)
-    return named if isinstance(named, str) else ""
+    frame = getattr(calibration, "robot_frame", None) or getattr(calibration, "frame", None)
+    return frame if isinstance(frame, str) else ""
 
 
-def calibrated(camera: Camera[Any], application: int) -> bool:
+def is_calibrated(camera: Camera[Any], application: int) -> bool:
     """Return True if an application has a calibration to a robot's frame."""
     return calibration_of(camera.settings.calibration, application) is not None
 
@@ -59,10 +59,11 @@ def localizations_in_metres(
         spec: name of the interpreter of the result; None for the camera's own.
     """
     parts = localizations_of(result.value)
-    if parts is None or calibrated(camera, result.application):
+    if parts is None or is_calibrated(camera, result.application):
         return parts
     reader = own_interpreter(camera, result.application) if spec is None else resolve(spec)
     if in_pixels(reader):
         return None
-    other = not parts and reader is not None and without_poses(reader) is not None
-    return None if other else parts  # an empty list may be one of texts, or of records
+    # an empty list of an interpreter without poses is a list of texts, or of records
+    is_other_list = not parts and reader is not None and without_poses(reader) is not None
+    return None if is_other_list else parts

@@ -33,7 +33,7 @@ MAX_QUEUED_BYTES: Final = 1 << 24
 """Largest number of bytes of containers whose results wait for a topic with a delay."""
 
 MAX_WAITING_RESULTS: Final = 4096
-"""Largest number of results that wait to be published; beyond it the oldest is dropped, counted."""
+"""Largest number of results that wait to be published; beyond it the oldest is dropped."""
 
 
 class CameraResults:
@@ -45,7 +45,7 @@ class CameraResults:
     with a calibration the robot's.
 
     A result that cannot be interpreted has a message on ``~/results`` only, with its ``error``.
-    Localizations in pixels are only there, as JSON: the other topics have metres.
+    Localizations in pixels are on ``~/results`` only, as JSON: the other topics have metres.
 
     Args:
         camera: camera of the results.
@@ -85,8 +85,8 @@ class CameraResults:
     @property
     def dropped(self) -> int:
         """Number of results that were dropped, because they came too fast or by a delay."""
-        waiting = 0 if self._stream is None else self._stream.statistics().dropped
-        return waiting + (0 if self._outlet is None else self._outlet.dropped)
+        dropped_by_stream = 0 if self._stream is None else self._stream.statistics().dropped
+        return dropped_by_stream + (0 if self._outlet is None else self._outlet.dropped)
 
     @property
     def has_subscribers(self) -> bool:
@@ -105,8 +105,8 @@ class CameraResults:
         if self._task is not None:
             return
         try:
-            for name, kind in TOPICS.items():
-                self._declare(name, kind)
+            for name, type_name in TOPICS.items():
+                self._declare(name, type_name)
         except BaseException:
             self._withdraw()
             raise
@@ -115,11 +115,11 @@ class CameraResults:
             self._run(self._stream), name=f"{self._camera.name}: results to ROS"
         )
 
-    def _declare(self, name: str, kind: str) -> None:
+    def _declare(self, name: str, type_name: str) -> None:
         try:
-            self._publishers[name] = self._node.publisher(f"~/{name}", kind, qos=DRIVER)
+            self._publishers[name] = self._node.publisher(f"~/{name}", type_name, qos=DRIVER)
         except ConfigurationError as exc:
-            if kind != DETECTIONS:
+            if type_name != DETECTIONS:
                 raise
             # ROS 1 does the same
             logger.info("%s: without %s: %s", self._node.full_name, name, exc)
@@ -164,32 +164,32 @@ class CameraResults:
             raise ConfigurationError(
                 f"{self._camera.name}: queue_size {queue_size}: expected 1 to {MAX_QUEUED_RESULTS}"
             )
-        before, self._outlet = self._outlet, None
-        if before is not None and before.topic == topic:
-            self._outlet = before.heir(min_delay, queue_size)
+        old_outlet, self._outlet = self._outlet, None
+        if old_outlet is not None and old_outlet.topic == topic:
+            self._outlet = old_outlet.with_limits(min_delay, queue_size)
             return
         try:
             if topic:
-                publisher = self._other_topic(topic, queue_size)
+                publisher = self._make_publisher(topic, queue_size)
                 self._outlet = _SubscriberOutlet(topic, publisher, min_delay, queue_size)
         except BaseException:
-            self._outlet = before
+            self._outlet = old_outlet
             raise
-        if before is not None:
-            before.close()
+        if old_outlet is not None:
+            old_outlet.close()
 
-    def _other_topic(self, topic: str, depth: int) -> Any:
+    def _make_publisher(self, topic: str, depth: int) -> Any:
         publisher = self._node.publisher(topic, RESULT, qos=QoS(depth=depth))
         general = self._publishers.get("results")
-        if general is not None and _name(publisher) == _name(general):
+        if general is not None and _topic_name(publisher) == _topic_name(general):
             publisher.close()
             raise ConfigurationError(
-                f"{self._camera.name}: {_name(general)} has its results already: expected another "
-                "topic, or none"
+                f"{self._camera.name}: {_topic_name(general)} has its results already: expected "
+                "another topic, or none"
             )
         return publisher
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ incoming results
 
     async def _run(self, stream: Subscription[Result]) -> None:
         while True:
@@ -198,15 +198,15 @@ class CameraResults:
             except StopAsyncIteration:
                 return
             except InterpretationError as exc:
-                self._take_failed(exc)
+                self._handle_failure(exc)
             except SmartCamError as exc:
                 logger.warning("%s: no results any more: %s", self._camera.name, exc)
                 return
             else:
-                self._take(result)
+                self._handle_result(result)
             await asyncio.sleep(0)  # let other tasks run
 
-    def _take(self, result: Result) -> None:
+    def _handle_result(self, result: Result) -> None:
         if not self.active:
             return
         self.taken += 1
@@ -215,10 +215,10 @@ class CameraResults:
             self._publish_to("localizations", lambda: make.poses(result, parts))
             self._publish_to("detections", lambda: make.detections(result, parts))
         self._publish_result(
-            _Made(result.number, lambda: make.result(result, parts), len(result.raw))
+            _LazyMessage(result.number, lambda: make.result(result, parts), len(result.raw))
         )
 
-    def _take_failed(self, error: InterpretationError) -> None:
+    def _handle_failure(self, error: InterpretationError) -> None:
         if not self.active:
             return
         self.taken += 1
@@ -226,19 +226,19 @@ class CameraResults:
         level = logging.DEBUG if self.failed > 1 else logging.WARNING
         logger.log(level, "%s ! a result has no poses: %s", self._camera.name, error)
         message = self._messages.failed(error, datetime.now(UTC))
-        self._publish_result(_Made(0, lambda: message, 0))
+        self._publish_result(_LazyMessage(0, lambda: message, 0))
 
-    def _publish_result(self, made: _Made) -> None:
-        self._publish_to("results", made.make)
+    def _publish_result(self, message: _LazyMessage) -> None:
+        self._publish_to("results", message.make)
         if self._outlet is not None:
-            self._outlet.offer(made, self._put)
+            self._outlet.offer(message, self._publish_message)
 
     def _publish_to(self, name: str, make: Any) -> None:
         publisher = self._publishers.get(name)
         if publisher is not None:
-            self._put(publisher, make)
+            self._publish_message(publisher, make)
 
-    def _put(self, publisher: Any, make: Any) -> None:
+    def _publish_message(self, publisher: Any, make: Any) -> None:
         if not _has_subscribers(publisher):
             return
         try:
@@ -259,12 +259,12 @@ def _has_subscribers(publisher: Any) -> bool:
     return bool(getattr(publisher, "has_subscribers", True))
 
 
-def _name(publisher: Any) -> str:
+def _topic_name(publisher: Any) -> str:
     return str(getattr(publisher, "name", "") or publisher.topic)
 
 
-class _Made(NamedTuple):
-    """A message that is built when it is published."""
+class _LazyMessage(NamedTuple):
+    """A message that ``make`` builds when it is published."""
 
     number: int
     make: Any
@@ -272,7 +272,7 @@ class _Made(NamedTuple):
 
 
 class _SubscriberOutlet:
-    """A topic with a delay between two messages, and a queue for that.
+    """A topic with a least delay between two messages, and a queue of waiting messages.
 
     Attributes:
         dropped: number of results dropped for want of room, or at the end.
@@ -282,7 +282,7 @@ class _SubscriberOutlet:
         self.topic = topic
         self.dropped: int = 0
         self._publisher, self._min_delay, self._queue_size = publisher, min_delay, queue_size
-        self._queue: collections.deque[_Made] = collections.deque()
+        self._queue: collections.deque[_LazyMessage] = collections.deque()
         self._bytes = 0
         self._timer: asyncio.TimerHandle | None = None
 
@@ -291,38 +291,38 @@ class _SubscriberOutlet:
         """True if the topic has a subscriber."""
         return _has_subscribers(self._publisher)
 
-    def offer(self, made: _Made, put: Any) -> None:
-        """Publish a message when the delay is over."""
+    def offer(self, message: _LazyMessage, publish: Any) -> None:
+        """Publish a message with ``publish`` as soon as the delay allows."""
         if not self.has_subscribers:
             return
-        self._queue.append(made)
-        self._bytes += made.size
-        self._go_on(put)
+        self._queue.append(message)
+        self._bytes += message.size
+        self._publish_waiting(publish)
         while len(self._queue) > self._queue_size or self._bytes > MAX_QUEUED_BYTES:
             self._bytes -= self._queue.popleft().size
             self.dropped += 1
 
-    def _go_on(self, put: Any) -> None:
+    def _publish_waiting(self, publish: Any) -> None:
         while self._queue and self._timer is None:
-            made = self._queue.popleft()
-            self._bytes -= made.size
-            put(self._publisher, made.make)
+            message = self._queue.popleft()
+            self._bytes -= message.size
+            publish(self._publisher, message.make)
             if self._min_delay:
                 loop = asyncio.get_running_loop()
-                self._timer = loop.call_later(self._min_delay, self._next, put)
+                self._timer = loop.call_later(self._min_delay, self._on_timer, publish)
 
-    def _next(self, put: Any) -> None:
+    def _on_timer(self, publish: Any) -> None:
         self._timer = None
-        self._go_on(put)
+        self._publish_waiting(publish)
 
-    def heir(self, min_delay: float, queue_size: int) -> _SubscriberOutlet:
+    def with_limits(self, min_delay: float, queue_size: int) -> _SubscriberOutlet:
         """Return an outlet for the same publisher with other limits; drop waiting results."""
-        self._end()
-        made = _SubscriberOutlet(self.topic, self._publisher, min_delay, queue_size)
-        made.dropped = self.dropped
-        return made
+        self._drop_waiting()
+        outlet = _SubscriberOutlet(self.topic, self._publisher, min_delay, queue_size)
+        outlet.dropped = self.dropped
+        return outlet
 
-    def _end(self) -> None:
+    def _drop_waiting(self) -> None:
         self.dropped += len(self._queue)
         self._queue.clear()
         if self._timer is not None:
@@ -330,5 +330,5 @@ class _SubscriberOutlet:
 
     def close(self) -> None:
         """Stop publishing, and drop waiting messages."""
-        self._end()
+        self._drop_waiting()
         self._publisher.close()

@@ -23,11 +23,11 @@ COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 
-LENS_WAIT: Final = 1.5
-"""Seconds of the timeout for a lens from a topic, before a wizard begins."""
+LENS_TIMEOUT: Final = 1.5
+"""Seconds to wait for a lens from a topic before a calibration begins."""
 
-PICTURE_WAIT: Final = 25.0
-"""Seconds of the timeout for a picture from a topic."""
+PICTURE_TIMEOUT: Final = 25.0
+"""Seconds to wait for a picture from a topic."""
 
 MAX_CLOCK_DIFFERENCE: Final = 60.0
 """Largest number of seconds between a stamp and this computer's clock; beyond it the stamp is of
@@ -40,7 +40,7 @@ class CameraGraph:
     Args:
         node: open node of ROS.
         calibrations: the calibrations; None if there are none.
-        owned: whether the calibrations end with the node, since no other interface shares them.
+        owned: True if the calibrations are closed with the node: no other interface shares them.
     """
 
     def __init__(self, node: Any, calibrations: ThesisCalibration | None, *, owned: bool) -> None:
@@ -63,7 +63,7 @@ class CameraGraph:
 
     def check_topic(self, topic: str) -> None:
         """Raise ConfigurationError if a topic is not valid."""
-        self._full(topic)
+        self._full_name(topic)
 
     def listen(self) -> None:
         """Subscribe to transforms from now on."""
@@ -87,17 +87,17 @@ class CameraGraph:
             CalibrationError: NO_PICTURE: no picture came in time.
             FrameFormatError: the message is no picture.
         """
-        full = self._full(topic)
-        kind = self._kind(full)
+        name = self._full_name(topic)
+        type_name = self._picture_type(name)
         times: list[float] = []
-        subscription = self._node.subscribe(full, kind, qos=QoS(reliable=False, depth=1))
+        subscription = self._node.subscribe(name, type_name, qos=QoS(reliable=False, depth=1))
         try:
-            async with asyncio.timeout(PICTURE_WAIT):
-                message, utc = await _fresh(subscription, times)
+            async with asyncio.timeout(PICTURE_TIMEOUT):
+                message, utc = await _next_picture(subscription, times)
         except TimeoutError as exc:
-            raise self._missing_error(full, kind, times) from exc
+            raise self._missing_error(name, type_name, times) from exc
         except StopAsyncIteration as exc:
-            raise RosError(f"{full}: the node of the camera was closed meanwhile") from exc
+            raise RosError(f"{name}: the node of the camera was closed meanwhile") from exc
         finally:
             subscription.close()
         frame = frame_from(message, source=topic)
@@ -106,16 +106,20 @@ class CameraGraph:
     async def lens(self, topic: str) -> CameraModel | None:
         """Return the lens from the ``camera_info`` of a topic with pictures.
 
-        None if no message came within :data:`LENS_WAIT`, or the lens is not calibrated.
+        None if no message came within :data:`LENS_TIMEOUT`, or the lens is not calibrated.
 
         Raises:
             RosMessageError, CalibrationError: the message is not a valid lens, or its model is
                 unknown.
         """
-        beside = f"{self._full(topic).removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-        subscription = self._node.subscribe(beside, CAMERA_INFO, qos=QoS(reliable=False, depth=1))
+        info_topic = (
+            f"{self._full_name(topic).removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        )
+        subscription = self._node.subscribe(
+            info_topic, CAMERA_INFO, qos=QoS(reliable=False, depth=1)
+        )
         try:
-            async with asyncio.timeout(LENS_WAIT):
+            async with asyncio.timeout(LENS_TIMEOUT):
                 lens = lens_from(await anext(subscription))
         except (TimeoutError, StopAsyncIteration):
             return None
@@ -123,36 +127,36 @@ class CameraGraph:
             subscription.close()
         return None if lens is None else lens.camera
 
-    def _full(self, topic: str) -> str:
+    def _full_name(self, topic: str) -> str:
         return resolve(topic, self._node.namespace, self._node.name)
 
-    def _kind(self, topic: str) -> str:
+    def _picture_type(self, topic: str) -> str:
         """Return the type of a topic with pictures, from the graph, otherwise from its name."""
         graph = getattr(self._node, "graph", None)
         types = [] if graph is None else graph.topics().get(topic, [])
-        for kind in (IMAGE, COMPRESSED):
-            if kind in types:
-                return kind
+        for type_name in (IMAGE, COMPRESSED):
+            if type_name in types:
+                return type_name
         return COMPRESSED if topic.endswith("/compressed") else IMAGE
 
-    def _missing_error(self, topic: str, kind: str, times: list[float]) -> Exception:
-        old = f"; {len(times)} came that were taken before" if times else ""
+    def _missing_error(self, topic: str, type_name: str, times: list[float]) -> Exception:
+        earlier = f"; {len(times)} came that were taken before" if times else ""
         return Code.NO_PICTURE.refusal(
-            f"{topic}: no picture came within {PICTURE_WAIT:g} s{old}; expected {kind} with the "
-            "time of its exposure, from a camera that is running",
-            kind,
+            f"{topic}: no picture came within {PICTURE_TIMEOUT:g} s{earlier}; expected {type_name} "
+            "with the time of its exposure, from a camera that is running",
+            type_name,
             len(times),
         )
 
 
-async def _fresh(subscription: Any, times: list[float]) -> tuple[Any, float | None]:
-    """Return the first picture that was taken after the call, and its time."""
-    begun = time.time()
+async def _next_picture(subscription: Any, times: list[float]) -> tuple[Any, float | None]:
+    """Return the first picture that was taken after the call, and its time, None if unknown."""
+    started_at = time.time()
     while True:
         message = await anext(subscription)
         utc = utc_of(message.header)
         if abs(utc - time.time()) <= MAX_CLOCK_DIFFERENCE:
-            if utc >= begun:
+            if utc >= started_at:
                 return message, utc
         elif times:
             return message, None

@@ -1,6 +1,6 @@
 """The services of a camera's node: the thesis' eleven, services of std_srvs, and a typed trigger.
 
-If the reply has a field for an error, a call with an error gets a reply.
+A call that fails gets a reply with the error, since all these replies have a field for it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from smartcam._thesis_calibration import CALIBRATION
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.interpreters import resolve
-from smartcam.ros2._cameras.calibrations import RosCalibrationFace
+from smartcam.ros2._cameras.calibrations import CalibrationServices
 from smartcam.ros2._cameras.messages import error_text
-from smartcam.ros2._cameras.reading import calibrated, localizations_in_metres
+from smartcam.ros2._cameras.reading import is_calibrated, localizations_in_metres
 from smartcam.ros2._cameras.thesis import RosThesisFace, ThesisServices
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class CameraServices:
         camera: the camera.
         node: the camera's node.
         results: the results that the node publishes.
-        life: the node's life cycle.
+        lifecycle: the node's life cycle.
         calibrations: the camera's calibrations; None if there is no folder for them.
     """
 
@@ -59,14 +59,14 @@ class CameraServices:
         camera: Camera[Any],
         node: Any,
         results: CameraResults,
-        life: ManagedCamera,
+        lifecycle: ManagedCamera,
         calibrations: ThesisCalibration | None = None,
     ) -> None:
         self._camera, self._node, self._results = camera, node, results
-        face = RosThesisFace(camera, node, results, life)
-        self._thesis = ThesisServices(face, node, results)
-        self._calibrating = RosCalibrationFace(camera, calibrations)
-        self._std: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
+        node_side = RosThesisFace(camera, node, results, lifecycle)
+        self._thesis = ThesisServices(node_side, node, results)
+        self._calibration = CalibrationServices(camera, calibrations)
+        self._std_services: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
             "trigger": ("Trigger", self._trigger),
             "start": ("Trigger", self._start),
             "stop": ("Trigger", self._stop),
@@ -75,8 +75,8 @@ class CameraServices:
             "run": ("SetBool", self._run),
         }
         # a trigger of another application needs more time, to switch twice
-        self._limit = MAX_TIMEOUT + 2 * camera.settings.switch_timeout + CLOSE_TIMEOUT
-        self._served: list[Any] = []
+        self._call_timeout = MAX_TIMEOUT + 2 * camera.settings.switch_timeout + CLOSE_TIMEOUT
+        self._services: list[Any] = []
 
     def start(self) -> None:
         """Serve. Idempotent.
@@ -84,71 +84,75 @@ class CameraServices:
         Raises:
             RosError: the node is not open.
         """
-        if self._served:
+        if self._services:
             return
         try:
             answers = dict.fromkeys(THESIS, self._thesis.answer)
-            answers |= dict.fromkeys(CALIBRATION, self._calibrating.answer)
+            answers |= dict.fromkeys(CALIBRATION, self._calibration.answer)
             for name, answer in answers.items():
-                do = functools.partial(answer, name)
-                self._serve(name, f"smartcam_msgs/srv/{name}", self._in_fields(do))
-            for name, (kind, answer_in_words) in self._std.items():
-                self._serve(name, f"std_srvs/srv/{kind}", self._in_words(answer_in_words))
-            typed = self._in_fields(self._trigger_results)
-            self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", typed)
+                call = functools.partial(answer, name)
+                self._serve(name, f"smartcam_msgs/srv/{name}", self._with_error_field(call))
+            for name, (type_name, answer_text) in self._std_services.items():
+                self._serve(
+                    name, f"std_srvs/srv/{type_name}", self._with_success_field(answer_text)
+                )
+            typed_value = self._with_error_field(self._trigger_results)
+            self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", typed_value)
         except BaseException:
             self._withdraw()
             raise
 
     async def close(self) -> None:
         """Withdraw the services and cancel running calls. Idempotent, bounded."""
-        served = self._withdraw()
+        services = self._withdraw()
         await self._thesis.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
-                for service in served:
+                for service in services:
                     if hasattr(service, "wait_closed"):
                         await service.wait_closed()
         except TimeoutError:
             logger.warning("%s ! a call does not end", self._node.full_name)
 
     def _withdraw(self) -> list[Any]:
-        served, self._served = self._served, []
-        for service in served:
+        services, self._services = self._services, []
+        for service in services:
             service.close()
-        return served
+        return services
 
     # ------------------------------------------------------------------ errors as fields
 
-    def _serve(self, name: str, kind: str, handler: Any) -> None:
-        response = self._node.types.service(kind).response
+    def _serve(self, name: str, type_name: str, handler: Any) -> None:
+        response = self._node.types.service(type_name).response
 
         async def answer(request: Any) -> Any:
             return response.new(**await handler(request))
 
-        self._served.append(self._node.serve(f"~/{name}", kind, answer, timeout=self._limit))
+        self._services.append(
+            self._node.serve(f"~/{name}", type_name, answer, timeout=self._call_timeout)
+        )
 
-    def _in_fields(
-        self, do: Callable[[Any], Awaitable[dict[str, Any]]]
+    def _with_error_field(
+        self, call: Callable[[Any], Awaitable[dict[str, Any]]]
     ) -> Callable[[Any], Awaitable[dict[str, Any]]]:
-        """Return a handler that answers with the fields of ``do``, or with ``error``."""
+        """Return a handler that answers with the fields of ``call``, or with ``error``."""
 
         async def handler(request: Any) -> dict[str, Any]:
             try:
-                return {"error": "", **await do(request)}
+                return {"error": "", **await call(request)}
             except Exception as exc:  # noqa: BLE001 - the caller gets any error
                 return {"error": self._error_text(exc)}
 
         return handler
 
-    def _in_words(
-        self, do: Callable[[Any], Awaitable[str]]
+    def _with_success_field(
+        self, call: Callable[[Any], Awaitable[str]]
     ) -> Callable[[Any], Awaitable[dict[str, Any]]]:
-        """Return a handler that answers with ``success`` and the text of ``do``, or the error."""
+        """Return a handler that answers with ``success`` and the text of ``call``, or the error."""
 
         async def handler(request: Any) -> dict[str, Any]:
             try:
-                return {"success": True, "message": await do(request)}
+                return {"success": True, "message": await call(request)}
             except Exception as exc:  # noqa: BLE001 - the caller gets any error
                 return {"success": False, "message": self._error_text(exc)}
 
@@ -187,15 +191,15 @@ class CameraServices:
 
     async def _trigger_results(self, request: Any) -> dict[str, Any]:
         camera = self._camera
-        wanted, spec = request.results_per_trigger or 1, spec_of_text(request.interpret_as)
-        self._check(request, wanted, spec)
+        result_count, spec = request.results_per_trigger or 1, spec_of_text(request.interpret_as)
+        self._check(request, result_count, spec)
         results = await camera.trigger(
             request.application_id or None,
             interpret_as=spec,
             input=bytes(request.input) or None,
             timeout=request.timeout or DEFAULT_TRIGGER_TIMEOUT,
             when_busy="refuse" if request.refuse_when_busy else "wait",
-            results_per_trigger=wanted,
+            results_per_trigger=result_count,
         )
         make = self._results.messages.result
         messages = [
@@ -203,7 +207,7 @@ class CameraServices:
         ]
         return {"results": messages}
 
-    def _check(self, request: Any, wanted: int, spec: str | None) -> None:
+    def _check(self, request: Any, result_count: int, spec: str | None) -> None:
         name = self._camera.name
         if not 0 <= request.timeout <= MAX_TIMEOUT:
             raise ConfigurationError(
@@ -211,7 +215,7 @@ class CameraServices:
                 f"for {DEFAULT_TRIGGER_TIMEOUT:g}"
             )
         for quantity, got, most in (
-            ("results_per_trigger", wanted, MAX_RESULTS),
+            ("results_per_trigger", result_count, MAX_RESULTS),
             ("bytes of input", len(request.input), MAX_INPUT_BYTES),
             ("characters of interpret_as", len(spec or ""), MAX_LAYOUT_CHARACTERS),
         ):
@@ -219,7 +223,7 @@ class CameraServices:
                 raise ConfigurationError(f"{name}: {quantity}: expected {most} at most, got {got}")
         if spec is not None and in_pixels(resolve(spec)):
             application = request.application_id or self._camera.active_application or 0
-            if not calibrated(self._camera, application):
+            if not is_calibrated(self._camera, application):
                 raise ConfigurationError(
                     f"{name}: interpret_as {spec!r:.80}: expected lengths, since poses in ROS are "
                     "in metres, got pixels"

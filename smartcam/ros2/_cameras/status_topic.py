@@ -1,4 +1,4 @@
-"""Publish a camera's status on the topic of the thesis' Setup, besides ``~/status``."""
+"""Publish a camera's status on the topic that the service SmartcameraSetup names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MIN_INTERVAL: Final = 0.05
 """Seconds between two messages."""
 
 MAX_WAITING_EVENTS: Final = 64
-"""Largest number of events that may wait; only the state after them is published."""
+"""Largest number of waiting events; only the camera's state after all of them is published."""
 
 
 class CameraStatusTopic:
@@ -39,7 +39,7 @@ class CameraStatusTopic:
         self._topic = ""
         self._publisher: Any = None
         self._task: asyncio.Task[None] | None = None
-        self._ending: set[asyncio.Task[None]] = set()
+        self._cancelled_tasks: set[asyncio.Task[None]] = set()
 
     def resolve(self, topic: str) -> str:
         """Return a topic's full name; empty for none, and for ``~/status``.
@@ -49,8 +49,8 @@ class CameraStatusTopic:
         """
         if not topic:
             return ""
-        full = resolve(topic, self._node.namespace, self._node.name, "topic")
-        return "" if full == f"{self._node.full_name}/status" else full
+        name = resolve(topic, self._node.namespace, self._node.name, "topic")
+        return "" if name == f"{self._node.full_name}/status" else name
 
     def publish_on(self, topic: str) -> None:
         """Publish on a topic instead of the previous one; empty for none.
@@ -58,34 +58,35 @@ class CameraStatusTopic:
         Raises:
             ConfigurationError: the topic is not valid.
         """
-        full = self.resolve(topic)
-        if full == self._topic:
+        name = self.resolve(topic)
+        if name == self._topic:
             return
-        self._end()
-        if full:
-            self._publisher = self._node.publisher(full, STATUS_TYPE, qos=LATCHED)
-            self._topic = full
+        self._stop()
+        if name:
+            self._publisher = self._node.publisher(name, STATUS_TYPE, qos=LATCHED)
+            self._topic = name
             self._task = asyncio.get_running_loop().create_task(
-                self._follow(self._publisher), name=f"{self._camera.name}: status to {full}"
+                self._publish_changes(self._publisher),
+                name=f"{self._camera.name}: status to {name}",
             )
 
-    def _end(self) -> None:
+    def _stop(self) -> None:
         task, self._task = self._task, None
         publisher, self._publisher, self._topic = self._publisher, None, ""
         if task is not None:
             task.cancel()
-            self._ending.add(task)
-            task.add_done_callback(self._ending.discard)
+            self._cancelled_tasks.add(task)
+            task.add_done_callback(self._cancelled_tasks.discard)
         if publisher is not None:
             publisher.close()
 
     async def close(self) -> None:
         """Stop publishing. Idempotent."""
-        self._end()
-        if self._ending:
-            await asyncio.wait(tuple(self._ending))
+        self._stop()
+        if self._cancelled_tasks:
+            await asyncio.wait(tuple(self._cancelled_tasks))
 
-    async def _follow(self, publisher: Any) -> None:
+    async def _publish_changes(self, publisher: Any) -> None:
         published: dict[str, Any] | None = None
         async with self._camera.events(max_queue=MAX_WAITING_EVENTS) as events:
             while True:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from smartcam._thesis import THESIS, ThesisCall
 from smartcam.exceptions import ConfigurationError
-from smartcam.ros2._cameras.lifecycle import have_application
+from smartcam.ros2._cameras.lifecycle import run_application
 from smartcam.ros2._cameras.messages import utf8
-from smartcam.ros2._cameras.reading import calibrated, place_of, reading_of
+from smartcam.ros2._cameras.reading import address_of, interpretation_of, is_calibrated
 from smartcam.ros2._cameras.status_topic import CameraStatusTopic
 from smartcam.settings import validated
 
@@ -48,19 +48,19 @@ class ManagedCamera(Protocol):
 
 
 class RosThesisFace:
-    """The part of a camera's node that the thesis' services use.
+    """The operations of the thesis' services on a camera's node.
 
     Args:
         camera: the camera.
         node: the camera's node.
         results: the results that the node publishes.
-        life: the node's life cycle.
+        lifecycle: the node's life cycle.
     """
 
     def __init__(
-        self, camera: Camera[Any], node: Any, results: CameraResults, life: ManagedCamera
+        self, camera: Camera[Any], node: Any, results: CameraResults, lifecycle: ManagedCamera
     ) -> None:
-        self._camera, self._results, self._life = camera, results, life
+        self._camera, self._results, self._lifecycle = camera, results, lifecycle
         self._status = CameraStatusTopic(camera, node, results.messages)
         self.name: str = camera.name
         self._stopped = False
@@ -77,7 +77,7 @@ class RosThesisFace:
     @property
     def address(self) -> Address:
         """Address of the camera itself."""
-        return place_of(self._camera)
+        return address_of(self._camera)
 
     @property
     def application(self) -> int | None:
@@ -87,7 +87,7 @@ class RosThesisFace:
     @property
     def reading(self) -> Interpretation:
         """Interpretation of the results."""
-        return reading_of(self._camera)
+        return interpretation_of(self._camera)
 
     def check_reading(self, spec: str) -> None:
         """Raise ConfigurationError if results cannot be interpreted by ``spec``."""
@@ -99,7 +99,7 @@ class RosThesisFace:
 
     def is_calibrated(self, application: int) -> bool:
         """Return True if an application has a calibration to a robot's frame."""
-        return calibrated(self._camera, application)
+        return is_calibrated(self._camera, application)
 
     def check_status_topic(self, topic: str) -> None:
         """Raise ConfigurationError if a topic is not valid."""
@@ -116,7 +116,7 @@ class RosThesisFace:
         if self._state == "active":
             return {}
         try:
-            await self._life.activate()
+            await self._lifecycle.activate()
         except BaseException:
             self._results.publish_on("")
             raise
@@ -127,18 +127,18 @@ class RosThesisFace:
         self._results.publish_on("")
         self._status.publish_on("")
         if self._state == "active":
-            await self._life.deactivate()
+            await self._lifecycle.deactivate()
         if self._state == "inactive":
-            await self._life.cleanup()
+            await self._lifecycle.cleanup()
 
     async def have_session(self) -> None:
         """Configure the node if it is not."""
         if self._state not in {"inactive", "active"}:
-            await self._life.configure()
+            await self._lifecycle.configure()
 
     async def ensure(self, application: int, timeout: float) -> None:
         """Load and run an application."""
-        await have_application(self._camera, application, timeout)
+        await run_application(self._camera, application, timeout)
 
     async def switch(self, application: int, timeout: float) -> None:
         """Load an application."""
@@ -156,7 +156,7 @@ class RosThesisFace:
 
     @property
     def _state(self) -> str:
-        return str(self._life.state.label)
+        return str(self._lifecycle.state.label)
 
 
 class ThesisServices:
@@ -170,7 +170,7 @@ class ThesisServices:
 
     def __init__(self, face: RosThesisFace, node: Any, results: CameraResults) -> None:
         self._face, self._node, self._messages = face, node, results.messages
-        self._settling = asyncio.Lock()  # requests change topics one after the other
+        self._topic_lock = asyncio.Lock()  # requests change topics one after the other
 
     async def close(self) -> None:
         """Stop publishing on topics of requests. Idempotent."""
@@ -186,7 +186,7 @@ class ThesisServices:
         service = THESIS[name]
         request = self._request(name, service, message)
         call = ThesisCall(self._face, request, request.timeout or service.timeout)
-        async with self._settling if service.settles else contextlib.nullcontext():
+        async with self._topic_lock if service.settles else contextlib.nullcontext():
             return self._encodable(await service.answer(call))
 
     def _request(self, name: str, service: ThesisService, message: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Publish the place of a calibrated camera on ``/tf_static``.
+"""Publish where a calibrated camera is, as transforms on ``/tf_static``.
 
 Frames are as in REP-103 and REP-105: metres, right-handed; the camera's pictures have an optical
 frame, x right, y down and z ahead, whose name has the suffix ``_optical``.
@@ -15,7 +15,7 @@ import numpy as np
 from smartcam.exceptions import CalibrationError, ConfigurationError
 from smartcam.geometry import Transform
 from smartcam.ros2._cameras.image_messages import stamp_fields
-from smartcam.ros2._cameras.reading import calibrations_of
+from smartcam.ros2._cameras.reading import calibrations_by_application
 from smartcam.ros2._node.qos import LATCHED
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class CameraFrames:
         calibrated_at: Transform | None = None,
     ) -> None:
         self._frame_id, self._parent, self._flange = frame_id, parent, flange
-        self._calibrations = calibrations_of(calibration)
+        self._calibrations = calibrations_by_application(calibration)
         self._place, self._calibrated_at = place, calibrated_at
         self.optical: str = f"{frame_id.removesuffix('_optical')}_optical"
         self.robot: str = parent if calibrated_at is None else f"{frame_id}_robot"
@@ -78,29 +78,34 @@ class CameraFrames:
                            camera
         ================== ================================= ==================================
 
-        If there are several applications, each one's child has ``_APPLICATION`` at its end.
+        With calibrations for several applications, each child's name ends with ``_APPLICATION``.
         """
-        transforms = [] if self._place is None else [self._of_pictures(self._place)]
+        transforms = [] if self._place is None else [self._picture_transform(self._place)]
         if self._calibrated_at is not None:
-            seen_from = self._calibrated_at.inverse()
-            return [*transforms, _named(seen_from, self._flange or seen_from.target, self.robot)]
+            base_in_flange = self._calibrated_at.inverse()
+            return [
+                *transforms,
+                _with_frame_names(
+                    base_in_flange, self._flange or base_in_flange.target, self.robot
+                ),
+            ]
         for application, calibration in self._calibrations.items():
-            end = "" if application is None else f"_{application}"
-            transforms += self._of_plane(calibration, end)
+            suffix = "" if application is None else f"_{application}"
+            transforms += self._plane_transforms(calibration, suffix)
         return transforms
 
-    def _of_pictures(self, place: Any) -> Transform:
+    def _picture_transform(self, place: Any) -> Transform:
         pose: Transform = place.camera_pose
         frame = self._flange if place.setup == "eye-in-hand" else self._parent
-        return _named(pose, frame or pose.target, self.optical)
+        return _with_frame_names(pose, frame or pose.target, self.optical)
 
-    def _of_plane(self, calibration: Any, end: str) -> list[Transform]:
+    def _plane_transforms(self, calibration: Any, suffix: str) -> list[Transform]:
         """Return the frame of a plane; none if a calibration has no plane."""
         plane = getattr(calibration, "plane", calibration)
         if getattr(plane, "kind", "") != "plane":
             return []
         name = self._frame_id if plane is calibration else f"{self._frame_id}_sheet"
-        child, parent = f"{name}{end}", self._parent or plane.robot_frame
+        child, parent = f"{name}{suffix}", self._parent or plane.robot_frame
         try:
             return [Transform(parent, child, plane.rotation, plane.origin)]
         except CalibrationError as exc:
@@ -108,19 +113,19 @@ class CameraFrames:
             return []
 
 
-def _named(transform: Transform, parent: str, child: str) -> Transform:
+def _with_frame_names(transform: Transform, parent: str, child: str) -> Transform:
     return Transform(parent, child, transform.rotation, transform.translation)
 
 
 def transform_fields(transform: Transform, utc: float) -> dict[str, Any]:
     """Return ``geometry_msgs/TransformStamped``: the source's pose in the target, its parent."""
     x, y, z, w = map(float, transform.quaternion / np.linalg.norm(transform.quaternion))
-    across, down, ahead = map(float, transform.translation)
+    x_translation, y_translation, z_translation = map(float, transform.translation)
     return {
         "header": {"stamp": stamp_fields(utc), "frame_id": transform.target},
         "child_frame_id": transform.source,
         "transform": {
-            "translation": {"x": across, "y": down, "z": ahead},
+            "translation": {"x": x_translation, "y": y_translation, "z": z_translation},
             "rotation": {"x": x, "y": y, "z": z, "w": w},
         },
     }
@@ -139,7 +144,7 @@ class StaticTransforms:
 
     def __init__(self, node: Any, transforms: Iterable[Transform] = ()) -> None:
         self._node = node
-        self._transforms = _checked(transforms)
+        self._transforms = _check_transforms(transforms)
         self._publisher: Any = None
 
     def start(self) -> None:
@@ -161,10 +166,10 @@ class StaticTransforms:
         transforms.
 
         Raises:
-            ConfigurationError: a frame has no name, a ``/`` in front, is its own parent, or has
+            ConfigurationError: a frame has no name, begins with ``/``, is its own parent, or has
                 two parents.
         """
-        self._transforms = _checked(transforms)
+        self._transforms = _check_transforms(transforms)
         if self._publisher is not None:
             self._publish()
         else:
@@ -177,13 +182,13 @@ class StaticTransforms:
         )
 
 
-def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
+def _check_transforms(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
     checked: dict[str, Transform] = {}
     for transform in transforms:
         for name in (transform.target, transform.source):
             if not name or name.startswith("/"):
                 raise ConfigurationError(
-                    f"tf: {transform.label}: expected names of frames without / in front, "
+                    f"tf: {transform.label}: expected names of frames that do not begin with /, "
                     f"got {name!r}"
                 )
         if transform.target == transform.source or transform.source in checked:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class NativeGraph:
-    """A node's view of the others.
+    """The nodes, topics and services that a node knows.
 
     Every method raises a :class:`~smartcam.RosError` if the node is not open.
 
@@ -24,16 +24,16 @@ class NativeGraph:
 
     def nodes(self) -> list[str]:
         """Return the full names of all nodes, as ``ros2 node list``."""
-        names = self._ask("get_node_names_and_namespaces")
+        names = self._call("get_node_names_and_namespaces")
         return sorted(full_name(namespace, name) for name, namespace in names)
 
     def topics(self) -> dict[str, list[str]]:
         """Return the types of each topic by its name, as ``ros2 topic list -t``."""
-        return {name: sorted(types) for name, types in self._ask("get_topic_names_and_types")}
+        return {name: sorted(types) for name, types in self._call("get_topic_names_and_types")}
 
     def services(self) -> dict[str, list[str]]:
         """Return the types of each service by its name, as ``ros2 service list -t``."""
-        return {name: sorted(types) for name, types in self._ask("get_service_names_and_types")}
+        return {name: sorted(types) for name, types in self._call("get_service_names_and_types")}
 
-    def _ask(self, question: str) -> Any:
-        return self._node.made(lambda ros: getattr(ros, question)())
+    def _call(self, method: str) -> Any:
+        return self._node.create(lambda ros: getattr(ros, method)())

@@ -13,9 +13,9 @@ from smartcam.ros2._types.stores import DISTRIBUTIONS
 if TYPE_CHECKING:
     from smartcam.ros2._types.types import MessageType, ServiceType
 
-CURE = (
-    "source the setup.bash of a ROS 2 in front of this Python, or install the wheels of rclpy, or "
-    "leave it out: without it smartcam speaks the wire format of rmw_zenoh itself"
+HOW_TO_GET_RCLPY = (
+    "source the setup.bash of a ROS 2 before you start this Python, or install the wheels of "
+    "rclpy, or do not use rclpy: smartcam itself speaks the wire format of rmw_zenoh"
 )
 
 
@@ -25,72 +25,73 @@ def rclpy(name: str = "") -> Any:
     Raises:
         ConfigurationError: this Python has no rclpy that can be imported.
     """
-    full = f"rclpy.{name}" if name else "rclpy"
+    module_name = f"rclpy.{name}" if name else "rclpy"
     try:
-        return importlib.import_module(full)
+        return importlib.import_module(module_name)
     except ImportError as exc:
         raise ConfigurationError(
-            f"ROS 2 through rclpy: {full} cannot be imported ({exc!s:.300}): expected ROS' own "
-            f"rclpy for this Python; {CURE}"
+            f"ROS 2 through rclpy: {module_name} cannot be imported ({exc!s:.300}): expected ROS' "
+            f"own rclpy for this Python; {HOW_TO_GET_RCLPY}"
         ) from exc
 
 
-def distribution() -> str:
-    """Return the distribution of the installed ROS, as far as it is known."""
+def installed_distribution() -> str:
+    """Return the distribution in ``ROS_DISTRO``; jazzy if that is not set or not known."""
     name = os.environ.get("ROS_DISTRO", "")
     return name if name in DISTRIBUTIONS else "jazzy"
 
 
 @functools.cache
-def class_of(name: str) -> Any:
+def rclpy_class(name: str) -> Any:
     """Return rclpy's class of a message or a service; None if there is none.
 
     Args:
         name: name of the type, such as ``std_msgs/msg/String``.
     """
-    package, kind, type_name = name.split("/")
+    package, category, type_name = name.split("/")
     check = rclpy("type_support").check_for_type_support
     try:
-        class_ = getattr(importlib.import_module(f"{package}.{kind}"), type_name)
-        for message_class in (class_.Request, class_.Response) if kind == "srv" else (class_,):
+        class_ = getattr(importlib.import_module(f"{package}.{category}"), type_name)
+        for message_class in (class_.Request, class_.Response) if category == "srv" else (class_,):
             check(message_class)
     except (ImportError, AttributeError, rclpy("exceptions").NoTypeSupportImportedException):
         return None
     return class_
 
 
-def checked_message(kind: MessageType) -> Any:
+def checked_message_class(message_type: MessageType) -> Any:
     """Return rclpy's class of a type of message; None if there is none.
 
     Raises:
         ConfigurationError: its fields differ from smartcam's.
     """
-    class_ = class_of(kind.name)
+    class_ = rclpy_class(message_type.name)
     if class_ is not None:
-        _compare(kind, class_)
+        _check_same_fields(message_type, class_)
     return class_
 
 
-def checked_service(kind: ServiceType) -> Any:
+def checked_service_class(service_type: ServiceType) -> Any:
     """Return rclpy's class of a type of service; None if there is none.
 
     Raises:
         ConfigurationError: its fields differ from smartcam's.
     """
-    class_ = class_of(kind.name)
+    class_ = rclpy_class(service_type.name)
     if class_ is not None:
-        _compare(kind.request, class_.Request)
-        _compare(kind.response, class_.Response)
+        _check_same_fields(service_type.request, class_.Request)
+        _check_same_fields(service_type.response, class_.Response)
     return class_
 
 
-def _compare(kind: MessageType, class_: Any) -> None:
-    ours = [field.name for field in kind.fields]
+def _check_same_fields(message_type: MessageType, class_: Any) -> None:
+    ours = [field.name for field in message_type.fields]
     theirs = [name for name in class_.get_fields_and_field_types() if name != EMPTY_FIELD]
     if ours != theirs:
         raise ConfigurationError(
-            f"{kind.name}: the ROS that is installed has the fields {', '.join(theirs)}: expected "
-            f"{', '.join(ours)}; name its distribution, or build the package of this smartcam"
+            f"{message_type.name}: the ROS that is installed has the fields {', '.join(theirs)}: "
+            f"expected {', '.join(ours)}; set the distribution to the installed one, or build the "
+            "package that belongs to this smartcam"
         )
 
 
@@ -98,6 +99,6 @@ EMPTY_FIELD = "structure_needs_at_least_one_member"
 """The field that ROS puts into a message without fields."""
 
 
-def to_ros(kind: MessageType, value: Any, cls: Any) -> Any:
+def to_ros(message_type: MessageType, value: Any, cls: Any) -> Any:
     """Return a message of rclpy for one of smartcam's, or for a mapping of its fields."""
-    return rclpy("serialization").deserialize_message(kind.encode(value), cls)
+    return rclpy("serialization").deserialize_message(message_type.encode(value), cls)

@@ -12,7 +12,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import RosError
-from smartcam.ros2._native.installed import class_of
+from smartcam.ros2._native.installed import rclpy_class
 from smartcam.ros2._native.services import ServiceCalls
 from smartcam.ros2._node.named_node import HANDLER_TIMEOUT
 
@@ -32,7 +32,7 @@ class NativeLifecycle:
 
     Args:
         node: open node of rclpy.
-        life: life cycle to follow.
+        lifecycle: life cycle to follow.
         handler: coroutine function that answers ``change_state``.
 
     Raises:
@@ -40,7 +40,7 @@ class NativeLifecycle:
     """
 
     def __init__(
-        self, node: NativeNode, life: Lifecycle, handler: Callable[[Any], Awaitable[Any]]
+        self, node: NativeNode, lifecycle: Lifecycle, handler: Callable[[Any], Awaitable[Any]]
     ) -> None:
         ros = node.ros
         self._machine: Any = getattr(ros, "_state_machine", None)
@@ -51,14 +51,19 @@ class NativeLifecycle:
                 "of Humble to Kilted; without rclpy smartcam has one of its own"
             )
         self._name = node.full_name
-        kind = node.types.service(CHANGE_STATE)
+        service_type = node.types.service(CHANGE_STATE)
         self._calls = ServiceCalls(
-            node, service.srv_name, kind, class_of(CHANGE_STATE), handler, HANDLER_TIMEOUT
+            node,
+            service.srv_name,
+            service_type,
+            rclpy_class(CHANGE_STATE),
+            handler,
+            HANDLER_TIMEOUT,
         )
         service.callback = self._calls.on_request
-        self._stop_listening = life.listen(self._follow)
+        self._stop_listening = lifecycle.listen(self._on_step)
 
-    def _follow(self, transition: LifecycleTransition) -> None:
+    def _on_step(self, transition: LifecycleTransition) -> None:
         try:
             self._machine.trigger_transition_by_id(transition.id, True)
         except Exception as exc:  # noqa: BLE001 - the context has ended, and the request with it

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from smartcam.exceptions import ConfigurationError, RosError
 from smartcam.ros2._native.graph import NativeGraph
-from smartcam.ros2._native.installed import checked_message, checked_service, rclpy
+from smartcam.ros2._native.installed import checked_message_class, checked_service_class, rclpy
 from smartcam.ros2._native.lifecycle import NativeLifecycle
 from smartcam.ros2._native.outbox import MessageThread
 from smartcam.ros2._native.parameters import NativeParameters
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 OPEN_TIMEOUT = 60.0
-"""Seconds for rclpy to make a node; a busy machine takes long to import rclpy for the first one."""
+"""Seconds for rclpy to create a node; for the first one, rclpy is imported, which may take long."""
 
 MISSING_LOG_DELAY = 1.0
 """Seconds after which missing packages are logged, all at once."""
 
 BILLION = 1_000_000_000
 
-End = TypeVar("End")
+Endpoint = TypeVar("Endpoint")
 
 
 class NativeNode(NamedNode):
@@ -78,17 +78,17 @@ class NativeNode(NamedNode):
         self.parameters: NativeParameters = NativeParameters(self)
         self.graph: NativeGraph = NativeGraph(self)
         self.outbox: MessageThread
-        self.side_by_side: Any = None
+        self.concurrent_group: Any = None
         self.stamps: RosStamps = RosStamps(self._time_shift)
         self._clock: Any = None
         self._managed = managed
-        self._spun: SpunNode | None = None
+        self._spun_node: SpunNode | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._dead: RosError | None = None
-        self._ended = asyncio.Event()
-        self._ends: set[Any] = set()
+        self._end_error: RosError | None = None
+        self._thread_ended = asyncio.Event()
+        self._endpoints: set[Any] = set()
         self._missing: dict[str, list[str]] = {}
-        self._telling: asyncio.TimerHandle | None = None
+        self._missing_timer: asyncio.TimerHandle | None = None
 
     @property
     def types(self) -> RosTypes:
@@ -98,17 +98,17 @@ class NativeNode(NamedNode):
     @property
     def is_open(self) -> bool:
         """True from the end of ``start()`` until ``stop()``."""
-        return self._spun is not None
+        return self._spun_node is not None
 
     @property
     def ros(self) -> Any:
         """The node of rclpy."""
-        return None if self._spun is None else self._spun.ros
+        return None if self._spun_node is None else self._spun_node.ros
 
     @property
     def executor(self) -> Any:
         """The executor of rclpy."""
-        return None if self._spun is None else self._spun.executor
+        return None if self._spun_node is None else self._spun_node.executor
 
     @property
     def has_sim_time(self) -> bool:
@@ -129,18 +129,18 @@ class NativeNode(NamedNode):
 
         Cancellation: the node is closed.
         """
-        if self._spun is not None:
+        if self._spun_node is not None:
             return
         self._loop = asyncio.get_running_loop()
-        self._dead, self._ended = None, asyncio.Event()
-        on_end = functools.partial(self._on_end, self._ended)
+        self._end_error, self._thread_ended = None, asyncio.Event()
+        on_end = functools.partial(self._on_end, self._thread_ended)
         spun = SpunNode(
             self.context, self.name, self.namespace, self._loop, on_end, managed=self._managed
         )
         await spun.start(OPEN_TIMEOUT)
-        self._spun = spun
+        self._spun_node = spun
         self.outbox = MessageThread(f"smartcam-rclpy-outbox {self.full_name}")
-        self.side_by_side = rclpy("callback_groups").ReentrantCallbackGroup()
+        self.concurrent_group = rclpy("callback_groups").ReentrantCallbackGroup()
         self._clock = spun.ros.get_clock()
         self.name, self.namespace = spun.ros.get_name(), spun.ros.get_namespace()  # remapped
         try:
@@ -149,24 +149,24 @@ class NativeNode(NamedNode):
             await self.stop()
             raise
 
-    def _on_end(self, ended: asyncio.Event, why: RosError | None) -> None:
+    def _on_end(self, ended: asyncio.Event, reason: RosError | None) -> None:
         ended.set()
-        if why is not None and ended is self._ended and self._spun is not None:
-            self._dead = why
-            logger.error("%s", why)
-            for end in tuple(self._ends):
-                if isinstance(end, NativeClient):
-                    end.fail(str(why))
+        if reason is not None and ended is self._thread_ended and self._spun_node is not None:
+            self._end_error = reason
+            logger.error("%s", reason)
+            for endpoint in tuple(self._endpoints):
+                if isinstance(endpoint, NativeClient):
+                    endpoint.fail_calls(str(reason))
 
     async def stop(self) -> None:
         """Close the node with its publishers, subscriptions and services. Idempotent, bounded."""
-        spun = self._spun
+        spun = self._spun_node
         if spun is None:
             return
         self._report_missing()
-        services = [endpoint for endpoint in self._ends if isinstance(endpoint, NativeService)]
-        for end in tuple(self._ends):
-            end.close()
+        services = [endpoint for endpoint in self._endpoints if isinstance(endpoint, NativeService)]
+        for endpoint in tuple(self._endpoints):
+            endpoint.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await self.parameters.close()
@@ -176,14 +176,14 @@ class NativeNode(NamedNode):
         except TimeoutError:
             pass  # the handler's author must end it at cancellation
         finally:
-            self._spun = None
-            spun.end()
-            await self._wait_ended()
+            self._spun_node = None
+            spun.stop()
+            await self._wait_for_thread()
 
-    async def _wait_ended(self) -> None:
+    async def _wait_for_thread(self) -> None:
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
-                await self._ended.wait()
+                await self._thread_ended.wait()
         except TimeoutError:
             logger.warning("%s ! rclpy does not end", self.full_name)
 
@@ -193,19 +193,19 @@ class NativeNode(NamedNode):
         Raises:
             RosError: the node is not open, or rclpy has ended.
         """
-        if self._dead is not None:
-            raise RosError(str(self._dead))
+        if self._end_error is not None:
+            raise RosError(str(self._end_error))
         super().check_open()
 
-    # ------------------------------------------------------------------ for its ends
+    # ------------------------------------------------------------------ for its endpoints
 
-    def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
+    def call_in_loop(self, function: Callable[..., None], *args: Any) -> bool:
         """Call a function in the event loop; return False if the loop is closed."""
-        spun = self._spun
-        return spun is not None and spun.in_loop(do, *given)
+        spun = self._spun_node
+        return spun is not None and spun.call_in_loop(function, *args)
 
     def submit(
-        self, work: Callable[[], Coroutine[Any, Any, None]]
+        self, make_coroutine: Callable[[], Coroutine[Any, Any, None]]
     ) -> concurrent.futures.Future[None]:
         """Run a coroutine in the event loop; return its future.
 
@@ -215,14 +215,14 @@ class NativeNode(NamedNode):
         loop = self._loop
         if loop is None or loop.is_closed():
             raise RosError(f"{self.full_name}: its event loop is closed")
-        return asyncio.run_coroutine_threadsafe(work(), loop)
+        return asyncio.run_coroutine_threadsafe(make_coroutine(), loop)
 
     def wake(self) -> None:
         """Wake rclpy, so that it notices new endpoints."""
-        if self._spun is not None:
-            self._spun.wake()
+        if self._spun_node is not None:
+            self._spun_node.wake()
 
-    def made(self, make: Callable[[Any], Any]) -> Any:
+    def create(self, make: Callable[[Any], Any]) -> Any:
         """Return an endpoint created by rclpy.
 
         Raises:
@@ -234,21 +234,21 @@ class NativeNode(NamedNode):
         except Exception as exc:
             raise RosError(f"{self.full_name}: {type(exc).__name__}: {exc!s:.300}") from exc
 
-    def unmade(self, kind: str, end: Any) -> None:
+    def destroy(self, kind: str, endpoint: Any) -> None:
         """Destroy an endpoint of rclpy."""
         ros = self.ros
         if ros is not None:
-            getattr(ros, f"destroy_{kind}")(end)
+            getattr(ros, f"destroy_{kind}")(endpoint)
 
-    def forget(self, end: Any) -> None:
-        """Note that an endpoint was closed."""
-        self._ends.discard(end)
+    def forget(self, endpoint: Any) -> None:
+        """Forget a closed endpoint."""
+        self._endpoints.discard(endpoint)
 
-    def _added(self, end: End) -> End:
-        self._ends.add(end)
-        return end
+    def _register(self, endpoint: Endpoint) -> Endpoint:
+        self._endpoints.add(endpoint)
+        return endpoint
 
-    # ------------------------------------------------------------------ what it has
+    # ------------------------------------------------------------------ endpoints
 
     def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativePublisher:
         """Publish on a topic.
@@ -263,10 +263,10 @@ class NativeNode(NamedNode):
                 fields.
             RosError: the node is not open.
         """
-        kind, name = self.types.message(type), self._resolved(topic, "topic")
-        cls = checked_message(kind)
+        message_type, name = self.types.message(type), self._resolve_name(topic, "topic")
+        cls = checked_message_class(message_type)
         self._note_missing(cls, type, name)
-        return self._added(NativePublisher(self, name, kind, qos, cls))
+        return self._register(NativePublisher(self, name, message_type, qos, cls))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativeSubscription:
         """Subscribe to a topic; read it by ``async for``.
@@ -280,9 +280,9 @@ class NativeNode(NamedNode):
             ConfigurationError: the topic is not valid, or the type is not built for this ROS.
             RosError: the node is not open.
         """
-        kind, name = self.types.message(type), self._resolved(topic, "topic")
-        cls = self._built(checked_message(kind), type)
-        return self._added(NativeSubscription(self, name, kind, qos, cls))
+        message_type, name = self.types.message(type), self._resolve_name(topic, "topic")
+        cls = self._require_built(checked_message_class(message_type), type)
+        return self._register(NativeSubscription(self, name, message_type, qos, cls))
 
     def serve(
         self,
@@ -308,10 +308,10 @@ class NativeNode(NamedNode):
             RosError: the node is not open.
         """
         del qos
-        kind, name = self.types.service(type), self._resolved(service, "service")
-        cls = checked_service(kind)
+        service_type, name = self.types.service(type), self._resolve_name(service, "service")
+        cls = checked_service_class(service_type)
         self._note_missing(cls, type, name)
-        return self._added(NativeService(self, name, kind, cls, handler, timeout))
+        return self._register(NativeService(self, name, service_type, cls, handler, timeout))
 
     def client(self, service: str, type: str, *, qos: QoS = SERVICES) -> NativeClient:
         """Return a client that calls a service.
@@ -326,25 +326,34 @@ class NativeNode(NamedNode):
             RosError: the node is not open.
         """
         del qos
-        kind, name = self.types.service(type), self._resolved(service, "service")
-        return self._added(NativeClient(self, name, kind, self._built(checked_service(kind), type)))
+        service_type, name = self.types.service(type), self._resolve_name(service, "service")
+        return self._register(
+            NativeClient(
+                self,
+                name,
+                service_type,
+                self._require_built(checked_service_class(service_type), type),
+            )
+        )
 
-    def manage(self, life: Lifecycle, handler: Callable[[Any], Awaitable[Any]]) -> NativeLifecycle:
+    def manage(
+        self, lifecycle: Lifecycle, handler: Callable[[Any], Awaitable[Any]]
+    ) -> NativeLifecycle:
         """Make ROS' own life cycle follow one of smartcam's.
 
         Args:
-            life: life cycle that decides about the state.
+            lifecycle: life cycle that decides about the state.
             handler: coroutine function that answers ``change_state``.
 
         Raises:
             RosError: the node is not open.
         """
         self.check_open()
-        return NativeLifecycle(self, life, handler)
+        return NativeLifecycle(self, lifecycle, handler)
 
-    # ------------------------------------------------------------------ what is not built
+    # ------------------------------------------------------------------ types that are not built
 
-    def _built(self, cls: Any, type: str) -> Any:
+    def _require_built(self, cls: Any, type: str) -> Any:
         if cls is None:
             raise ConfigurationError(
                 f"{type}: its package is not built for the ROS that is installed"
@@ -356,14 +365,14 @@ class NativeNode(NamedNode):
         if cls is not None:
             return
         self._missing.setdefault(type.partition("/")[0], []).append(name)
-        if self._telling is None:
+        if self._missing_timer is None:
             loop = asyncio.get_running_loop()
-            self._telling = loop.call_later(MISSING_LOG_DELAY, self._report_missing)
+            self._missing_timer = loop.call_later(MISSING_LOG_DELAY, self._report_missing)
 
     def _report_missing(self) -> None:
-        if self._telling is not None:
-            self._telling.cancel()
-            self._telling = None
+        if self._missing_timer is not None:
+            self._missing_timer.cancel()
+            self._missing_timer = None
         missing, self._missing = self._missing, {}
         for package, names in missing.items():
             logger.warning(

@@ -23,9 +23,9 @@ MAX_WAITING_BYTES = 1 << 26
 
 
 class _ThreadJob(NamedTuple):
-    do: Callable[[], None]
+    run: Callable[[], None]
     size: int
-    dropped: Callable[[], None] | None  # function for a dropped job; None: the job is never dropped
+    on_drop: Callable[[], None] | None  # function for a dropped job; None: the job is never dropped
 
 
 class MessageThread:
@@ -43,10 +43,10 @@ class MessageThread:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def put(
-        self, do: Callable[[], None], size: int = 0, dropped: Callable[[], None] | None = None
+    def add_job(
+        self, run: Callable[[], None], size: int = 0, on_drop: Callable[[], None] | None = None
     ) -> None:
-        """Add a job; if too much waits, a job that may be dropped is dropped.
+        """Add a job; if too many jobs wait, drop the oldest of those that may be dropped.
 
         Raises:
             RosError: the thread ends, or has ended.
@@ -54,7 +54,7 @@ class MessageThread:
         with self._changed:
             if self._closing:
                 raise RosError(f"{self._thread.name}: it is closed")
-            self._jobs.append(_ThreadJob(do, size, dropped))
+            self._jobs.append(_ThreadJob(run, size, on_drop))
             self._bytes += size
             while len(self._jobs) > MAX_WAITING_MESSAGES or self._bytes > MAX_WAITING_BYTES:
                 if not self._drop_oldest():
@@ -62,19 +62,19 @@ class MessageThread:
             self._changed.notify()
 
     def _drop_oldest(self) -> bool:
-        for place, job in enumerate(self._jobs):
-            if job.dropped is not None and place < len(self._jobs) - 1:
-                del self._jobs[place]
+        for index, job in enumerate(self._jobs):
+            if job.on_drop is not None and index < len(self._jobs) - 1:
+                del self._jobs[index]
                 self._bytes -= job.size
-                job.dropped()
+                job.on_drop()
                 return True
         return False
 
     def close(self, timeout: float) -> bool:
-        """Do the waiting jobs, and end; blocks.
+        """Run the waiting jobs, and end the thread; blocks.
 
         Returns:
-            Whether the thread has ended in time.
+            True if the thread has ended in time.
         """
         with self._changed:
             self._closing = True
@@ -92,6 +92,6 @@ class MessageThread:
                 job = self._jobs.popleft()
                 self._bytes -= job.size
             try:
-                job.do()
+                job.run()
             except Exception as exc:  # noqa: BLE001 - the middleware may raise any error
                 logger.debug("%s ! %s", self._thread.name, exc)

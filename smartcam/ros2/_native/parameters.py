@@ -1,4 +1,4 @@
-"""Parameters of a node of rclpy: ROS holds and serves them, and hooks are called here."""
+"""Parameters of a node of rclpy: ROS keeps and serves them, this module calls their hooks."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import ConfigurationError, RosError, SmartCamError
-from smartcam.ros2._native.installed import class_of, rclpy, to_ros
-from smartcam.ros2._node.parameter_services import reason
+from smartcam.ros2._native.installed import rclpy, rclpy_class, to_ros
+from smartcam.ros2._node.parameter_services import reason_text
 from smartcam.ros2._node.parameter_values import decode_value
 from smartcam.ros2._node.parameters import SET_TIMEOUT, RosParameters
 
@@ -27,7 +27,7 @@ SIM_TIME = "use_sim_time"
 """A parameter that rclpy declares itself."""
 
 HOOK_TIMEOUT = 2 * SET_TIMEOUT + 1.0
-"""Seconds for which a thread of rclpy waits for the hooks of a set, and for earlier sets."""
+"""Seconds for which a thread of rclpy waits for the hooks of a set, and for earlier sets to end."""
 
 _asked_by_ros: contextvars.ContextVar[bool] = contextvars.ContextVar("asked_by_ros", default=False)
 
@@ -61,7 +61,7 @@ class NativeParameters(RosParameters):
         self._ros = None
         await super().close()
 
-    # ------------------------------------------------------------------ from here to ROS
+    # ------------------------------------------------------------------ changes here, told to ROS
 
     def _notify(self, **changes: Any) -> None:
         """Add, change or delete parameters in ROS."""
@@ -71,15 +71,17 @@ class NativeParameters(RosParameters):
             self._declare_in_ros(name)
         changed = changes.get("changed", ())
         if changed and not _asked_by_ros.get():
-            self._put(lambda: self._ros.set_parameters([self._parameter(name) for name in changed]))
+            self._change_in_ros(
+                lambda: self._ros.set_parameters([self._rclpy_parameter(name) for name in changed])
+            )
         for name in changes.get("deleted", ()):
             if not self._ros.describe_parameter(name).read_only:  # rclpy keeps read-only ones
-                self._put(lambda name=name: self._ros.undeclare_parameter(name))
+                self._change_in_ros(lambda name=name: self._ros.undeclare_parameter(name))
 
-    def _put(self, do: Any) -> Any:
+    def _change_in_ros(self, change: Any) -> Any:
         self._own_change.now = True
         try:
-            return do()
+            return change()
         except Exception as exc:  # noqa: BLE001 - rclpy may raise any error
             logger.warning("%s ! a parameter: %s", self._native.full_name, exc)
         finally:
@@ -87,88 +89,88 @@ class NativeParameters(RosParameters):
 
     def _declare_in_ros(self, name: str) -> None:
         description = self.describe(name)
-        kind = self._native.types.message("rcl_interfaces/msg/ParameterDescriptor")
-        descriptor = to_ros(kind, description.encode(), class_of(kind.name))
-        given = self._parameter(name)
+        message_type = self._native.types.message("rcl_interfaces/msg/ParameterDescriptor")
+        descriptor = to_ros(message_type, description.encode(), rclpy_class(message_type.name))
+        parameter = self._rclpy_parameter(name)
         self._own_change.now = True
         try:
-            made = self._ros.declare_parameter(
-                name, given.value, descriptor, ignore_override=description.read_only
+            declared = self._ros.declare_parameter(
+                name, parameter.value, descriptor, ignore_override=description.read_only
             )
         except Exception as exc:
             del self._declared[name]
             raise ConfigurationError(f"parameter {name!r}: {exc!s:.300}") from exc
         finally:
             self._own_change.now = False
-        if made.value != given.value:
-            self._begin_with(name, decode_value(made.get_parameter_value()))
+        if declared.value != parameter.value:
+            self._apply_override(name, decode_value(declared.get_parameter_value()))
 
-    def _begin_with(self, name: str, value: Typed) -> None:
+    def _apply_override(self, name: str, value: Typed) -> None:
         """Apply a parameter's value from the command line or a parameter file."""
 
-        async def begin() -> None:
+        async def apply() -> None:
             _asked_by_ros.set(True)
             try:
-                await self.carry_out({name: value})
+                await self.set_shielded({name: value})
             except SmartCamError as exc:
                 logger.warning("%s ! parameter %s: %s", self._native.full_name, name, exc)
                 _asked_by_ros.set(False)
                 self._notify(changed=[name])
 
-        task = asyncio.get_running_loop().create_task(begin())
+        task = asyncio.get_running_loop().create_task(apply())
         self._tasks.add(task)
-        task.add_done_callback(self._ended)
+        task.add_done_callback(self._on_task_done)
 
-    def _parameter(self, name: str) -> Any:
-        value = self._of(name).value
+    def _rclpy_parameter(self, name: str) -> Any:
+        value = self._get_declared(name).value
         plain: Any = value.value
         if isinstance(plain, bytes):
             plain = [bytes([byte]) for byte in plain]
-        kinds = rclpy("parameter").Parameter
+        parameter_class = rclpy("parameter").Parameter
         plain = list(plain) if isinstance(plain, tuple) else plain
-        return kinds(name, kinds.Type(value.number), plain)
+        return parameter_class(name, parameter_class.Type(value.number), plain)
 
-    # ------------------------------------------------------------------ from ROS to here
+    # ------------------------------------------------------------------ changes by other nodes
 
     def _on_set(self, parameters: Sequence[Any]) -> Any:
         """Accept or refuse values; called in the thread that sets them, which waits for hooks."""
-        result = class_of("rcl_interfaces/msg/SetParametersResult")
+        result = rclpy_class("rcl_interfaces/msg/SetParametersResult")
         if getattr(self._own_change, "now", False):
             return result(successful=True)
         try:
-            self._carry_out({parameter.name: parameter for parameter in parameters})
+            self._set_in_event_loop({parameter.name: parameter for parameter in parameters})
         except concurrent.futures.CancelledError:
             return result(successful=False, reason=f"{self._native.full_name} is closed")
         except TimeoutError:
             text = f"no answer within {HOOK_TIMEOUT:g} s; whether it took effect is unknown"
             return result(successful=False, reason=text)
         except SmartCamError as exc:
-            return result(successful=False, reason=reason(exc))
+            return result(successful=False, reason=reason_text(exc))
         except Exception as exc:
             logger.exception("%s ! parameters", self._native.full_name)
             return result(successful=False, reason=f"{type(exc).__name__}: {exc!s:.300}")
         return result(successful=True)
 
-    def _carry_out(self, given: Mapping[str, Any]) -> None:
+    def _set_in_event_loop(self, parameters: Mapping[str, Any]) -> None:
         values = {
             name: decode_value(value.get_parameter_value())
-            for name, value in given.items()
+            for name, value in parameters.items()
             if self.find(name) is not None  # others are rclpy's own
         }
         if not values:
             return
 
-        async def in_loop() -> None:
+        async def set_values() -> None:
             task = asyncio.current_task()
             if self._ros is None or task is None:
                 raise RosError(f"{self._native.full_name} is closed")
             self._tasks.add(task)  # close() cancels it
-            task.add_done_callback(self._ended)
+            task.add_done_callback(self._on_task_done)
             _asked_by_ros.set(True)
             await self.set_all(values)
 
-        waiting = self._native.submit(in_loop)
+        future = self._native.submit(set_values)
         try:
-            waiting.result(HOOK_TIMEOUT)
+            future.result(HOOK_TIMEOUT)
         finally:
-            waiting.cancel()
+            future.cancel()

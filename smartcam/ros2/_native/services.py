@@ -11,11 +11,11 @@ from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import RosError, ServiceCallError, ServiceTimeoutError, SmartCamError
 from smartcam.ros2._native.installed import rclpy, to_ros
 from smartcam.ros2._native.spinning import NoReplyError
-from smartcam.ros2._native.topics import profile_of
+from smartcam.ros2._native.topics import rclpy_profile
 from smartcam.ros2._node.qos import QoS
-from smartcam.ros2._node.refusals import refusal
+from smartcam.ros2._node.refusals import refusal_response
 from smartcam.ros2._node.services import MAX_CONCURRENT_CALLS, SERVER_POLL_INTERVAL
-from smartcam.ros2._node.topics import message_of
+from smartcam.ros2._node.topics import message_or_fields
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 CALL_QUEUE_QOS = QoS(depth=2 * MAX_CONCURRENT_CALLS)
-"""Quality of services: with ROS' own depth of 10, the oldest of more simultaneous calls is lost."""
+"""Quality of services. With ROS' own depth of 10, the oldest of more than 10 simultaneous calls
+would be lost."""
 
 
 class ServiceCalls:
@@ -35,7 +36,7 @@ class ServiceCalls:
     Args:
         node: node of the service.
         name: name of the service.
-        kind: type of the service.
+        service_type: type of the service.
         cls: rclpy's class of the type.
         handler: coroutine function that takes each request and returns the response.
         timeout: seconds of the handler's timeout.
@@ -49,86 +50,90 @@ class ServiceCalls:
         self,
         node: NativeNode,
         name: str,
-        kind: ServiceType,
+        service_type: ServiceType,
         cls: Any,
         handler: Callable[[Any], Awaitable[Any]],
         timeout: float,
     ) -> None:
         self.calls: int = 0
         self.failed: int = 0
-        self._node, self._name, self._kind, self._cls = node, name, kind, cls
+        self._node, self._name, self._service_type, self._cls = node, name, service_type, cls
         self._handler, self._timeout = handler, timeout
         self._serialize = rclpy("serialization").serialize_message
         self._future = rclpy("task").Future
-        self._under_way, self._lock, self._closed = 0, threading.Lock(), False
+        self._running_count, self._lock, self._closed = 0, threading.Lock(), False
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def on_request(self, request: Any, _response: Any) -> Any:
         """Return the response to a request; rclpy calls and awaits this in its own thread."""
         with self._lock:
-            full = self._under_way >= MAX_CONCURRENT_CALLS
-            self._under_way += not full
-        if full:
+            is_full = self._running_count >= MAX_CONCURRENT_CALLS
+            self._running_count += not is_full
+        if is_full:
             return self._reply(
-                self._refused(f"{MAX_CONCURRENT_CALLS} calls are running, which is the most")
+                self._encode_refusal(f"{MAX_CONCURRENT_CALLS} calls are running, which is the most")
             )
         try:
-            answered = self._future(executor=self._node.executor)
-            if not self._node.in_loop(self._take, self._serialize(request), answered):
+            reply_future = self._future(executor=self._node.executor)
+            if not self._node.call_in_loop(
+                self._start_call, self._serialize(request), reply_future
+            ):
                 raise NoReplyError
-            return self._reply(await answered)
+            return self._reply(await reply_future)
         finally:
             with self._lock:
-                self._under_way -= 1
+                self._running_count -= 1
 
     def _reply(self, data: bytes | None) -> Any:
         if data is None:
             raise NoReplyError
         return rclpy("serialization").deserialize_message(data, self._cls.Response)
 
-    def _take(self, data: bytes, answered: Any) -> None:
+    def _start_call(self, data: bytes, reply_future: Any) -> None:
         self.calls += 1
-        task = asyncio.get_running_loop().create_task(self._serve(data, answered))
+        task = asyncio.get_running_loop().create_task(self._serve(data, reply_future))
         self._tasks.add(task)
-        task.add_done_callback(lambda done: self._done(done, answered))
+        task.add_done_callback(lambda done: self._on_task_done(done, reply_future))
         if self._closed:
             task.cancel()
 
-    def _done(self, task: asyncio.Task[None], answered: Any) -> None:
+    def _on_task_done(self, task: asyncio.Task[None], reply_future: Any) -> None:
         self._tasks.discard(task)
-        if not answered.done():  # the task was cancelled before it began
-            self._answer(answered, self._refused("the call was cancelled"))
+        if not reply_future.done():  # the task was cancelled before it began
+            self._set_reply(reply_future, self._encode_refusal("the call was cancelled"))
 
-    def _answer(self, answered: Any, data: bytes | None) -> None:
-        answered.set_result(data)
+    def _set_reply(self, reply_future: Any, data: bytes | None) -> None:
+        reply_future.set_result(data)
         self._node.wake()
 
-    async def _serve(self, data: bytes, answered: Any) -> None:
+    async def _serve(self, data: bytes, reply_future: Any) -> None:
         try:
             async with asyncio.timeout(self._timeout):
-                reply = await self._handler(self._kind.request.decode(data, whole=False))
-            encoded: bytes | None = self._kind.response.encode(message_of(reply, {}))
+                reply = await self._handler(self._service_type.request.decode(data, whole=False))
+            encoded: bytes | None = self._service_type.response.encode(message_or_fields(reply, {}))
         except asyncio.CancelledError:
-            self._answer(answered, self._refused("the call was cancelled"))
+            self._set_reply(reply_future, self._encode_refusal("the call was cancelled"))
             raise
         except TimeoutError as exc:
-            given_up = f"no answer in {self._timeout:g} s"
-            encoded = self._refused(str(exc) if isinstance(exc, SmartCamError) else given_up)
+            timeout_text = f"no answer in {self._timeout:g} s"
+            encoded = self._encode_refusal(
+                str(exc) if isinstance(exc, SmartCamError) else timeout_text
+            )
         except SmartCamError as exc:
-            encoded = self._refused(str(exc))
+            encoded = self._encode_refusal(str(exc))
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:
             logger.exception("%s ! its handler failed", self._name)
-            encoded = self._refused(f"{type(exc).__name__}: {exc}")
-        self._answer(answered, encoded)
+            encoded = self._encode_refusal(f"{type(exc).__name__}: {exc}")
+        self._set_reply(reply_future, encoded)
 
-    def _refused(self, why: str) -> bytes | None:
+    def _encode_refusal(self, reason: str) -> bytes | None:
         self.failed += 1
-        answer = refusal(self._kind, f"{self._name}: {why}", self._node.types)
+        answer = refusal_response(self._service_type, f"{self._name}: {reason}", self._node.types)
         outcome = "was refused" if answer is not None else "had no reply"
-        logger.warning("%s ! a call %s: %s", self._name, outcome, why)
-        return None if answer is None else self._kind.response.encode(answer)
+        logger.warning("%s ! a call %s: %s", self._name, outcome, reason)
+        return None if answer is None else self._service_type.response.encode(answer)
 
     def close(self) -> None:
         """Cancel running calls. Idempotent."""
@@ -156,21 +161,25 @@ class NativeService:
         self,
         node: NativeNode,
         name: str,
-        kind: ServiceType,
+        service_type: ServiceType,
         cls: Any,
         handler: Callable[[Any], Awaitable[Any]],
         timeout: float,
     ) -> None:
         self.name: str = name
-        self.type: ServiceType = kind
-        self._node, self._closed, self._raw = node, False, None
-        self._calls = ServiceCalls(node, name, kind, cls, handler, timeout)
+        self.type: ServiceType = service_type
+        self._node, self._closed, self._ros_object = node, False, None
+        self._calls = ServiceCalls(node, name, service_type, cls, handler, timeout)
         if cls is not None:
-            group = node.side_by_side
-            made = self._calls.on_request
-            self._raw = node.made(
+            group = node.concurrent_group
+            callback = self._calls.on_request
+            self._ros_object = node.create(
                 lambda ros: ros.create_service(
-                    cls, name, made, qos_profile=profile_of(CALL_QUEUE_QOS), callback_group=group
+                    cls,
+                    name,
+                    callback,
+                    qos_profile=rclpy_profile(CALL_QUEUE_QOS),
+                    callback_group=group,
                 )
             )
 
@@ -180,8 +189,8 @@ class NativeService:
             return
         self._closed = True
         self._calls.close()
-        if self._raw is not None:
-            self._node.outbox.put(lambda: self._node.unmade("service", self._raw))
+        if self._ros_object is not None:
+            self._node.outbox.add_job(lambda: self._node.destroy("service", self._ros_object))
         self._node.forget(self)
 
     async def wait_closed(self) -> None:
@@ -197,14 +206,17 @@ class NativeClient:
         type: type of requests and replies.
     """
 
-    def __init__(self, node: NativeNode, name: str, kind: ServiceType, cls: Any) -> None:
+    def __init__(self, node: NativeNode, name: str, service_type: ServiceType, cls: Any) -> None:
         self.name: str = name
-        self.type: ServiceType = kind
+        self.type: ServiceType = service_type
         self._node, self._cls, self._closed = node, cls, False
-        self._waiting: set[asyncio.Future[Any]] = set()
-        self._raw = node.made(
+        self._replies: set[asyncio.Future[Any]] = set()
+        self._ros_object = node.create(
             lambda ros: ros.create_client(
-                cls, name, qos_profile=profile_of(CALL_QUEUE_QOS), callback_group=node.side_by_side
+                cls,
+                name,
+                qos_profile=rclpy_profile(CALL_QUEUE_QOS),
+                callback_group=node.concurrent_group,
             )
         )
 
@@ -214,7 +226,7 @@ class NativeClient:
         if self._closed:
             return False
         try:
-            return bool(self._raw.service_is_ready())
+            return bool(self._ros_object.service_is_ready())
         except Exception:  # noqa: BLE001 - the context has ended, so there is no server
             return False
 
@@ -261,12 +273,12 @@ class NativeClient:
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
-        message = to_ros(self.type.request, message_of(request, fields), self._cls.Request)
+        message = to_ros(self.type.request, message_or_fields(request, fields), self._cls.Request)
         self._check_open()
         await self.wait_served(timeout)
         reply: asyncio.Future[Any] = loop.create_future()
-        self._waiting.add(reply)
-        pending = self._ask(message, reply)
+        self._replies.add(reply)
+        ros_future = self._send_request(message, reply)
         try:
             async with asyncio.timeout_at(deadline):
                 reply_message = await reply
@@ -277,38 +289,40 @@ class NativeClient:
                 service=self.name,
             ) from exc
         finally:
-            self._waiting.discard(reply)
-            self._raw.remove_pending_request(pending)
+            self._replies.discard(reply)
+            self._ros_object.remove_pending_request(ros_future)
         data = rclpy("serialization").serialize_message(reply_message)
         return self.type.response.decode(data, whole=False)
 
-    def _ask(self, message: Any, reply: asyncio.Future[Any]) -> Any:
-        def take(reply_message: Any) -> None:
+    def _send_request(self, message: Any, reply: asyncio.Future[Any]) -> Any:
+        def set_reply(reply_message: Any) -> None:
             if not reply.done():
                 reply.set_result(reply_message)
 
         try:
-            future = self._raw.call_async(message)
+            future = self._ros_object.call_async(message)
         except Exception as exc:
-            self._waiting.discard(reply)
+            self._replies.discard(reply)
             text = f"{self.name}: {type(exc).__name__}: {exc!s:.300}"
             raise ServiceCallError(text, service=self.name) from exc
         future.add_done_callback(
-            lambda done: None if done.cancelled() else self._node.in_loop(take, done.result())
+            lambda done: (
+                None if done.cancelled() else self._node.call_in_loop(set_reply, done.result())
+            )
         )
         return future
 
-    def fail(self, why: str) -> None:
+    def fail_calls(self, reason: str) -> None:
         """End running calls."""
-        for reply in self._waiting:
+        for reply in self._replies:
             if not reply.done():
-                reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
+                reply.set_exception(ServiceCallError(f"{self.name}: {reason}", service=self.name))
 
     def close(self) -> None:
         """Stop calling, and end running calls. Idempotent."""
         if self._closed:
             return
         self._closed = True
-        self.fail("this client was closed")
-        self._node.outbox.put(lambda: self._node.unmade("client", self._raw))
+        self.fail_calls("this client was closed")
+        self._node.outbox.add_job(lambda: self._node.destroy("client", self._ros_object))
         self._node.forget(self)

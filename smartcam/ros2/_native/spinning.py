@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from smartcam._ros_names import check_domain
 from smartcam.exceptions import ConfigurationError, RosError
-from smartcam.ros2._native.installed import distribution, rclpy
+from smartcam.ros2._native.installed import installed_distribution, rclpy
 from smartcam.ros2._types.types import RosTypes
 
 if TYPE_CHECKING:
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 EXECUTOR_THREADS = 4
-"""Threads of a node's executor: a set of parameters takes one until its hook has answered."""
+"""Threads of a node's executor: setting a parameter blocks one until the hook has answered."""
 
 CHECK_INTERVAL = 1.0
-"""Seconds between two checks of a spinning thread whether its event loop still runs."""
+"""Seconds between two checks in which a spinning thread looks whether its event loop still runs."""
 
 ERROR_PAUSE = 0.05
-"""Seconds for which a spinning thread pauses after an error, so that a repeated one is cheap."""
+"""Seconds for which a spinning thread pauses after an error: it may repeat at once."""
 
 EXIT_TIMEOUT = 2.0
 """Seconds for which the end of the program waits for a node that was not closed."""
@@ -61,10 +61,10 @@ class NativeContext:
         self.domain: int | None = None if domain is None else check_domain(domain)
         self.args: tuple[str, ...] = tuple(args)
         rclpy()
-        self.types: RosTypes = RosTypes(distribution or _distribution())
+        self.types: RosTypes = RosTypes(distribution or installed_distribution())
         self._lock = threading.Lock()
         self._context: Any = None
-        self._users = 0
+        self._user_count = 0
 
     def open(self) -> Any:
         """Return the context of rclpy, for one more user; blocks.
@@ -74,38 +74,35 @@ class NativeContext:
             RosError: rclpy does not start.
         """
         with self._lock:
-            if not self._users:
-                self._context = self._begin()
-            self._users += 1
+            if not self._user_count:
+                self._context = self._create_context()
+            self._user_count += 1
             return self._context
 
-    def _begin(self) -> Any:
-        made = rclpy("context").Context()
+    def _create_context(self) -> Any:
+        context = rclpy("context").Context()
         no_signals = rclpy("signals").SignalHandlerOptions.NO  # the program handles signals
         try:
             rclpy().init(
                 args=["smartcam", *self.args],
-                context=made,
+                context=context,
                 domain_id=self.domain,
                 signal_handler_options=no_signals,
             )
         except Exception as exc:
             kind = ConfigurationError if self.args else RosError
             raise kind(f"rclpy does not begin: {type(exc).__name__}: {exc!s:.300}") from exc
-        return made
+        return context
 
     def close(self) -> None:
         """Release the context for one user; the last one shuts it down; blocks."""
         with self._lock:
-            self._users -= 1
-            if self._users:
+            self._user_count -= 1
+            if self._user_count:
                 return
             context, self._context = self._context, None
         with contextlib.suppress(Exception):  # the context may already be shut down
             context.try_shutdown()
-
-
-_distribution = distribution
 
 
 class SpunNode:
@@ -117,7 +114,7 @@ class SpunNode:
         namespace: namespace of the node.
         loop: event loop of the node's users.
         on_end: function called in the event loop when the thread has ended, with the reason, or
-            None after :meth:`end`.
+            None after :meth:`stop`.
         managed: whether the node has a life cycle.
 
     Attributes:
@@ -139,9 +136,9 @@ class SpunNode:
         self.executor: Any = None
         self._context, self._name, self._namespace = context, name, namespace
         self._loop, self._on_end, self._managed = loop, on_end, managed
-        self._stopping = threading.Event()
+        self._stop_requested = threading.Event()
         self._logged: set[str] = set()
-        self._made: asyncio.Future[None] = loop.create_future()
+        self._created: asyncio.Future[None] = loop.create_future()
         self._thread = threading.Thread(
             target=self._run, name=f"smartcam-rclpy {namespace}/{name}", daemon=True
         )
@@ -155,21 +152,21 @@ class SpunNode:
 
         Cancellation: the thread ends by itself.
         """
-        _open.add(self)
+        _open_nodes.add(self)
         self._thread.start()
         try:
             async with asyncio.timeout(timeout):
-                await asyncio.shield(self._made)
+                await asyncio.shield(self._created)
         except TimeoutError as exc:
-            self.end()
+            self.stop()
             raise RosError(f"{self._name}: rclpy made no node within {timeout:g} s") from exc
         except BaseException:
-            self.end()
+            self.stop()
             raise
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """Make the thread destroy the node and end."""
-        self._stopping.set()
+        self._stop_requested.set()
         with contextlib.suppress(Exception):  # the executor may be ending
             if self.executor is not None:
                 self.executor.create_task(_nothing, None)  # only a task wakes the executor
@@ -180,52 +177,52 @@ class SpunNode:
             if self.executor is not None:
                 self.executor.wake()
 
-    def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
+    def call_in_loop(self, function: Callable[..., None], *args: Any) -> bool:
         """Call a function in the event loop; return False if the loop is closed."""
         try:
-            self._loop.call_soon_threadsafe(do, *given)
+            self._loop.call_soon_threadsafe(function, *args)
         except RuntimeError:
             return False
         return True
 
-    def abandon(self) -> None:
+    def stop_at_exit(self) -> None:
         """End a node that is still open at the program's end, in bounded time."""
-        self.end()
+        self.stop()
         self._thread.join(EXIT_TIMEOUT)
 
     # ------------------------------------------------------------------ in the thread
 
     def _run(self) -> None:
-        why: RosError | None = None
+        reason: RosError | None = None
         try:
             context = self._context.open()
         except BaseException as exc:  # noqa: BLE001 - passed to start()
-            self.in_loop(self._report_made, exc)
-            _open.discard(self)
+            self.call_in_loop(self._report_created, exc)
+            _open_nodes.discard(self)
             return
         try:
-            self._make(context)
-            self.in_loop(self._report_made, None)
-            why = self._spin(context)
+            self._create_node(context)
+            self.call_in_loop(self._report_created, None)
+            reason = self._spin(context)
         except BaseException as exc:  # noqa: BLE001 - passed to start(), or to on_end
-            why = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
+            reason = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
         finally:
             self._close()
             self._context.close()
-            _open.discard(self)
-            self.in_loop(self._report_made, why)
-            self.in_loop(self._on_end, why)
+            _open_nodes.discard(self)
+            self.call_in_loop(self._report_created, reason)
+            self.call_in_loop(self._on_end, reason)
 
-    def _report_made(self, error: BaseException | None) -> None:
-        if self._made.done():
+    def _report_created(self, error: BaseException | None) -> None:
+        if self._created.done():
             return
         if error is None:
-            self._made.set_result(None)
+            self._created.set_result(None)
         else:
-            self._made.set_exception(error)
-            self._made.exception()  # start() may have been cancelled
+            self._created.set_exception(error)
+            self._created.exception()  # start() may have been cancelled
 
-    def _make(self, context: Any) -> None:
+    def _create_node(self, context: Any) -> None:
         namespace = "" if self._namespace == "/" else self._namespace
         make = managed_node if self._managed else rclpy("node").Node
         self.ros = make(self._name, namespace=namespace, context=context)
@@ -233,9 +230,9 @@ class SpunNode:
         self.executor.add_node(self.ros)
 
     def _spin(self, context: Any) -> RosError | None:
-        """Spin until the end; return its reason, None after :meth:`end`."""
+        """Spin until the end; return its reason, None after :meth:`stop`."""
         shut_down = rclpy("executors").ExternalShutdownException
-        while not self._stopping.is_set():
+        while not self._stop_requested.is_set():
             if self._loop.is_closed():
                 logger.error("%s ! its event loop is closed: the node is taken back", self._name)
                 return RosError(f"{self._name}: its event loop is closed")
@@ -248,15 +245,15 @@ class SpunNode:
             except NoReplyError:
                 pass
             except Exception as exc:  # noqa: BLE001 - mostly of an endpoint closed meanwhile
-                self._tell_error(exc)
+                self._log_error_once(exc)
         return None
 
-    def _tell_error(self, error: Exception) -> None:
+    def _log_error_once(self, error: Exception) -> None:
         text = f"{type(error).__name__}: {error!s:.300}"
-        closed = type(error).__name__ == "InvalidHandle"
+        is_closed = type(error).__name__ == "InvalidHandle"
         if text not in self._logged and len(self._logged) < MAX_LOGGED_TEXTS:
             self._logged.add(text)
-            level = logging.DEBUG if closed else logging.WARNING
+            level = logging.DEBUG if is_closed else logging.WARNING
             logger.log(level, "%s ! a callback of rclpy failed: %s", self._name, text)
         time.sleep(ERROR_PAUSE)
 
@@ -272,27 +269,27 @@ class SpunNode:
 
 def managed_node(name: str, *, namespace: str, context: Any) -> Any:
     """Return a node of rclpy with a life cycle whose services run concurrently; blocks."""
-    life, groups = rclpy("lifecycle"), rclpy("callback_groups")
+    lifecycle_module, groups = rclpy("lifecycle"), rclpy("callback_groups")
     node_class = rclpy("node").Node
-    bases = (life.LifecycleNodeMixin, node_class)
-    made = cast("Any", type("SmartcamNode", bases, {"__init__": _nothing}))()
-    node_class.__init__(made, name, namespace=namespace, context=context)
-    life.LifecycleNodeMixin.__init__(
-        made,
+    bases = (lifecycle_module.LifecycleNodeMixin, node_class)
+    node = cast("Any", type("SmartcamNode", bases, {"__init__": _nothing}))()
+    node_class.__init__(node, name, namespace=namespace, context=context)
+    lifecycle_module.LifecycleNodeMixin.__init__(
+        node,
         enable_communication_interface=True,
         callback_group=groups.ReentrantCallbackGroup(),
     )
-    return made
+    return node
 
 
 def _nothing(_self: Any) -> None:
     pass
 
 
-_open: weakref.WeakSet[SpunNode] = weakref.WeakSet()
+_open_nodes: weakref.WeakSet[SpunNode] = weakref.WeakSet()
 
 
 @atexit.register
-def _abandon() -> None:
-    for spun in tuple(_open):
-        spun.abandon()
+def _stop_open_nodes() -> None:
+    for spun in tuple(_open_nodes):
+        spun.stop_at_exit()

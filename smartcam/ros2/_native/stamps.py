@@ -1,8 +1,8 @@
 """Convert the stamps of messages to ROS' time, for a node with ``use_sim_time``.
 
-All stamps come from the system's clock. When messages leave the node they are converted to ROS'
-time: a stamp is moved by the seconds by which ROS' time is ahead when its first message leaves.
-Later messages with the same stamp, such as a picture's lens, get the same new stamp.
+All stamps come from the system's clock, and are converted when a message leaves the node. To the
+stamp of a first message the present difference of ROS' time and the system's is added. Later
+messages with the same stamp, such as a picture's lens, get the same new stamp.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ BILLION = 1_000_000_000
 
 
 class RosStamps:
-    """Moves the stamps of messages to ROS' time.
+    """Converts the stamps of messages to ROS' time.
 
     Args:
         shift: function that returns the seconds by which ROS' time is ahead of the system's.
     """
 
     def __init__(self, shift: Callable[[], float]) -> None:
-        self._shift = shift
-        self._moved_stamps: collections.OrderedDict[int, int] = collections.OrderedDict()
+        self._time_shift = shift
+        self._shifted_stamps: collections.OrderedDict[int, int] = collections.OrderedDict()
         self._lock = threading.Lock()
 
-    def moved(self, kind: MessageType, data: bytes) -> bytes:
+    def to_ros_time(self, message_type: MessageType, data: bytes) -> bytes:
         """Return a message with the stamps of its headers in ROS' time."""
-        message = kind.decode(data)
-        for header in headers(kind, message):
+        message = message_type.decode(data)
+        for header in iter_headers(message_type, message):
             stamp = header.stamp
-            moved = self._moved(stamp.sec * BILLION + stamp.nanosec)
-            stamp.sec, stamp.nanosec = divmod(moved, BILLION)
-        return kind.encode(message)
+            shifted = self._shift_stamp(stamp.sec * BILLION + stamp.nanosec)
+            stamp.sec, stamp.nanosec = divmod(shifted, BILLION)
+        return message_type.encode(message)
 
-    def _moved(self, stamp: int) -> int:
+    def _shift_stamp(self, stamp: int) -> int:
         with self._lock:
-            known = self._moved_stamps.get(stamp)
-            if known is None:
-                known = max(0, stamp + round(self._shift() * BILLION))
-                self._moved_stamps[stamp] = known
-                if len(self._moved_stamps) > MAX_STAMPS:
-                    self._moved_stamps.popitem(last=False)
-            return known
+            shifted = self._shifted_stamps.get(stamp)
+            if shifted is None:
+                shifted = max(0, stamp + round(self._time_shift() * BILLION))
+                self._shifted_stamps[stamp] = shifted
+                if len(self._shifted_stamps) > MAX_STAMPS:
+                    self._shifted_stamps.popitem(last=False)
+            return shifted
 
 
-def headers(kind: MessageType, message: Any) -> Iterator[Any]:
+def iter_headers(message_type: MessageType, message: Any) -> Iterator[Any]:
     """Yield the headers in a message."""
-    for field in kind.fields:
+    for field in message_type.fields:
         if not field.nested:
             continue
         value = getattr(message, field.attribute)
@@ -66,4 +66,4 @@ def headers(kind: MessageType, message: Any) -> Iterator[Any]:
             if field.type == HEADER:
                 yield part
             else:
-                yield from headers(kind.nested[field.type], part)
+                yield from iter_headers(message_type.nested[field.type], part)

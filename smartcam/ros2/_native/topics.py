@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam.exceptions import RosError
 from smartcam.ros2._native.installed import rclpy
 from smartcam.ros2._node.topic_reader import TopicReader
-from smartcam.ros2._node.topics import MAX_WAITING_BYTES, message_of
+from smartcam.ros2._node.topics import MAX_WAITING_BYTES, message_or_fields
 
 if TYPE_CHECKING:
     from smartcam.ros2._native.node import NativeNode
@@ -21,20 +21,22 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
-def profile_of(qos: QoS) -> Any:
+def rclpy_profile(qos: QoS) -> Any:
     """Return a quality of service in rclpy's form."""
-    kinds = rclpy("qos")
-    reliable, durable = kinds.ReliabilityPolicy, kinds.DurabilityPolicy
-    more: dict[str, Any] = {}
+    qos_module = rclpy("qos")
+    reliable, durable = qos_module.ReliabilityPolicy, qos_module.DurabilityPolicy
+    options: dict[str, Any] = {}
     if math.isfinite(qos.lifespan):
-        more["lifespan"] = rclpy("duration").Duration(seconds=qos.lifespan)
+        options["lifespan"] = rclpy("duration").Duration(seconds=qos.lifespan)
     keeps_last = qos.depth is not None
-    return kinds.QoSProfile(
-        history=kinds.HistoryPolicy.KEEP_LAST if keeps_last else kinds.HistoryPolicy.KEEP_ALL,
+    return qos_module.QoSProfile(
+        history=qos_module.HistoryPolicy.KEEP_LAST
+        if keeps_last
+        else qos_module.HistoryPolicy.KEEP_ALL,
         depth=qos.kept,
         reliability=reliable.RELIABLE if qos.reliable else reliable.BEST_EFFORT,
         durability=durable.TRANSIENT_LOCAL if qos.latched else durable.VOLATILE,
-        **more,
+        **options,
     )
 
 
@@ -42,7 +44,7 @@ class NativePublisher:
     """Publishes on a topic through rclpy; created by :meth:`NativeNode.publisher`.
 
     Messages are encoded here and passed to rclpy as bytes, so that a picture never becomes a list
-    of numbers; a thread of the node does that, since a middleware may wait for room.
+    of numbers. A thread of the node passes them on, since a middleware may wait for room.
 
     Attributes:
         name: absolute name of the topic.
@@ -52,26 +54,30 @@ class NativePublisher:
         dropped: number of messages that were dropped for lack of room, the oldest first.
     """
 
-    def __init__(self, node: NativeNode, name: str, kind: MessageType, qos: QoS, cls: Any) -> None:
+    def __init__(
+        self, node: NativeNode, name: str, message_type: MessageType, qos: QoS, cls: Any
+    ) -> None:
         self.name: str = name
-        self.type: MessageType = kind
+        self.type: MessageType = message_type
         self.qos: QoS = qos
         self.published: int = 0
         self.dropped: int = 0
         self._node, self._closed = node, False
-        self._raw: Any = None
+        self._ros_object: Any = None
         if cls is not None:
-            self._raw = node.made(lambda ros: ros.create_publisher(cls, name, profile_of(qos)))
+            self._ros_object = node.create(
+                lambda ros: ros.create_publisher(cls, name, rclpy_profile(qos))
+            )
 
     @property
     def has_subscribers(self) -> bool:
         """True if the topic has a known subscriber, and always if it is latched."""
-        if self._closed or self._raw is None:
+        if self._closed or self._ros_object is None:
             return False
         if self.qos.latched:
             return True
         try:
-            return bool(self._raw.get_subscription_count())
+            return bool(self._ros_object.get_subscription_count())
         except Exception:  # noqa: BLE001 - the context has ended, so there is no subscriber
             return False
 
@@ -82,7 +88,7 @@ class NativePublisher:
             RosMessageError: the message is not of the type.
             RosError: the publisher is closed, or rclpy has ended.
         """
-        self.publish_encoded(self.type.encode(message_of(message, fields)))
+        self.publish_encoded(self.type.encode(message_or_fields(message, fields)))
 
     def publish_encoded(self, data: bytes) -> None:
         """Publish an encoded message of the type; never waits.
@@ -91,8 +97,8 @@ class NativePublisher:
             RosError: the publisher is closed, or rclpy has ended.
         """
         self._check_open()
-        if self._raw is not None:
-            self._node.outbox.put(lambda: self._pass_on(data), len(data), self._drop)
+        if self._ros_object is not None:
+            self._node.outbox.add_job(lambda: self._pass_to_rclpy(data), len(data), self._drop)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
         """Publish a message, and return once the middleware has it; a thread encodes it.
@@ -104,30 +110,30 @@ class NativePublisher:
         Cancellation: the message is published or not.
         """
         self._check_open()
-        if self._raw is None:
+        if self._ros_object is None:
             return
-        message = message_of(message, fields)
-        done = asyncio.Event()
-        failed: list[Exception] = []
+        message = message_or_fields(message, fields)
+        passed_event = asyncio.Event()
+        errors: list[Exception] = []
 
         def publish() -> None:
             try:
-                self._pass_on(self.type.encode(message))
+                self._pass_to_rclpy(self.type.encode(message))
             except Exception as exc:  # noqa: BLE001 - passed to the waiting task
-                failed.append(exc)
-            self._node.in_loop(done.set)
+                errors.append(exc)
+            self._node.call_in_loop(passed_event.set)
 
-        self._node.outbox.put(publish)
-        await done.wait()
-        if failed:
-            raise failed[0]
+        self._node.outbox.add_job(publish)
+        await passed_event.wait()
+        if errors:
+            raise errors[0]
 
-    def _pass_on(self, data: bytes) -> None:
+    def _pass_to_rclpy(self, data: bytes) -> None:
         """Pass a message to rclpy, in the node's thread."""
         if self._node.has_sim_time:
-            data = self._node.stamps.moved(self.type, data)
+            data = self._node.stamps.to_ros_time(self.type, data)
         try:
-            self._raw.publish(data)
+            self._ros_object.publish(data)
         except Exception as exc:
             raise RosError(f"{self.name}: {type(exc).__name__}: {exc!s:.300}") from exc
         self.published += 1
@@ -145,8 +151,8 @@ class NativePublisher:
         if self._closed:
             return
         self._closed = True
-        if self._raw is not None:
-            self._node.outbox.put(lambda: self._node.unmade("publisher", self._raw))
+        if self._ros_object is not None:
+            self._node.outbox.add_job(lambda: self._node.destroy("publisher", self._ros_object))
         self._node.forget(self)
 
 
@@ -157,37 +163,39 @@ class NativeSubscription(TopicReader[bytes]):
         name: absolute name of the topic.
     """
 
-    def __init__(self, node: NativeNode, name: str, kind: MessageType, qos: QoS, cls: Any) -> None:
-        super().__init__(name, kind, qos.kept, MAX_WAITING_BYTES)
+    def __init__(
+        self, node: NativeNode, name: str, message_type: MessageType, qos: QoS, cls: Any
+    ) -> None:
+        super().__init__(name, message_type, qos.kept, MAX_WAITING_BYTES)
         self.name: str = name
         self._node, self._closed = node, False
-        self._most, self._crossing, self._lock = qos.kept, 0, threading.Lock()
-        self._raw = node.made(
+        self._max_on_way, self._messages_on_way, self._lock = qos.kept, 0, threading.Lock()
+        self._ros_object = node.create(
             lambda ros: ros.create_subscription(
                 cls,
                 name,
                 self._on_message,
-                profile_of(qos),
+                rclpy_profile(qos),
                 raw=True,
-                callback_group=node.side_by_side,
+                callback_group=node.concurrent_group,
             )
         )
 
     def _on_message(self, data: bytes) -> None:
-        """Receive a message in a thread of rclpy; if the loop is late, drop it."""
+        """Pass a message from rclpy's thread to the event loop; drop it if too many wait there."""
         with self._lock:
-            if self._crossing >= self._most:
+            if self._messages_on_way >= self._max_on_way:
                 return
-            self._crossing += 1
-        self._node.in_loop(self._take, data)
+            self._messages_on_way += 1
+        self._node.call_in_loop(self._offer_message, data)
 
-    def _take(self, data: bytes) -> None:
+    def _offer_message(self, data: bytes) -> None:
         with self._lock:
-            self._crossing -= 1
+            self._messages_on_way -= 1
         if not self._closed:
             self._queue.offer(data, 0.0, len(data))
 
-    def _read(self, item: bytes) -> Any:
+    def _decode_item(self, item: bytes) -> Any:
         return self.type.decode(item, whole=False)
 
     def close(self) -> None:
@@ -196,5 +204,5 @@ class NativeSubscription(TopicReader[bytes]):
             return
         self._closed = True
         self._queue.close()
-        self._node.outbox.put(lambda: self._node.unmade("subscription", self._raw))
+        self._node.outbox.add_job(lambda: self._node.destroy("subscription", self._ros_object))
         self._node.forget(self)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam._ros_names import check_domain
 from smartcam._zenoh import BusLink, ZenohSession, quietly
 from smartcam.exceptions import ConfigurationError
-from smartcam.ros2._node.graph import OTHER_END, RosGraph
+from smartcam.ros2._node.graph import OPPOSITE_KIND, RosGraph
 from smartcam.ros2._types.types import RosTypes
 
 if TYPE_CHECKING:
@@ -36,38 +36,38 @@ SETTINGS: Mapping[str, Any] = {
 """Settings of a Zenoh session for ROS nodes, as in the sessions of rmw_zenoh."""
 
 
-CALM, MAX_DIRECT = 0.5, 8
-"""Seconds, and messages that the event loop passes to the engine itself in that time. The engine's
-queue has room for 16 and drops the rest silently while its own thread gets no processor or the link
-takes no data. A thread, which waits for room, passes all others: with 0.01 s, 3 of 4 bursts of 1000
-results lost some on a machine that kept the engine's thread waiting; with 0.5 s, none of 8."""
+CALM_TIME, MAX_DIRECT_MESSAGES = 0.5, 8
+"""The event loop passes at most ``MAX_DIRECT_MESSAGES`` to the engine in ``CALM_TIME`` seconds; a
+thread, which can wait for room, passes all others. The engine's queue has room for 16 messages and
+silently drops further ones while its own thread gets no processor or the link takes no data. With
+0.01 s, 3 of 4 bursts of 1000 results lost some on a busy machine; with 0.5 s, none of 8."""
 
 PRIORITIES = ("DATA_LOW", "BACKGROUND", "DATA")
-"""Priorities of long messages of which only the newest is needed. The engine sends one message of
-each priority and link at a time; topics use the priorities in turn, so that the two pictures of a
-pair do not wait for each other."""
+"""Priorities for long messages of which only the newest is needed. On each link the engine sends
+one message of a priority at a time. Topics get the priorities in turn, so that the two pictures of
+a pair do not wait for each other."""
 
-PAUSE, RATE = 0.002, 5e8
-"""Seconds, and bytes per second: the time that a healthy link needs for one long message."""
+MESSAGE_PAUSE, LINK_BYTES_PER_SECOND = 0.002, 5e8
+"""Seconds, and bytes per second: the assumed time of a healthy link for one long message."""
 
 
 class NewestSlot:
     """A thread, and a priority, for long messages of which only the newest is needed.
 
     Attributes:
-        lane: name of the thread.
+        thread_name: name of the thread.
         priority: name of the engine's priority.
     """
 
     def __init__(self, priority: str) -> None:
-        self.lane: str = f"newest-{priority.lower()}"
+        self.thread_name: str = f"newest-{priority.lower()}"
         self.priority: str = priority
-        self._free = 0.0
+        self._next_send_at = 0.0
 
-    def wait(self, size: int) -> None:
-        """Wait until the previous message should be sent; ``size`` bytes come now."""
-        time.sleep(max(0.0, self._free - time.monotonic()))
-        self._free = time.monotonic() + PAUSE + size / RATE
+    def wait_for_link(self, size: int) -> None:
+        """Wait for the time of the previous message; count ``size`` bytes for the next call."""
+        time.sleep(max(0.0, self._next_send_at - time.monotonic()))
+        self._next_send_at = time.monotonic() + MESSAGE_PAUSE + size / LINK_BYTES_PER_SECOND
 
 
 class RosContext:
@@ -94,30 +94,30 @@ class RosContext:
         domain: int | None = None,
         distribution: str = "jazzy",
     ) -> None:
-        self.domain: int = check_domain(_environments() if domain is None else domain)
+        self.domain: int = check_domain(_domain_of_environment() if domain is None else domain)
         self.types: RosTypes = RosTypes(distribution)
-        self._owns = session is None
+        self._owns_session = session is None
         if session is None:
-            listening = _endpoints(listen)
-            link = BusLink(listening, () if listening else _endpoints(connect))
+            listening = _as_tuple(listen)
+            link = BusLink(listening, () if listening else _as_tuple(connect))
             session = ZenohSession(link, SETTINGS, bus_name="ROS 2")
         self.zenoh: ZenohSession = session
         self.graph: RosGraph = RosGraph(self.domain)
         self.zid: str = ""
         self._users = 0
-        self._numbers = 0
-        self._ends: dict[tuple[str, str], list[Entity]] = {}
+        self._last_id = 0
+        self._endpoints: dict[tuple[str, str], list[Entity]] = {}
         self._watchers: dict[tuple[str, str], list[Callable[[Entity, bool], None]]] = {}
         self._lock = threading.Lock()
         self._threads: dict[str, ThreadPoolExecutor] = {}
-        self._long: collections.Counter[object] = collections.Counter()
-        self._in_lane: collections.Counter[str] = collections.Counter()
-        self._calm_since, self._direct_messages, self._crowded = 0.0, 0, 0.0
+        self._waiting_by_owner: collections.Counter[object] = collections.Counter()
+        self._waiting_by_thread: collections.Counter[str] = collections.Counter()
+        self._interval_started_at, self._direct_messages, self._last_thread_send_at = 0.0, 0, 0.0
         self._slots = itertools.cycle(NewestSlot(priority) for priority in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
     async def open(self, timeout: float) -> None:
-        """Open the session, if no node has done so.
+        """Open the session, unless another node has opened it.
 
         Raises:
             ConnectFailedError: there is no router within ``timeout`` seconds.
@@ -126,14 +126,14 @@ class RosContext:
         if self._users > 1:
             return
         try:
-            if self._owns:
+            if self._owns_session:
                 await self.zenoh.open(timeout)
             self.zid = str(self.zenoh.session.info.zid())
             self.graph.open(self.zenoh)
         except BaseException:
             self._users -= 1
             raise
-        self._stop_listening = self.graph.listen(self._compare)
+        self._stop_listening = self.graph.listen(self._on_entity)
 
     async def close(self) -> None:
         """Release the context for a node; the last one closes an own session."""
@@ -146,31 +146,31 @@ class RosContext:
         for thread in self._threads.values():
             thread.shutdown(wait=False)  # waiting jobs find the session closed, and end
         self._threads.clear()
-        if self._owns:
+        if self._owns_session:
             await self.zenoh.close()
 
     def next_id(self) -> int:
         """Return a number that is unique in this session."""
-        self._numbers += 1
-        return self._numbers
+        self._last_id += 1
+        return self._last_id
 
     # ------------------------------------------------------------------ incompatible endpoints
 
-    def add(self, entity: Entity) -> None:
-        """Add an endpoint of this process; log incompatible endpoints."""
-        self._ends.setdefault((entity.name, entity.kind), []).append(entity)
-        for other in self.graph.ends(entity.name, OTHER_END[entity.kind]):
-            self._differ(entity, other)
+    def add_endpoint(self, entity: Entity) -> None:
+        """Add an endpoint of this process, and log endpoints that are incompatible with it."""
+        self._endpoints.setdefault((entity.name, entity.kind), []).append(entity)
+        for other in self.graph.ends(entity.name, OPPOSITE_KIND[entity.kind]):
+            self._warn_if_incompatible(entity, other)
 
-    def remove(self, entity: Entity) -> None:
+    def remove_endpoint(self, entity: Entity) -> None:
         """Remove a closed endpoint."""
-        ends = self._ends.get((entity.name, entity.kind), [])
-        if entity in ends:
-            ends.remove(entity)
-        if not ends:
-            self._ends.pop((entity.name, entity.kind), None)
+        endpoints = self._endpoints.get((entity.name, entity.kind), [])
+        if entity in endpoints:
+            endpoints.remove(entity)
+        if not endpoints:
+            self._endpoints.pop((entity.name, entity.kind), None)
 
-    def watch(
+    def watch_endpoints(
         self, name: str, kind: str, watcher: Callable[[Entity, bool], None]
     ) -> Callable[[], None]:
         """Call ``watcher(entity, present)`` for each endpoint that comes or goes from now on.
@@ -186,21 +186,21 @@ class RosContext:
         watchers = self._watchers.setdefault((name, kind), [])
         watchers.append(watcher)
 
-        def end() -> None:
+        def stop_watching() -> None:
             watchers.remove(watcher)
             if not watchers and self._watchers.get((name, kind)) is watchers:
                 del self._watchers[name, kind]
 
-        return end
+        return stop_watching
 
-    def _compare(self, other: Entity, present: bool) -> None:
+    def _on_entity(self, other: Entity, present: bool) -> None:
         for watcher in tuple(self._watchers.get((other.name, other.kind), ())):
             watcher(other, present)
-        if present and other.kind in OTHER_END:
-            for end in self._ends.get((other.name, OTHER_END[other.kind]), ()):
-                self._differ(end, other)
+        if present and other.kind in OPPOSITE_KIND:
+            for endpoint in self._endpoints.get((other.name, OPPOSITE_KIND[other.kind]), ()):
+                self._warn_if_incompatible(endpoint, other)
 
-    def _differ(self, one: Entity, other: Entity) -> None:
+    def _warn_if_incompatible(self, one: Entity, other: Entity) -> None:
         if (one.type, one.hash) != (other.type, other.hash):
             logger.warning(
                 "%s of %s is %s %s here, but %s of %s has %s %s: they do not hear each other",
@@ -216,47 +216,48 @@ class RosContext:
 
     # ------------------------------------------------------------------ waiting messages
 
-    def slot(self) -> NewestSlot:
-        """Return the slot of a further topic of which only the newest message is needed."""
+    def next_slot(self) -> NewestSlot:
+        """Return a slot for one more topic of which only the newest message is needed."""
         return next(self._slots)
 
-    def waits(self, owner: object) -> bool:
+    def has_waiting(self, owner: object) -> bool:
         """Return True if messages of an owner wait to be sent."""
-        return bool(self._long[owner])
+        return bool(self._waiting_by_owner[owner])
 
-    def calm(self) -> bool:
-        """Return True if the event loop may pass one more short message to the engine."""
+    def allow_direct_send(self) -> bool:
+        """Return True, and count the message, if the event loop may pass it to the engine."""
         now = time.monotonic()
-        if self._in_lane["short"] or now - self._crowded < CALM:
-            # the thread may wait in the engine, and would block the loop, too; and the engine has
-            # just been full
+        if self._waiting_by_thread["short"] or now - self._last_thread_send_at < CALM_TIME:
+            # the engine may be full: then its thread waits, and the event loop would be blocked
             return False
-        if now - self._calm_since > CALM:
-            self._calm_since, self._direct_messages = now, 0
+        if now - self._interval_started_at > CALM_TIME:
+            self._interval_started_at, self._direct_messages = now, 0
         self._direct_messages += 1
-        return self._direct_messages <= MAX_DIRECT
+        return self._direct_messages <= MAX_DIRECT_MESSAGES
 
-    def send_later(self, owner: object, send: Callable[[], None], lane: str) -> None:
-        """Call ``send`` in the thread of a lane, where it may wait for room; in order."""
-        thread = self._threads.get(lane)
+    def send_in_thread(self, owner: object, send: Callable[[], None], thread_name: str) -> None:
+        """Call ``send`` in the thread of this name, in order; there it may wait for room."""
+        thread = self._threads.get(thread_name)
         if thread is None:
-            thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")
+            thread = self._threads[thread_name] = ThreadPoolExecutor(
+                1, f"smartcam-ros2-{thread_name}"
+            )
         with self._lock:
-            self._long[owner] += 1
-            self._in_lane[lane] += 1
-        thread.submit(quietly, send).add_done_callback(lambda _: self._sent(owner, lane))
+            self._waiting_by_owner[owner] += 1
+            self._waiting_by_thread[thread_name] += 1
+        thread.submit(quietly, send).add_done_callback(lambda _: self._on_sent(owner, thread_name))
 
-    def _sent(self, owner: object, lane: str) -> None:
+    def _on_sent(self, owner: object, thread_name: str) -> None:
         with self._lock:
-            self._in_lane[lane] -= 1
-            if lane == "short":
-                self._crowded = time.monotonic()
-            self._long[owner] -= 1
-            if not self._long[owner]:
-                del self._long[owner]
+            self._waiting_by_thread[thread_name] -= 1
+            if thread_name == "short":
+                self._last_thread_send_at = time.monotonic()
+            self._waiting_by_owner[owner] -= 1
+            if not self._waiting_by_owner[owner]:
+                del self._waiting_by_owner[owner]
 
 
-def _environments() -> int:
+def _domain_of_environment() -> int:
     text = os.environ.get("ROS_DOMAIN_ID", "").strip()
     if not text:
         return 0
@@ -265,8 +266,8 @@ def _environments() -> int:
     return int(text)
 
 
-def _endpoints(given: str | Sequence[str]) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
+def _as_tuple(value: str | Sequence[str]) -> tuple[str, ...]:
+    return (value,) if isinstance(value, str) else tuple(value)
 
 
 def _nothing() -> None:

@@ -14,7 +14,7 @@ from smartcam.ros2._node.tokens import (
     SERVICE,
     SUBSCRIPTION,
     Entity,
-    pattern,
+    token_pattern,
 )
 
 if TYPE_CHECKING:
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_ENTITIES = 100_000
-"""Largest number of nodes and endpoints in the graph; further ones are ignored, which the log
-says."""
+"""Largest number of nodes and endpoints in the graph; further ones are ignored, with a warning."""
 
 
 class RosGraph:
@@ -51,12 +50,12 @@ class RosGraph:
         put = session.engine.SampleKind.PUT
 
         def on_sample(sample: Any) -> None:
-            session.in_loop(declared.call, 0, self.take, str(sample.key_expr), sample.kind == put)
+            session.in_loop(declared.call, 0, self.update, str(sample.key_expr), sample.kind == put)
 
         self._declared = declared = ZenohDeclared(session)
         declared.of(
             lambda opened: opened.liveliness().declare_subscriber(
-                pattern(self._domain), direct(on_sample), history=True
+                token_pattern(self._domain), direct(on_sample), history=True
             )
         )
 
@@ -66,29 +65,28 @@ class RosGraph:
             self._declared.close()
 
     def listen(self, listener: Callable[[Entity, bool], None]) -> Callable[[], None]:
-        """Call ``listener(entity, present)`` for each entity that comes or goes.
+        """Call ``listener(entity, present)`` for each entity that is present, comes or goes.
 
-        Return a function that ends this.
-        For present entities it is called at once.
+        Return a function that ends these calls.
         """
         self._listeners.append(listener)
         for entity in tuple(self._entities.values()):
             listener(entity, True)
         return lambda: self._listeners.remove(listener)
 
-    def take(self, token: str, present: bool) -> None:
+    def update(self, token: str, present: bool) -> None:
         """Add or remove the entity of a token."""
-        known = self._entities.get(token)
-        if (known is not None) == present:
+        entity = self._entities.get(token)
+        if (entity is not None) == present:
             return
-        if known is not None:
+        if entity is not None:
             del self._entities[token]
-            self._by_gid.pop(known.gid, None)
-            ends = self._by_name[known.name, known.kind]
-            del ends[token]
-            if not ends:
-                del self._by_name[known.name, known.kind]
-            self._notify_watchers(known, False)
+            self._by_gid.pop(entity.gid, None)
+            endpoints = self._by_name[entity.name, entity.kind]
+            del endpoints[token]
+            if not endpoints:
+                del self._by_name[entity.name, entity.kind]
+            self._notify_watchers(entity, False)
             return
         try:
             entity = Entity.parse(token)
@@ -114,7 +112,7 @@ class RosGraph:
             except BaseException:
                 logger.exception("the graph: a listener failed at %s", entity.token)
 
-    # ------------------------------------------------------------------ questions
+    # ------------------------------------------------------------------ contents
 
     def __iter__(self) -> Iterator[Entity]:
         return iter(tuple(self._entities.values()))
@@ -129,11 +127,11 @@ class RosGraph:
 
     def topics(self) -> dict[str, list[str]]:
         """Return the types of each topic by its name, as ``ros2 topic list -t``."""
-        return self._types({PUBLISHER, SUBSCRIPTION})
+        return self._types_by_name({PUBLISHER, SUBSCRIPTION})
 
     def services(self) -> dict[str, list[str]]:
         """Return the types of each service by its name, as ``ros2 service list -t``."""
-        return self._types({SERVICE})
+        return self._types_by_name({SERVICE})
 
     def ends(self, name: str, kind: str) -> list[Entity]:
         """Return the endpoints of a topic or a service.
@@ -149,7 +147,7 @@ class RosGraph:
         """Return the endpoints of a node, as ``ros2 node info``."""
         return [entity for entity in self if entity.kind != NODE and entity.full_node == full_name]
 
-    def _types(self, kinds: set[str]) -> dict[str, list[str]]:
+    def _types_by_name(self, kinds: set[str]) -> dict[str, list[str]]:
         types: dict[str, set[str]] = {}
         for entity in self:
             if entity.kind in kinds:
@@ -157,5 +155,5 @@ class RosGraph:
         return {name: sorted(types[name]) for name in sorted(types)}
 
 
-OTHER_END = {PUBLISHER: SUBSCRIPTION, SUBSCRIPTION: PUBLISHER, SERVICE: CLIENT, CLIENT: SERVICE}
-"""The kind of the endpoint at the other end."""
+OPPOSITE_KIND = {PUBLISHER: SUBSCRIPTION, SUBSCRIPTION: PUBLISHER, SERVICE: CLIENT, CLIENT: SERVICE}
+"""The kind of endpoint to which an endpoint of each kind is connected."""

@@ -1,4 +1,4 @@
-"""The methods of a node of ROS that a camera's node needs.
+"""The interface of a node of ROS, as a camera's node uses it.
 
 :class:`~smartcam.ros2.Node` uses the wire format of rmw_zenoh, a ``NativeNode`` uses rclpy, and ROS
 1's node a rosbridge. The parts of a camera's node use only this interface.
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class PublisherEnd(Protocol):
     """A publisher of a topic.
 
-    It may also have ``has_subscribers``, True if the topic has a subscriber as far as is known;
+    It may also have ``has_subscribers``, False if the topic is known to have no subscriber;
     ``publish_encoded`` for an encoded message; and ``publish_newest`` for pictures, of which a slow
     subscriber gets only the newest.
     """

@@ -100,12 +100,12 @@ TRANSITIONS = tuple(
 )
 """Transitions, in rcl's order. Those from number 10 on cannot be requested."""
 
-PRIVATE = 10
-"""First id of the transitions that follow by themselves."""
+FIRST_INTERNAL_ID = 10
+"""First id of the transitions, and states, that follow by themselves and cannot be requested."""
 
 
 class Lifecycle:
-    """The states of a managed node, and its transitions, one at a time.
+    """The states of a managed node, and its transitions, of which one runs at a time.
 
     A transition that has begun continues when its caller is cancelled. If its work raises a
     :exc:`~smartcam.SmartCamError`, the node returns to the previous state; after any other error
@@ -118,7 +118,7 @@ class Lifecycle:
 
     Attributes:
         state: the current state; during a transition the state of the transition.
-        closed: True if no transition can be requested any more.
+        closed: True once transitions can no longer be requested.
     """
 
     def __init__(
@@ -142,11 +142,11 @@ class Lifecycle:
         return [transition for transition in TRANSITIONS if transition.start is self.state]
 
     def listen(self, on_step: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
-        """Call ``on_step`` after each step; return a function that ends this."""
+        """Call ``on_step`` after each change of the state; return a function that ends this."""
         self._listeners.append(on_step)
         return lambda: self._listeners.remove(on_step) if on_step in self._listeners else None
 
-    async def settled(self) -> None:
+    async def wait_for_transition(self) -> None:
         """Wait for the end of a running transition.
 
         Raises:
@@ -174,40 +174,40 @@ class Lifecycle:
 
         Cancellation: a transition that has begun continues.
         """
-        await self.settled()
-        transition = self._find(label, number)
-        self._begins()
+        await self.wait_for_transition()
+        transition = self._find_transition(label, number)
+        self._on_transition_requested()
         self._enter(transition)
-        self._task = asyncio.get_running_loop().create_task(self._finish(transition))
-        self._task.add_done_callback(self._finished)
+        self._task = asyncio.get_running_loop().create_task(self._run_transition(transition))
+        self._task.add_done_callback(self._on_task_done)
         await asyncio.shield(self._task)
 
-    def _begins(self) -> None:
-        """Begin a requested transition."""
+    def _on_transition_requested(self) -> None:
+        """Do what a subclass needs before a requested transition begins."""
 
     async def configure(self) -> None:
         """Go from Unconfigured to Inactive like :meth:`change`; in other states do nothing."""
-        await self._have("configure", INACTIVE, ACTIVE)
+        await self._change_unless_in("configure", INACTIVE, ACTIVE)
 
     async def activate(self) -> None:
         """Go from Inactive to Active like :meth:`change`; in other states do nothing."""
-        await self._have("activate", ACTIVE)
+        await self._change_unless_in("activate", ACTIVE)
 
     async def deactivate(self) -> None:
         """Go from Active to Inactive like :meth:`change`; in other states do nothing."""
-        await self._have("deactivate", INACTIVE, UNCONFIGURED)
+        await self._change_unless_in("deactivate", INACTIVE, UNCONFIGURED)
 
     async def cleanup(self) -> None:
         """Go from Inactive to Unconfigured like :meth:`change`; in other states do nothing."""
-        await self._have("cleanup", UNCONFIGURED)
+        await self._change_unless_in("cleanup", UNCONFIGURED)
 
     async def shutdown(self) -> None:
         """Go to Finalized, for good, like :meth:`change`."""
-        await self._have("shutdown", FINALIZED)
+        await self._change_unless_in("shutdown", FINALIZED)
 
-    async def _have(self, label: str, *enough: LifecycleState) -> None:
-        await self.settled()
-        if self.closed or self.state not in enough:
+    async def _change_unless_in(self, label: str, *states: LifecycleState) -> None:
+        await self.wait_for_transition()
+        if self.closed or self.state not in states:
             await self.change(label)
 
     async def close(self) -> None:
@@ -222,27 +222,29 @@ class Lifecycle:
             if step is not None and self.state is not FINALIZED:
                 self._enter(step)
 
-    def _find(self, label: str, number: int) -> LifecycleTransition:
-        possible = [step for step in self.available if step.id < PRIVATE]
+    def _find_transition(self, label: str, number: int) -> LifecycleTransition:
+        possible = [step for step in self.available if step.id < FIRST_INTERNAL_ID]
         for step in possible:
             if not self.closed and (step.label == label if label else step.id == number):
                 return step
-        wanted = repr(label[:40]) if label else f"transition {number}"
-        ways = ", ".join(f"{step.label} ({step.id})" for step in possible) or "nothing"
+        transition_text = repr(label[:40]) if label else f"transition {number}"
+        possible_text = ", ".join(f"{step.label} ({step.id})" for step in possible) or "nothing"
         state = "closed" if self.closed else self.state.label
-        raise RosError(f"{self.name}: {wanted}: it is {state}, where {ways} can be asked for")
+        raise RosError(
+            f"{self.name}: {transition_text}: it is {state}, where {possible_text} can be asked for"
+        )
 
-    async def _finish(self, transition: LifecycleTransition) -> None:
+    async def _run_transition(self, transition: LifecycleTransition) -> None:
         try:
             async with asyncio.timeout(self._timeout):
                 work = self._work.get(transition.label)
                 if work is not None:
                     await work()
         except SmartCamError:
-            self._follow(FAILURE)
+            self._enter_by_label(FAILURE)
             raise
         except TimeoutError as exc:
-            self._follow(FAILURE)
+            self._enter_by_label(FAILURE)
             text = f"{self.name}: {transition.label}: it took more than {self._timeout:g} s"
             raise ResponseTimeoutError(text, waited=self._timeout) from exc
         except asyncio.CancelledError:
@@ -251,25 +253,25 @@ class Lifecycle:
             raise
         except BaseException as exc:
             logger.exception("%s ! %s failed", self.name, transition.label)
-            self._follow(ERROR)
-            self._follow(SUCCESS)  # nothing has to be undone
+            self._enter_by_label(ERROR)
+            self._enter_by_label(SUCCESS)  # nothing has to be undone
             text = f"{self.name}: {transition.label}: {type(exc).__name__}: {exc}"
             raise RosError(text) from exc
-        self._follow(SUCCESS)
+        self._enter_by_label(SUCCESS)
 
-    def _finished(self, task: asyncio.Task[None]) -> None:
+    def _on_task_done(self, task: asyncio.Task[None]) -> None:
         """Handle the end of a transition; a cancelled one has failed."""
         if task.cancelled():
-            self._follow(FAILURE)
+            self._enter_by_label(FAILURE)
         else:
             task.exception()
 
-    def _follow(self, label: str) -> None:
+    def _enter_by_label(self, label: str) -> None:
         self._enter(next(step for step in self.available if step.label == label))
 
     def _enter(self, transition: LifecycleTransition) -> None:
         self.state = transition.goal
-        if self.state.id < PRIVATE:
+        if self.state.id < FIRST_INTERNAL_ID:
             logger.info("%s = %s", self.name, self.state.label)
         for on_step in tuple(self._listeners):
             try:

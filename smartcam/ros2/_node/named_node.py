@@ -9,7 +9,7 @@ from smartcam._server import Server
 from smartcam.exceptions import RosError
 
 HANDLER_TIMEOUT = 600.0
-"""Seconds of the timeout of a service's handler."""
+"""Seconds that a service's handler may take."""
 
 
 class NamedNode(Server):
@@ -46,7 +46,7 @@ class NamedNode(Server):
         if not self.is_open:
             raise RosError(f"{self.full_name}: the node is not open")
 
-    def _resolved(self, name: str, kind_text: str) -> str:
+    def _resolve_name(self, name: str, kind_text: str) -> str:
         """Return the absolute name of a topic or a service of the open node.
 
         Args:
@@ -57,6 +57,6 @@ class NamedNode(Server):
             ConfigurationError: the name is not valid.
             RosError: the node is not open.
         """
-        full = resolve(name, self.namespace, self.name, kind_text)
+        absolute_name = resolve(name, self.namespace, self.name, kind_text)
         self.check_open()
-        return full
+        return absolute_name

@@ -14,7 +14,7 @@ from smartcam.ros2._node.parameters import RosParameters
 from smartcam.ros2._node.qos import DEFAULT, SERVICES, QoS
 from smartcam.ros2._node.services import RosClient, RosService
 from smartcam.ros2._node.tokens import CLIENT, NODE, PUBLISHER, SERVICE, SUBSCRIPTION, Entity
-from smartcam.ros2._node.topics import RosEnd, RosPublisher, RosSubscription
+from smartcam.ros2._node.topics import RosEndpoint, RosPublisher, RosSubscription
 from smartcam.ros2._node.type_description import TypeDescriptions
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ OPEN_TIMEOUT = 10.0
 
 CLOSE_TIMEOUT = 5.0
 
-End = TypeVar("End", bound=RosEnd)
+Endpoint = TypeVar("Endpoint", bound=RosEndpoint)
 
 
 class Node(NamedNode):
@@ -81,10 +81,10 @@ class Node(NamedNode):
         self._open_timeout = open_timeout
         self._id = 0
         self._token: ZenohDeclared | None = None
-        self._ends: set[RosEnd] = set()
+        self._endpoints: set[RosEndpoint] = set()
         self.parameters: RosParameters = RosParameters(self, served=parameters)
         self._descriptions = (
-            TypeDescriptions(self, lambda: [end.entity for end in self._ends])
+            TypeDescriptions(self, lambda: [endpoint.entity for endpoint in self._endpoints])
             if parameters
             else None
         )
@@ -139,9 +139,9 @@ class Node(NamedNode):
         token, self._token = self._token, None
         if token is None:
             return
-        services = [endpoint for endpoint in self._ends if isinstance(endpoint, RosService)]
-        for end in tuple(self._ends):
-            end.close()
+        services = [endpoint for endpoint in self._endpoints if isinstance(endpoint, RosService)]
+        for endpoint in tuple(self._endpoints):
+            endpoint.close()
         token.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
@@ -153,7 +153,7 @@ class Node(NamedNode):
         finally:
             await self.context.close()
 
-    # ------------------------------------------------------------------ what it has
+    # ------------------------------------------------------------------ endpoints
 
     def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosPublisher:
         """Publish on a topic.
@@ -167,9 +167,13 @@ class Node(NamedNode):
             ConfigurationError: the topic is not valid, or there is no such type.
             RosError: the node is not open.
         """
-        kind = self.types.message(type)
-        entity = self._end(PUBLISHER, topic, "topic", kind.dds, kind.hash, qos)
-        return self._added(RosPublisher(self.context, entity, kind, self._ends.discard))
+        message_type = self.types.message(type)
+        entity = self._make_entity(
+            PUBLISHER, topic, "topic", message_type.dds, message_type.hash, qos
+        )
+        return self._register(
+            RosPublisher(self.context, entity, message_type, self._endpoints.discard)
+        )
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosSubscription:
         """Subscribe to a topic; read it by ``async for``.
@@ -183,9 +187,13 @@ class Node(NamedNode):
             ConfigurationError: the topic is not valid, or there is no such type.
             RosError: the node is not open.
         """
-        kind = self.types.message(type)
-        entity = self._end(SUBSCRIPTION, topic, "topic", kind.dds, kind.hash, qos)
-        return self._added(RosSubscription(self.context, entity, kind, self._ends.discard))
+        message_type = self.types.message(type)
+        entity = self._make_entity(
+            SUBSCRIPTION, topic, "topic", message_type.dds, message_type.hash, qos
+        )
+        return self._register(
+            RosSubscription(self.context, entity, message_type, self._endpoints.discard)
+        )
 
     def serve(
         self,
@@ -211,10 +219,14 @@ class Node(NamedNode):
             ConfigurationError: the name is not valid, or there is no such type.
             RosError: the node is not open.
         """
-        kind = self.types.service(type)
-        entity = self._end(SERVICE, service, "service", kind.dds, kind.hash, qos)
-        return self._added(
-            RosService(self.context, entity, kind, handler, timeout, self._ends.discard)
+        service_type = self.types.service(type)
+        entity = self._make_entity(
+            SERVICE, service, "service", service_type.dds, service_type.hash, qos
+        )
+        return self._register(
+            RosService(
+                self.context, entity, service_type, handler, timeout, self._endpoints.discard
+            )
         )
 
     def client(self, service: str, type: str, *, qos: QoS = SERVICES) -> RosClient:
@@ -229,9 +241,13 @@ class Node(NamedNode):
             ConfigurationError: the name is not valid, or there is no such type.
             RosError: the node is not open.
         """
-        kind = self.types.service(type)
-        entity = self._end(CLIENT, service, "service", kind.dds, kind.hash, qos)
-        return self._added(RosClient(self.context, entity, kind, self._ends.discard))
+        service_type = self.types.service(type)
+        entity = self._make_entity(
+            CLIENT, service, "service", service_type.dds, service_type.hash, qos
+        )
+        return self._register(
+            RosClient(self.context, entity, service_type, self._endpoints.discard)
+        )
 
     def parameters_of(self, name: str, *, timeout: float = CALL_TIMEOUT) -> ParameterClient:
         """Return a client that lists, gets, describes and sets another node's parameters.
@@ -247,24 +263,31 @@ class Node(NamedNode):
             self.client, resolve(name, self.namespace, self.name, "node"), timeout
         )
 
-    def _added(self, end: End) -> End:
-        self._ends.add(end)
-        return end
+    def _register(self, endpoint: Endpoint) -> Endpoint:
+        self._endpoints.add(endpoint)
+        return endpoint
 
-    def _end(
+    def _make_entity(
         self,
         kind: Kind,
         name: str,
         kind_text: str,
         dds: str,
-        hashed: str,
+        type_hash: str,
         qos: QoS,
     ) -> Entity:
-        full = self._resolved(name, kind_text)
-        return self._entity(kind, self.context.next_id(), full, dds, hashed, qos)
+        absolute_name = self._resolve_name(name, kind_text)
+        return self._entity(kind, self.context.next_id(), absolute_name, dds, type_hash, qos)
 
-    def _entity(self, kind: Kind, number: int, *more: Any) -> Entity:
+    def _entity(self, kind: Kind, number: int, *topic_fields: Any) -> Entity:
         context = self.context
         return Entity(
-            kind, context.domain, context.zid, self._id, number, self.namespace, self.name, *more
+            kind,
+            context.domain,
+            context.zid,
+            self._id,
+            number,
+            self.namespace,
+            self.name,
+            *topic_fields,
         )

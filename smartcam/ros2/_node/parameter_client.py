@@ -9,7 +9,7 @@ from smartcam.ros2._node.parameter_values import (
     ParameterDescription,
     decode_value,
     encode_value,
-    typed,
+    typed_value,
 )
 from smartcam.ros2._node.qos import PARAMETERS
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.ros2._node.services import RosClient
 
 CALL_TIMEOUT = 15.0
-"""Seconds of a call's timeout; a set of a node of smartcam has a timeout of ten seconds."""
+"""Seconds that a call may take; a node of smartcam takes up to ten to set a parameter."""
 
 
 class ParameterClient:
@@ -88,20 +88,20 @@ class ParameterClient:
             ConfigurationError: a value cannot be a parameter.
             ServiceCallError: the node refused, with its reason.
         """
-        both = {**(values or {}), **more}
-        if not both:
+        all_values = {**(values or {}), **more}
+        if not all_values:
             raise ConfigurationError(f"{self.name}: expected parameters to set, got none")
         reply = await self._call(
             "set_parameters_atomically",
             "SetParametersAtomically",
             parameters=[
-                {"name": name, "value": encode_value(typed(name, value))}
-                for name, value in both.items()
+                {"name": name, "value": encode_value(typed_value(name, value))}
+                for name, value in all_values.items()
             ],
         )
         if not reply.result.successful:
             raise ServiceCallError(
-                f"{self.name} refused to set {', '.join(both):.200}: "
+                f"{self.name} refused to set {', '.join(all_values):.200}: "
                 f"{reply.result.reason[:1000] or 'it does not say why'}",
                 service=f"{self.name}/set_parameters_atomically",
             )

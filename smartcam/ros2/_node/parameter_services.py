@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_NAMES = 1024
-"""Largest number of names in a request; one with more is refused: list returns nothing, set returns
-the reason."""
+"""Largest number of names in a request. One with more is refused: the answer to a list request is
+empty, the answer to a set request has the reason."""
 
 MAX_REASON_CHARACTERS = 1000
 """Largest number of characters of the reason why parameters could not be set."""
 
 NAMES_PER_TURN = 64
-"""Number of names after which other tasks get a turn."""
+"""Number of names after which the event loop runs other tasks."""
 
 SEPARATOR: Final = "."
 DEPTH_RECURSIVE: Final = 0
@@ -67,13 +67,13 @@ class ParameterServices:
             ("set_parameters_atomically", "SetParametersAtomically", self._set_atomically),
         ):
             self._node.serve(f"~/{name}", f"rcl_interfaces/srv/{type}", handler, qos=PARAMETERS)
-        self.tell(new=self._parameters.names())
+        self.publish_event(new=self._parameters.names())
 
     def close(self) -> None:
         """Stop publishing; the node closes the endpoints."""
         self._events = None
 
-    def tell(
+    def publish_event(
         self,
         *,
         new: Sequence[str] = (),
@@ -90,7 +90,8 @@ class ParameterServices:
             new_parameters=self._messages(new),
             changed_parameters=self._messages(changed),
             deleted_parameters=[
-                {"name": name, "value": encode_value(was)} for name, was in (deleted or {}).items()
+                {"name": name, "value": encode_value(old_value)}
+                for name, old_value in (deleted or {}).items()
             ],
         )
 
@@ -101,98 +102,100 @@ class ParameterServices:
     # ------------------------------------------------------------------ reading
 
     async def _describe(self, request: Any) -> dict[str, Any]:
-        kind = self._node.types.message("rcl_interfaces/msg/ParameterDescriptor")
+        message_type = self._node.types.message("rcl_interfaces/msg/ParameterDescriptor")
         describe = self._parameters.describe
         return {
-            "descriptors": await self._each(
-                request.names, lambda name, _: kind.new(**describe(name).encode())
+            "descriptors": await self._answer_each(
+                request.names, lambda name, _: message_type.new(**describe(name).encode())
             )
         }
 
     async def _get_types(self, request: Any) -> dict[str, Any]:
-        return {"types": bytes(await self._each(request.names, lambda _, value: value.number))}
+        return {
+            "types": bytes(await self._answer_each(request.names, lambda _, value: value.number))
+        }
 
     async def _get(self, request: Any) -> dict[str, Any]:
-        kind = self._node.types.message("rcl_interfaces/msg/ParameterValue")
+        message_type = self._node.types.message("rcl_interfaces/msg/ParameterValue")
         return {
-            "values": await self._each(
-                request.names, lambda _, value: kind.new(**encode_value(value))
+            "values": await self._answer_each(
+                request.names, lambda _, value: message_type.new(**encode_value(value))
             )
         }
 
-    async def _each(
+    async def _answer_each(
         self, names: Sequence[str], make: Callable[[str, Typed], Answer]
     ) -> list[Answer]:
-        """Return an answer for each name; none if a name is not declared, or there are too many."""
-        if self._too_many(names):
+        """Return an answer for each name; [] if a name is not declared, or there are too many."""
+        if self._too_many_reason(names):
             return []
-        made = []
-        for place, name in enumerate(names, 1):
+        answers = []
+        for count, name in enumerate(names, 1):
             value = self._parameters.find(name)
             if value is None:
                 return []
-            made.append(make(name, value))
-            if not place % NAMES_PER_TURN:
+            answers.append(make(name, value))
+            if not count % NAMES_PER_TURN:
                 await asyncio.sleep(0)
-        return made
+        return answers
 
     async def _list(self, request: Any) -> dict[str, Any]:
-        if self._too_many(request.prefixes):
+        if self._too_many_reason(request.prefixes):
             return {}
         names: list[str] = []
         prefixes: dict[str, None] = {}
-        for place, name in enumerate(self._parameters.names(), 1):
-            if _listed(name, request.prefixes, request.depth):
+        for count, name in enumerate(self._parameters.names(), 1):
+            if _is_listed(name, request.prefixes, request.depth):
                 names.append(name)
                 if SEPARATOR in name:
                     prefixes[name.rpartition(SEPARATOR)[0]] = None
-            if not place % NAMES_PER_TURN:
+            if not count % NAMES_PER_TURN:
                 await asyncio.sleep(0)
         return {"result": {"names": names, "prefixes": list(prefixes)}}
 
     # ------------------------------------------------------------------ setting
 
     async def _set(self, request: Any) -> dict[str, Any]:
-        if why := self._too_many(request.parameters):
-            refused = {"successful": False, "reason": why}
+        if too_many := self._too_many_reason(request.parameters):
+            refused = {"successful": False, "reason": too_many}
             return {"results": [refused] * len(request.parameters)}
         results = []
         for parameter in request.parameters:
-            results.append(await self._result([parameter]))
+            results.append(await self._set_result([parameter]))
             await asyncio.sleep(0)
         return {"results": results}
 
     async def _set_atomically(self, request: Any) -> dict[str, Any]:
-        if why := self._too_many(request.parameters):
-            return {"result": {"successful": False, "reason": why}}
+        if too_many := self._too_many_reason(request.parameters):
+            return {"result": {"successful": False, "reason": too_many}}
         if not request.parameters:
             return {"result": {"successful": False, "reason": "expected a parameter, got none"}}
-        return {"result": await self._result(request.parameters)}
+        return {"result": await self._set_result(request.parameters)}
 
-    def _too_many(self, names: Sequence[Any]) -> str:
-        """Return and log why a request has too many names; "" if it does not."""
+    def _too_many_reason(self, names: Sequence[Any]) -> str:
+        """Return the reason to refuse too many names, and log it; "" if there are not too many."""
         if len(names) <= MAX_NAMES:
             return ""
-        why = f"a request with {len(names)} names: expected {MAX_NAMES} at most"
-        logger.warning("%s ! %s", self._node.full_name, why)
-        return why
+        too_many = f"a request with {len(names)} names: expected {MAX_NAMES} at most"
+        logger.warning("%s ! %s", self._node.full_name, too_many)
+        return too_many
 
-    async def _result(self, parameters: Sequence[Any]) -> dict[str, Any]:
+    async def _set_result(self, parameters: Sequence[Any]) -> dict[str, Any]:
         try:
             values = {parameter.name: decode_value(parameter.value) for parameter in parameters}
-            await self._parameters.carry_out(values)
+            await self._parameters.set_shielded(values)
         except SmartCamError as exc:
-            return {"successful": False, "reason": reason(exc)}
+            return {"successful": False, "reason": reason_text(exc)}
         return {"successful": True}
 
 
-def reason(exc: SmartCamError) -> str:
-    """Return why setting failed, as text that fits into a message."""
+def reason_text(exc: SmartCamError) -> str:
+    """Return an error of setting parameters as a text that fits into a message."""
     text = "; ".join((str(exc), *getattr(exc, "__notes__", ())))
     return text[:MAX_REASON_CHARACTERS].replace("\0", " ").encode(errors="replace").decode()
 
 
-def _listed(name: str, prefixes: Sequence[str], depth: int) -> bool:
+def _is_listed(name: str, prefixes: Sequence[str], depth: int) -> bool:
     """Return True if a name is at most ``depth`` parts below a requested prefix."""
     for prefix in prefixes or ("",):
         if name == prefix:

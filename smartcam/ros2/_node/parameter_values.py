@@ -28,14 +28,14 @@ TYPES: Final = (
 """The names of types by their numbers in messages (``rcl_interfaces/msg/ParameterType``)."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING, BYTES = range(6)
-_TO_ARRAY: Final = 5
-"""Difference between the number of an array type and that of its elements."""
+_ARRAY_OFFSET: Final = 5
+"""Number of an array's type minus the number of its elements' type."""
 
-_NUMBERS: Final = (INTEGER, DOUBLE)
+_NUMBER_TYPES: Final = (INTEGER, DOUBLE)
 _INT64: Final = (-(1 << 63), (1 << 63) - 1)
 
 _MAX_DEVIATION: Final = 1e-9
-"""Largest deviation of a double from a bound or a step, as a part of either."""
+"""Largest deviation of a double from a bound, or from a step, relative to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +72,15 @@ class ParameterDescription:
         if not isinstance(value, int | float) or self.minimum is None or self.maximum is None:
             return
         if self.type == TYPES[DOUBLE]:
-            fits = _double_fits(float(value), self.minimum, self.maximum, self.step or 0.0)
+            is_in_range = _is_double_in_range(
+                float(value), self.minimum, self.maximum, self.step or 0.0
+            )
         else:
             first, step = int(self.minimum), int(self.step or 0)
-            fits = first <= value <= self.maximum and not (
+            is_in_range = first <= value <= self.maximum and not (
                 step and value != self.maximum and (int(value) - first) % step
             )
-        if not fits:
+        if not is_in_range:
             step_text = f" in steps of {self.step}" if self.step else ""
             raise ConfigurationError(
                 f"parameter {self.name!r}: {value} is out of its range: expected {self.minimum} "
@@ -123,7 +125,7 @@ class ParameterDescription:
         )
 
 
-def _double_fits(value: float, first: float, last: float, step: float) -> bool:
+def _is_double_in_range(value: float, first: float, last: float, step: float) -> bool:
     if math.isclose(value, first, rel_tol=_MAX_DEVIATION) or math.isclose(
         value, last, rel_tol=_MAX_DEVIATION
     ):
@@ -138,17 +140,17 @@ def _double_fits(value: float, first: float, last: float, step: float) -> bool:
     return math.isclose(value, nearest, rel_tol=_MAX_DEVIATION, abs_tol=_MAX_DEVIATION * step)
 
 
-def range_of(
+def checked_range(
     name: str, number: int, minimum: float | None, maximum: float | None, step: float | None
 ) -> tuple[float | None, float | None, float | None]:
-    """Return a declared range: both bounds, or neither.
+    """Return minimum, maximum and step of a declared range; without a range all are None.
 
     Raises:
         ConfigurationError: a bound is not valid, or the range is empty.
     """
     if minimum is None and maximum is None and step is None:
         return None, None, None
-    if number not in _NUMBERS:
+    if number not in _NUMBER_TYPES:
         raise ConfigurationError(
             f"parameter {name!r}: {TYPES[number]} has no range: expected integer or double"
         )
@@ -159,11 +161,11 @@ def range_of(
             f"parameter {name!r}: step {step}: expected a number above 0, and a minimum"
         )
     if number == INTEGER:
-        given = [bound for bound in (first, last, step) if bound is not None]
-        wrong = [bound for bound in given if not _is_int64(bound)]
-        if wrong:
+        value = [bound for bound in (first, last, step) if bound is not None]
+        too_large = [bound for bound in value if not _is_int64(bound)]
+        if too_large:
             raise ConfigurationError(
-                f"parameter {name!r}: a range of {wrong[0]}: expected whole numbers of 64 bits"
+                f"parameter {name!r}: a range of {too_large[0]}: expected whole numbers of 64 bits"
             )
     else:
         first, last, step = float(first), float(last), None if step is None else float(step)
@@ -192,7 +194,7 @@ def type_name(number: int) -> str:
 
 
 class Typed(NamedTuple):
-    """A value with the number of its type; None if it is not set. Arrays are tuples."""
+    """A value with the number of its type. Arrays are tuples; a value that is not set is None."""
 
     number: int
     value: Any
@@ -206,69 +208,69 @@ class Typed(NamedTuple):
         return f"{self.type} {self.value!r:.80}"
 
 
-def typed(name: str, given: object, declared: int = NOT_SET) -> Typed:
+def typed_value(name: str, value: object, declared: int = NOT_SET) -> Typed:
     """Return a value with its type.
 
     Args:
         name: name of the parameter, for texts.
-        given: a value of Python or numpy, or a :class:`Typed` value.
+        value: a value of Python or numpy, or a :class:`Typed` value.
         declared: number of the type of a list without elements.
 
     Raises:
         ConfigurationError: the value cannot be a parameter.
     """
-    if isinstance(given, Typed):
-        return given
-    if isinstance(given, np.ndarray | np.generic):
-        given = given.tolist()
-    if isinstance(given, list | tuple):
-        return _array(name, given, declared)
-    number = _number_of(type(given))
+    if isinstance(value, Typed):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return _typed_array(name, value, declared)
+    number = _type_number(type(value))
     if number == NOT_SET:
         raise ConfigurationError(
-            f"parameter {name!r}: got {type(given).__name__}, expected bool, int, float, str, "
+            f"parameter {name!r}: got {type(value).__name__}, expected bool, int, float, str, "
             "bytes, or a list of bool, int, float or str"
         )
-    _check_elements(name, number, (given,))
-    return Typed(number, _PLAIN[number](given))
+    _check_elements(name, number, (value,))
+    return Typed(number, _PYTHON_TYPES[number](value))
 
 
-def _array(name: str, given: Sequence[Any], declared: int) -> Typed:
-    if not given:
+def _typed_array(name: str, value: Sequence[Any], declared: int) -> Typed:
+    if not value:
         if declared < BYTES:
             raise ConfigurationError(
                 f"parameter {name!r}: a list without elements: expected its type, too"
             )
         return Typed(declared, b"" if declared == BYTES else ())
-    numbers = {_number_of(kind) for kind in set(map(type, given))}
+    numbers = {_type_number(kind) for kind in set(map(type, value))}
     number = numbers.pop()
     if numbers or not BOOL <= number <= STRING:
-        names = sorted({type(value).__name__ for value in given})
+        names = sorted({type(value).__name__ for value in value})
         raise ConfigurationError(
             f"parameter {name!r}: expected a list of bool, of int, of float or of str, got "
             f"{', '.join(names)}"
         )
-    _check_elements(name, number, given)
-    return Typed(number + _TO_ARRAY, tuple(map(_PLAIN[number], given)))
+    _check_elements(name, number, value)
+    return Typed(number + _ARRAY_OFFSET, tuple(map(_PYTHON_TYPES[number], value)))
 
 
-_PLAIN: Final[dict[int, Callable[[Any], Any]]] = {
+_PYTHON_TYPES: Final[dict[int, Callable[[Any], Any]]] = {
     BOOL: bool, INTEGER: int, DOUBLE: float, STRING: str, BYTES: bytes,
 }  # fmt: skip
 
 
-def _number_of(kind: type) -> int:
+def _type_number(python_type: type) -> int:
     for number, type_ in ((BOOL, bool), (INTEGER, int), (DOUBLE, float), (STRING, str)):
-        if issubclass(kind, type_):
+        if issubclass(python_type, type_):
             return number
-    return BYTES if issubclass(kind, bytes | bytearray) else NOT_SET
+    return BYTES if issubclass(python_type, bytes | bytearray) else NOT_SET
 
 
-def _check_elements(name: str, number: int, given: Sequence[Any]) -> None:
-    if number == INTEGER and not (_is_int64(min(given)) and _is_int64(max(given))):
+def _check_elements(name: str, number: int, value: Sequence[Any]) -> None:
+    if number == INTEGER and not (_is_int64(min(value)) and _is_int64(max(value))):
         raise ConfigurationError(f"parameter {name!r}: expected integers of 64 bits")
     if number == STRING:
-        text = "".join(given)
+        text = "".join(value)
         try:
             text.encode()
         except UnicodeEncodeError as exc:

@@ -14,8 +14,8 @@ from smartcam.ros2._node.parameter_values import (
     TYPES,
     ParameterDescription,
     Typed,
-    range_of,
-    typed,
+    checked_range,
+    typed_value,
 )
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 SET_TIMEOUT = 10.0
-"""Seconds of a hook's timeout, and of a set's wait for earlier sets."""
+"""Seconds that a hook may take, and that a set may wait for earlier sets."""
 
 MAX_VALUE_SIZE = 1 << 16
 """Largest number of characters, bytes or elements of a value."""
@@ -45,8 +45,8 @@ class _Declared:
     ) -> None:
         self.description, self.value, self.on_set = description, value, on_set
 
-    def fitting(self, given: object, *, by_node: bool = False) -> Typed:
-        """Return a value with its type, after checking that the parameter can have it.
+    def checked_value(self, value: object, *, by_node: bool = False) -> Typed:
+        """Return a value with its type; ``by_node`` allows it for a read-only parameter.
 
         Raises:
             ConfigurationError: the value is of another type or out of range, or is read-only.
@@ -54,9 +54,9 @@ class _Declared:
         name = self.description.name
         if self.description.read_only and not by_node:
             raise ConfigurationError(f"parameter {name!r} cannot be set: it is read-only")
-        if given is None or (isinstance(given, Typed) and given.value is None):
+        if value is None or (isinstance(value, Typed) and value.value is None):
             raise ConfigurationError(f"parameter {name!r} cannot be unset: it is {self.value.type}")
-        value = typed(name, given, self.value.number)
+        value = typed_value(name, value, self.value.number)
         if value.number != self.value.number:
             raise ConfigurationError(
                 f"parameter {name!r} is {self.value.type}, it cannot be set to {value}"
@@ -89,7 +89,7 @@ class RosParameters:
     Args:
         node: node of the parameters.
         served: whether other nodes can use the parameters.
-        timeout: seconds of the timeout of one ``on_set``, and of a set's wait for earlier sets.
+        timeout: seconds that one ``on_set`` may take, and that a set may wait for earlier sets.
     """
 
     def __init__(
@@ -97,8 +97,8 @@ class RosParameters:
     ) -> None:
         self._node, self._timeout = node, timeout
         self._declared: dict[str, _Declared] = {}
-        self._turn = asyncio.Lock()
-        self._setting: asyncio.Task[Any] | None = None  # task that sets parameters now
+        self._lock = asyncio.Lock()
+        self._setting_task: asyncio.Task[Any] | None = None  # task that sets parameters now
         self._tasks: set[asyncio.Task[Any]] = set()
         self._services = ParameterServices(node, self) if served else None
         self.declare(
@@ -168,14 +168,16 @@ class RosParameters:
                 f"parameter {name!r}: type {type!r}: expected one of {', '.join(TYPES[1:])}"
                 f"{did_you_mean(type, TYPES)}"
             )
-        first = typed(name, value, TYPES.index(type) if type else 0)
+        first = typed_value(name, value, TYPES.index(type) if type else 0)
         if type and first.type != type:
             raise ConfigurationError(f"parameter {name!r}: expected {type}, got {first}")
-        bounds = range_of(name, first.number, minimum, maximum, step)
-        described = ParameterDescription(name, first.type, description, read_only, *bounds)
-        made = _Declared(described, first, on_set)
-        made.fitting(first, by_node=True)
-        self._declared[name] = made
+        bounds = checked_range(name, first.number, minimum, maximum, step)
+        parameter_description = ParameterDescription(
+            name, first.type, description, read_only, *bounds
+        )
+        declared = _Declared(parameter_description, first, on_set)
+        declared.checked_value(first, by_node=True)
+        self._declared[name] = declared
         self._notify(new=[name])
 
     def undeclare(self, name: str) -> None:
@@ -184,9 +186,9 @@ class RosParameters:
         Raises:
             ConfigurationError: there is no parameter of this name.
         """
-        gone = self._of(name)
+        parameter = self._get_declared(name)
         del self._declared[name]
-        self._notify(deleted={name: gone.value})
+        self._notify(deleted={name: parameter.value})
 
     def names(self) -> list[str]:
         """Return the names, in the order of their declaration."""
@@ -198,7 +200,7 @@ class RosParameters:
         Raises:
             ConfigurationError: there is no parameter of this name.
         """
-        return self._of(name).value.value
+        return self._get_declared(name).value.value
 
     def describe(self, name: str) -> ParameterDescription:
         """Return the description of a parameter.
@@ -206,14 +208,14 @@ class RosParameters:
         Raises:
             ConfigurationError: there is no parameter of this name.
         """
-        return self._of(name).description
+        return self._get_declared(name).description
 
     def find(self, name: str) -> Typed | None:
         """Return a value with its type; None if there is no parameter of this name."""
         parameter = self._declared.get(name)
         return None if parameter is None else parameter.value
 
-    def _of(self, name: str) -> _Declared:
+    def _get_declared(self, name: str) -> _Declared:
         parameter = self._declared.get(name)
         if parameter is None:
             raise ConfigurationError(
@@ -230,10 +232,10 @@ class RosParameters:
         Raises:
             ConfigurationError: there is no parameter of this name, or it cannot have the value.
         """
-        declared = self._of(name)
-        fitted = declared.fitting(value, by_node=True)
-        if fitted != declared.value:
-            declared.value = fitted
+        declared = self._get_declared(name)
+        new_value = declared.checked_value(value, by_node=True)
+        if new_value != declared.value:
+            declared.value = new_value
             self._notify(changed=[name])
 
     async def set(self, name: str, value: object) -> None:
@@ -258,65 +260,67 @@ class RosParameters:
 
         Cancellation: like a failed ``on_set``.
         """
-        if self._setting is not None and self._setting is asyncio.current_task():
+        if self._setting_task is not None and self._setting_task is asyncio.current_task():
             raise RosError(f"{', '.join(values):.80}: an on_set cannot set parameters")
         try:
             async with asyncio.timeout(self._timeout):
-                await self._turn.acquire()
+                await self._lock.acquire()
         except TimeoutError:
             raise RosError(
                 f"{', '.join(values):.80}: other sets took more than {self._timeout:g} s"
             ) from None
-        self._setting = asyncio.current_task()
+        self._setting_task = asyncio.current_task()
         try:
-            await self._set_now(values)
+            await self._set_locked(values)
         finally:
-            self._setting = None
-            self._turn.release()
+            self._setting_task = None
+            self._lock.release()
 
-    async def carry_out(self, values: Mapping[str, object]) -> None:
-        """Set like :meth:`set_all`, to the end even if the caller is cancelled."""
+    async def set_shielded(self, values: Mapping[str, object]) -> None:
+        """Do :meth:`set_all` to its end, even if the caller is cancelled."""
         task = asyncio.get_running_loop().create_task(self.set_all(values))
         self._tasks.add(task)
-        task.add_done_callback(self._ended)
+        task.add_done_callback(self._on_task_done)
         await asyncio.shield(task)
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
+    def _on_task_done(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         if not task.cancelled():
             task.exception()  # the caller may have been cancelled
 
-    async def _set_now(self, values: Mapping[str, object]) -> None:
+    async def _set_locked(self, values: Mapping[str, object]) -> None:
         changes = []
         for name, value in values.items():
-            declared = self._of(name)
-            changes.append(_ParameterChange(declared, declared.value, declared.fitting(value)))
-        done: list[_ParameterChange] = []
+            declared = self._get_declared(name)
+            changes.append(
+                _ParameterChange(declared, declared.value, declared.checked_value(value))
+            )
+        applied: list[_ParameterChange] = []
         try:
             for change in changes:
-                await self._call(change.declared, change.new)
-                done.append(change)
+                await self._call_hook(change.declared, change.new)
+                applied.append(change)
         except BaseException as exc:
-            await self._take_back(done, exc)
+            await self._undo_changes(applied, exc)
             raise
         for change in changes:
             change.declared.value = change.new
         self._notify(changed=[name for name in values if name in self._declared])
 
-    async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
+    async def _undo_changes(self, applied: list[_ParameterChange], error: BaseException) -> None:
         """Undo changes; a change that cannot be undone stays, and is published and logged."""
-        for change in reversed(done):
+        for change in reversed(applied):
             name = change.declared.description.name
             try:
-                await self._call(change.declared, change.old)
+                await self._call_hook(change.declared, change.old)
             except SmartCamError as exc:
                 change.declared.value = change.new
                 text = f"parameter {name!r} stays {change.new}: it was not taken back: {exc}"
                 logger.error("%s ! %s", self._node.full_name, text)  # noqa: TRY400 - it is said
-                why.add_note(text)
+                error.add_note(text)
                 self._notify(changed=[name])
 
-    async def _call(self, declared: _Declared, value: Typed) -> None:
+    async def _call_hook(self, declared: _Declared, value: Typed) -> None:
         """Call the hook with a value.
 
         Raises:
@@ -329,9 +333,9 @@ class RosParameters:
         deadline = asyncio.timeout(self._timeout)
         try:
             async with deadline:
-                made = declared.on_set(value.value)
-                if inspect.isawaitable(made):
-                    await made
+                outcome = declared.on_set(value.value)
+                if inspect.isawaitable(outcome):
+                    await outcome
         except SmartCamError:
             raise
         except Exception as exc:
@@ -345,7 +349,7 @@ class RosParameters:
 
     def _notify(self, **changes: Any) -> None:
         if self._services is not None:
-            self._services.tell(**changes)
+            self._services.publish_event(**changes)
 
 
 def _refuse_sim_time(value: bool) -> None:

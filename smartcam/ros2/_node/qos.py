@@ -30,7 +30,7 @@ class QoS:
     Attributes:
         reliable: ``False`` for best effort.
         latched: transient local: a later subscriber gets the last ``depth`` messages.
-        depth: number of kept messages, None for all: then the publisher waits.
+        depth: number of kept messages; None keeps all, and the publisher waits for subscribers.
         lifespan: seconds after which a message is no longer delivered.
 
     Raises:

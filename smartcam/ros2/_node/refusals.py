@@ -1,13 +1,13 @@
 """Answer a refused call, so that its caller does not wait forever.
 
 rmw_zenoh drops error replies, so its clients would wait forever. A refusal is therefore an ordinary
-response, if the type can express it. Many types have fields for a refusal: ``success`` and a text,
-or an ``error``. Services of ROS that return lists return an empty list, as rclcpp does if a
+response if the service's type can express it: many types have a field ``success`` with a text, or a
+field ``error``. ROS' own services that return lists return an empty list, as rclcpp does if a
 parameter is not declared.
 
-A response of any other type, such as a sum, would be a lie. A call of such a type waits until it
-can be carried out. If its request is not valid, it gets an error reply, and rmw_zenoh's client
-waits forever, as for any node of ROS.
+A response of any other type, such as a sum, would be wrong. A call of such a service waits until it
+can be carried out. If its request is not valid, the call gets an error reply, and a client of
+rmw_zenoh waits forever, as with any node of ROS.
 """
 
 from __future__ import annotations
@@ -20,48 +20,54 @@ if TYPE_CHECKING:
 MAX_REASON_CHARACTERS: Final = 1000
 """Largest number of characters of the reason in an answer; a longer one is cut."""
 
-FLAGS: Final = ("success", "successful")
+SUCCESS_FIELDS: Final = ("success", "successful")
 """Names of fields that are true if the call was carried out."""
 
-TEXTS: Final = (
+REASON_FIELDS: Final = (
     *("error", "error_message", "failure_reason", "message", "reason", "status_message"),
 )
 """Names of fields for the reason of a refusal."""
 
-LISTING: Final = ("composition_interfaces", "lifecycle_msgs", "rcl_interfaces")
+LIST_PACKAGES: Final = ("composition_interfaces", "lifecycle_msgs", "rcl_interfaces")
 """Packages in whose answers an empty list means that nothing is known."""
 
 UNKNOWN_STATE: Final = {"id": 0, "label": "unknown"}
 """The unknown state of a life cycle, in the form of ``lifecycle_msgs/msg/State``."""
 
 
-def refusal(kind: ServiceType, why: str, types: RosTypes) -> Any:
-    """Return the response that refuses a call; None if the type has none.
+def refusal_response(service_type: ServiceType, reason: str, types: RosTypes) -> Any:
+    """Return the response that refuses a call; None if the type has no such response.
 
     Args:
-        kind: type of the service.
-        why: reason as a text.
+        service_type: type of the service.
+        reason: reason as a text.
         types: types of the nested messages.
     """
-    text = why[:MAX_REASON_CHARACTERS].replace("\0", "\ufffd").encode(errors="replace").decode()
-    fields = _refused(kind.response, text, types)
-    return None if fields is None else kind.response.new(**fields)
+    text = reason[:MAX_REASON_CHARACTERS].replace("\0", "\ufffd").encode(errors="replace").decode()
+    fields = _refusal_fields(service_type.response, text, types)
+    return None if fields is None else service_type.response.new(**fields)
 
 
-def _refused(kind: MessageType, why: str, types: RosTypes) -> dict[str, Any] | None:
-    plain = {field.name: field.type for field in kind.fields if not field.shape}
-    flags = {name: False for name in FLAGS if plain.get(name) == "bool"}
-    texts = {name: why for name in TEXTS if plain.get(name) == "string"}
+def _refusal_fields(
+    message_type: MessageType, reason: str, types: RosTypes
+) -> dict[str, Any] | None:
+    types_of_single_fields = {
+        field.name: field.type for field in message_type.fields if not field.shape
+    }
+    flags = {name: False for name in SUCCESS_FIELDS if types_of_single_fields.get(name) == "bool"}
+    texts = {name: reason for name in REASON_FIELDS if types_of_single_fields.get(name) == "string"}
     if flags or "error" in texts:
         return flags | texts
-    if kind.name == "lifecycle_msgs/srv/GetState_Response":
+    if message_type.name == "lifecycle_msgs/srv/GetState_Response":
         return {"current_state": UNKNOWN_STATE}
-    if len(kind.fields) == 1 and kind.fields[0].nested:
-        field = kind.fields[0]
-        within = _refused(types.message(field.type), why, types)
-        if within:
-            return {field.name: [within] if field.shape else within}
-        if within is not None and not field.shape:
+    if len(message_type.fields) == 1 and message_type.fields[0].nested:
+        field = message_type.fields[0]
+        nested_fields = _refusal_fields(types.message(field.type), reason, types)
+        if nested_fields:
+            return {field.name: [nested_fields] if field.shape else nested_fields}
+        if nested_fields is not None and not field.shape:
             return {}
-    lists = bool(kind.fields) and all(field.shape == "sequence" for field in kind.fields)
-    return {} if lists and kind.name.startswith(LISTING) else None
+    has_only_lists = bool(message_type.fields) and all(
+        field.shape == "sequence" for field in message_type.fields
+    )
+    return {} if has_only_lists and message_type.name.startswith(LIST_PACKAGES) else None

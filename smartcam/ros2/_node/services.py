@@ -22,9 +22,9 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.ros2._node.attachment import Attachment
-from smartcam.ros2._node.refusals import refusal
+from smartcam.ros2._node.refusals import refusal_response
 from smartcam.ros2._node.tokens import CLIENT, SERVICE
-from smartcam.ros2._node.topics import RosEnd, message_of
+from smartcam.ros2._node.topics import RosEndpoint, message_or_fields
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_CONCURRENT_CALLS = 64
-"""Largest number of calls of a service that are carried out at the same time; further ones are
-refused, or wait."""
+"""Largest number of calls of a service that run at the same time. Further calls are refused; they
+wait if the service's answers have no fields for a refusal."""
 
 MAX_WAITING_CALLS = 256
 """Largest number of waiting calls of a service whose answers have no fields for a refusal."""
@@ -56,7 +56,7 @@ class _RequestedCall(NamedTuple):
     attachment: Attachment
 
 
-class RosService(RosEnd):
+class RosService(RosEndpoint):
     """A service of a node; created by :meth:`Node.serve`.
 
     Attributes:
@@ -69,13 +69,13 @@ class RosService(RosEnd):
         self,
         context: RosContext,
         entity: Entity,
-        kind: ServiceType,
+        service_type: ServiceType,
         handler: Callable[[Any], Awaitable[Any]],
         timeout: float,
-        on_close: Callable[[RosEnd], None],
+        on_close: Callable[[RosEndpoint], None],
     ) -> None:
         super().__init__(context, entity, on_close)
-        self.type: ServiceType = kind
+        self.type: ServiceType = service_type
         self.calls: int = 0
         self.failed: int = 0
         self._handler, self._timeout = handler, timeout
@@ -85,44 +85,44 @@ class RosService(RosEnd):
 
         def on_query(query: Any) -> None:
             data = b"" if query.payload is None else query.payload.to_bytes()
-            extra = None if query.attachment is None else query.attachment.to_bytes()
-            zenoh.in_loop(self._take, 0, query, data, extra)
+            attachment_bytes = None if query.attachment is None else query.attachment.to_bytes()
+            zenoh.in_loop(self._on_request, 0, query, data, attachment_bytes)
 
         self._declare(
             lambda session: session.declare_queryable(entity.key, direct(on_query), complete=True)
         )
-        self._appear()
-        self._stop_listening = context.watch(self.name, CLIENT, self._on_graph)
+        self._declare_token()
+        self._stop_listening = context.watch_endpoints(self.name, CLIENT, self._on_client)
 
-    def _take(self, query: Any, data: bytes, extra: bytes | None) -> None:
+    def _on_request(self, query: Any, data: bytes, attachment_bytes: bytes | None) -> None:
         self.calls += 1
         try:
-            attachment = Attachment.decode(extra)
+            attachment = Attachment.decode(attachment_bytes)
         except RosError as exc:
             self._fail(query, exc)
             return
         call = _RequestedCall(query, data, attachment)
-        full = len(self._tasks) >= MAX_CONCURRENT_CALLS
+        is_full = len(self._tasks) >= MAX_CONCURRENT_CALLS
         if self._closed:
             self._refuse(call, RosError("the service is closed"))
         elif len(data) > MAX_REQUEST_BYTES:
-            why = f"a request of {len(data)} bytes: expected {MAX_REQUEST_BYTES} at most"
-            self._refuse(call, RosMessageError(why))
-        elif full and not self._can_refuse and len(self._waiting) < MAX_WAITING_CALLS:
+            reason = f"a request of {len(data)} bytes: expected {MAX_REQUEST_BYTES} at most"
+            self._refuse(call, RosMessageError(reason))
+        elif is_full and not self._can_refuse and len(self._waiting) < MAX_WAITING_CALLS:
             self._waiting.append(call)
-        elif full:
+        elif is_full:
             self._refuse(
                 call,
                 RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most"),
             )
         else:
-            self._begin(call)
+            self._start_call(call)
 
     @property
     def _can_refuse(self) -> bool:
-        return refusal(self.type, "", self._context.types) is not None
+        return refusal_response(self.type, "", self._context.types) is not None
 
-    def _begin(self, call: _RequestedCall) -> None:
+    def _start_call(self, call: _RequestedCall) -> None:
         try:
             request = self.type.request.decode(call.data)
         except RosError as exc:
@@ -130,24 +130,24 @@ class RosService(RosEnd):
             return
         task = asyncio.get_running_loop().create_task(self._serve(call, request))
         self._tasks[task] = call.attachment.gid
-        task.add_done_callback(self._done)
+        task.add_done_callback(self._on_call_done)
 
-    def _done(self, task: asyncio.Task[None]) -> None:
+    def _on_call_done(self, task: asyncio.Task[None]) -> None:
         del self._tasks[task]
         while self._waiting and len(self._tasks) < MAX_CONCURRENT_CALLS:
-            self._begin(self._waiting.popleft())
+            self._start_call(self._waiting.popleft())
 
     async def _serve(self, call: _RequestedCall, request: object) -> None:
         try:
             async with asyncio.timeout(self._timeout):
                 reply = await self._handler(request)
-            data = self.type.response.encode(message_of(reply, {}))
+            data = self.type.response.encode(message_or_fields(reply, {}))
         except asyncio.CancelledError:
             self._refuse(call, RosError("the call was cancelled"))
             raise
         except TimeoutError as exc:
-            why = exc if isinstance(exc, SmartCamError) else f"no answer in {self._timeout:g} s"
-            self._refuse(call, RosError(str(why)))
+            reason = exc if isinstance(exc, SmartCamError) else f"no answer in {self._timeout:g} s"
+            self._refuse(call, RosError(str(reason)))
         except SmartCamError as exc:
             self._refuse(call, exc)
         except ENDS_PROGRAM:
@@ -162,27 +162,27 @@ class RosService(RosEnd):
         attachment = call.attachment._replace(time=time.time_ns()).encode()
         self._context.zenoh.reply(call.query, [(self.entity.key, data)], attachment=attachment)
 
-    def _refuse(self, call: _RequestedCall, why: SmartCamError) -> None:
+    def _refuse(self, call: _RequestedCall, reason: SmartCamError) -> None:
         """Answer by a response with the reason, or by an error if the type has no field for it."""
-        answer = refusal(self.type, f"{self.name}: {why}", self._context.types)
+        answer = refusal_response(self.type, f"{self.name}: {reason}", self._context.types)
         if answer is None:
-            self._fail(call.query, why)
+            self._fail(call.query, reason)
             return
         self.failed += 1
-        logger.warning("%s ! a call was refused: %s", self.name, why)
+        logger.warning("%s ! a call was refused: %s", self.name, reason)
         self._reply(call, self.type.response.encode(answer))
 
-    def _fail(self, query: Any, why: SmartCamError) -> None:
+    def _fail(self, query: Any, reason: SmartCamError) -> None:
         self.failed += 1
-        logger.warning("%s ! a call had no reply: %s", self.name, why)
-        self._context.zenoh.refuse(query, f"{self.name}: {why}")
+        logger.warning("%s ! a call had no reply: %s", self.name, reason)
+        self._context.zenoh.refuse(query, f"{self.name}: {reason}")
 
-    def _on_graph(self, entity: Entity, present: bool) -> None:
+    def _on_client(self, entity: Entity, present: bool) -> None:
         """Cancel the calls of a lost client."""
         if present:
             return
-        left = [call for call in self._waiting if call.attachment.gid != entity.gid]
-        self._waiting = collections.deque(left)
+        remaining = [call for call in self._waiting if call.attachment.gid != entity.gid]
+        self._waiting = collections.deque(remaining)
         for task, gid in self._tasks.items():
             if gid == entity.gid:
                 task.cancel()
@@ -204,7 +204,7 @@ class RosService(RosEnd):
             await asyncio.wait(tuple(self._tasks))
 
 
-class RosClient(RosEnd):
+class RosClient(RosEndpoint):
     """Calls a service; created by :meth:`Node.client`.
 
     Attributes:
@@ -215,11 +215,11 @@ class RosClient(RosEnd):
         self,
         context: RosContext,
         entity: Entity,
-        kind: ServiceType,
-        on_close: Callable[[RosEnd], None],
+        service_type: ServiceType,
+        on_close: Callable[[RosEndpoint], None],
     ) -> None:
         super().__init__(context, entity, on_close)
-        self.type: ServiceType = kind
+        self.type: ServiceType = service_type
         self._number = 0
         self._waiting: set[asyncio.Future[Any]] = set()
         self._querier: Any = None
@@ -236,13 +236,13 @@ class RosClient(RosEnd):
             return self._querier
 
         self._declare(declare)
-        self._appear()
+        self._declare_token()
 
     @property
     def served(self) -> bool:
         """True if there is a server, as far as is known."""
         ends = self._context.graph.ends(self.name, SERVICE)
-        return not self._closed and any(end.key == self.entity.key for end in ends)
+        return not self._closed and any(set_error.key == self.entity.key for set_error in ends)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
         """Wait until there is a server.
@@ -258,7 +258,9 @@ class RosClient(RosEnd):
                     self._check_open()
                     await asyncio.sleep(SERVER_POLL_INTERVAL)
         except TimeoutError as exc:
-            others = [end.ros_type for end in self._context.graph.ends(self.name, SERVICE)]
+            others = [
+                set_error.ros_type for set_error in self._context.graph.ends(self.name, SERVICE)
+            ]
             others_text = f", but one for {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
                 f"{self.name}: no server for {self.type.name} {self.type.hash} within "
@@ -287,14 +289,14 @@ class RosClient(RosEnd):
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
-        data = self.type.request.encode(message_of(request, fields))
+        data = self.type.request.encode(message_or_fields(request, fields))
         await self.wait_served(timeout)
         self._number += 1
         attachment = Attachment(self._number, time.time_ns(), self.entity.gid)
         reply: asyncio.Future[bytes] = loop.create_future()
         self._waiting.add(reply)
         try:
-            self._ask(data, attachment, reply)
+            self._send_request(data, attachment, reply)
             async with asyncio.timeout_at(deadline):
                 reply_data = await reply
         except TimeoutError as exc:
@@ -307,38 +309,42 @@ class RosClient(RosEnd):
             self._waiting.discard(reply)
         return self.type.response.decode(reply_data)
 
-    def _ask(self, data: bytes, attachment: Attachment, reply: asyncio.Future[bytes]) -> None:
+    def _send_request(
+        self, data: bytes, attachment: Attachment, reply: asyncio.Future[bytes]
+    ) -> None:
         zenoh = self._context.zenoh
         refused: list[str] = []
-        came = False
+        has_reply = False
 
-        def take(reply_data: bytes) -> None:
+        def set_reply(reply_data: bytes) -> None:
             if not reply.done():
                 reply.set_result(reply_data)
 
-        def end() -> None:
+        def set_error() -> None:
             if not reply.done():
-                why = (
+                reason = (
                     refused[0]
                     if refused
                     else ("the call ended without a reply; whether it was carried out is unknown")
                 )
-                reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
+                reply.set_exception(ServiceCallError(f"{self.name}: {reason}", service=self.name))
 
         def on_reply(answer: Any) -> None:
-            nonlocal came
+            nonlocal has_reply
             if answer.ok is None:
                 refused.append(answer.err.payload.to_bytes()[:1000].decode(errors="replace"))
                 return
-            extra = None if answer.ok.attachment is None else answer.ok.attachment.to_bytes()
-            if self._is_for(attachment, extra):
-                came = True
+            attachment_bytes = (
+                None if answer.ok.attachment is None else answer.ok.attachment.to_bytes()
+            )
+            if self._is_reply_to(attachment, attachment_bytes):
+                has_reply = True
                 payload = answer.ok.payload.to_bytes()
-                zenoh.in_loop(take, len(payload), payload)
+                zenoh.in_loop(set_reply, len(payload), payload)
 
         def on_end() -> None:
-            if not came:  # after a reply the loop need not be woken again
-                zenoh.in_loop(end, 0)
+            if not has_reply:  # after a reply, the event loop has been woken already
+                zenoh.in_loop(set_error, 0)
 
         self._querier.get(
             direct(on_reply, on_end),
@@ -346,14 +352,14 @@ class RosClient(RosEnd):
             attachment=attachment.encode(),
         )
 
-    def _is_for(self, wanted: Attachment, extra: bytes | None) -> bool:
+    def _is_reply_to(self, request: Attachment, attachment_bytes: bytes | None) -> bool:
         """Return True if a reply answers this call; called in a thread of the engine."""
         try:
-            attachment = Attachment.decode(extra)
+            attachment = Attachment.decode(attachment_bytes)
         except RosMessageError as exc:
             logger.warning("%s ! a reply was ignored: %s", self.name, exc)
             return False
-        if (attachment.number, attachment.gid) == (wanted.number, wanted.gid):
+        if (attachment.number, attachment.gid) == (request.number, request.gid):
             return True
         logger.warning("%s ! a reply to another call was ignored: %s", self.name, attachment)
         return False

@@ -24,10 +24,10 @@ SERVICE: Final = "SS"
 CLIENT: Final = "SC"
 KINDS: Final = (NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT)
 
-_NODE_PARTS, _ENDPOINT_PARTS = {9}, {13, 14}  # newer ones may have backends of buffers, too
+_NODE_PARTS, _ENDPOINT_PARTS = {9}, {13, 14}  # the 14th, in newer tokens, names buffer backends
 
 
-def pattern(domain: int) -> str:
+def token_pattern(domain: int) -> str:
     """Return the pattern of all tokens of a domain."""
     return f"{ADMIN}/{domain}/**"
 
@@ -67,15 +67,15 @@ class Entity:
     def token(self) -> str:
         """The entity's liveliness token."""
         parts = [ADMIN, str(self.domain), self.zid, str(self.node_id), str(self.id), self.kind]
-        parts += [_mangled(part) for part in (self.enclave, self.namespace, self.node)]
+        parts += [_mangle(part) for part in (self.enclave, self.namespace, self.node)]
         if self.kind != NODE:
-            parts += [_mangled(part) for part in (self.name, self.type, self.hash)]
+            parts += [_mangle(part) for part in (self.name, self.type, self.hash)]
             parts.append(self.qos.encode())
         return "/".join(parts)
 
     @cached_property
     def gid(self) -> bytes:
-        """The entity's 16 bytes in attachments: a hash of the token."""
+        """The entity's GID in attachments, 16 bytes: a hash of the token."""
         return gid_of(self.token)
 
     @property
@@ -101,20 +101,20 @@ class Entity:
             ValueError: the token is not valid; the text has the expected form.
         """
         parts = token.split("/")
-        wanted = _NODE_PARTS if parts[5:6] == [NODE] else _ENDPOINT_PARTS
-        if len(parts) not in wanted or parts[0] != ADMIN or parts[5] not in KINDS:
+        allowed_counts = _NODE_PARTS if parts[5:6] == [NODE] else _ENDPOINT_PARTS
+        if len(parts) not in allowed_counts or parts[0] != ADMIN or parts[5] not in KINDS:
             raise ValueError(
                 f"token {token!r:.200}: expected {ADMIN}/DOMAIN/ZID/NODE/ID/KIND/..., KIND one of "
                 f"{' '.join(KINDS)}, of 9 parts for a node and 13 else"
             )
         domain, zid, node_id, number = int(parts[1]), parts[2], int(parts[3]), int(parts[4])
-        enclave, namespace, node = (_demangled(part) for part in parts[6:9])
-        made = cls(parts[5], domain, zid, node_id, number, namespace, node, enclave=enclave)  # type: ignore[arg-type]
-        if made.kind == NODE:
-            return made
-        name, kind, hashed = (_demangled(part) for part in parts[9:12])
+        enclave, namespace, node = (_demangle(part) for part in parts[6:9])
+        entity = cls(parts[5], domain, zid, node_id, number, namespace, node, enclave=enclave)  # type: ignore[arg-type]
+        if entity.kind == NODE:
+            return entity
+        name, type_name, type_hash = (_demangle(part) for part in parts[9:12])
         return cls(
-            made.kind,
+            entity.kind,
             domain,
             zid,
             node_id,
@@ -122,8 +122,8 @@ class Entity:
             namespace,
             node,
             name,
-            kind,
-            hashed,
+            type_name,
+            type_hash,
             QoS.decode(parts[12]),
             enclave,
         )
@@ -137,9 +137,9 @@ def gid_of(token: str) -> bytes:
     return struct.pack("<QQ", value & 0xFFFFFFFFFFFFFFFF, value >> 64)
 
 
-def _mangled(text: str) -> str:
+def _mangle(text: str) -> str:
     return text.replace("/", "%")
 
 
-def _demangled(text: str) -> str:
+def _demangle(text: str) -> str:
     return text.replace("%", "/")

@@ -23,11 +23,11 @@ class TopicReader(ABC, Generic[Item]):
     """Subscription to a topic, read by ``async for``.
 
     Messages wait in a queue, which drops the oldest if it is full. A message that cannot be decoded
-    is left out and counted, and the first one is logged.
+    is left out and counted; the first such message is logged.
 
     Args:
         topic: absolute name of the topic.
-        kind: type of the messages.
+        message_type: type of the messages.
         depth: largest number of waiting messages.
         max_bytes: largest number of bytes of all waiting messages.
 
@@ -39,9 +39,9 @@ class TopicReader(ABC, Generic[Item]):
     _logger: ClassVar[logging.Logger] = logging.getLogger("smartcam.ros2")
 
     def __init__(
-        self, topic: str, kind: MessageType, depth: int, max_bytes: int = sys.maxsize
+        self, topic: str, message_type: MessageType, depth: int, max_bytes: int = sys.maxsize
     ) -> None:
-        self.type: MessageType = kind
+        self.type: MessageType = message_type
         self.rejected: int = 0
         self._topic = topic
         self._queue = Subscription[Item](
@@ -49,7 +49,7 @@ class TopicReader(ABC, Generic[Item]):
         )
 
     @abstractmethod
-    def _read(self, item: Item) -> Any:
+    def _decode_item(self, item: Item) -> Any:
         """Return the message of an item of the queue.
 
         Raises:
@@ -67,11 +67,11 @@ class TopicReader(ABC, Generic[Item]):
         while True:
             item = await anext(self._queue)
             try:
-                return self._read(item)
+                return self._decode_item(item)
             except RosMessageError as exc:
                 self._reject(exc)
 
-    def _reject(self, why: RosMessageError) -> None:
+    def _reject(self, error: RosMessageError) -> None:
         self.rejected += 1
         level = logging.DEBUG if self.rejected > 1 else logging.WARNING
-        self._logger.log(level, "%s ! %s; such messages are left out", self._topic, why)
+        self._logger.log(level, "%s ! %s; such messages are left out", self._topic, error)

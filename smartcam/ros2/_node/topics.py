@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_DIRECT_BYTES = 1 << 16
-"""Bytes beyond which a thread sends a message, and waits until the engine has taken it."""
+"""Largest message in bytes that the event loop sends; a thread sends larger ones, and may wait."""
 
 MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes of a topic's messages that wait to be sent, or to be read."""
 
 
-def message_of(message: object, fields: dict[str, Any]) -> object:
+def message_or_fields(message: object, fields: dict[str, Any]) -> object:
     """Return the message to send, or its fields if no message is given."""
     if message is not None and fields:
         raise RosMessageError("expected a message or its fields, got both")
@@ -45,13 +45,13 @@ def message_of(message: object, fields: dict[str, Any]) -> object:
 
 
 MAX_SHORT_MESSAGES = 10_000
-"""Largest number of waiting short messages of a topic; for long ones it is the topic's depth."""
+"""Largest number of waiting short messages of a topic; of long messages, ``depth`` may wait."""
 
 HEARTBEAT_INTERVAL = 0.5
 """Seconds between two heartbeats of a latched topic (``rmw_publisher_data.cpp``)."""
 
 
-class RosEnd:
+class RosEndpoint:
     """An endpoint of a topic or a service, with its token.
 
     Args:
@@ -61,7 +61,7 @@ class RosEnd:
     """
 
     def __init__(
-        self, context: RosContext, entity: Entity, on_close: Callable[[RosEnd], None]
+        self, context: RosContext, entity: Entity, on_close: Callable[[RosEndpoint], None]
     ) -> None:
         self.entity: Entity = entity
         self._context, self._on_close = context, on_close
@@ -73,23 +73,25 @@ class RosEnd:
         """The absolute name of the topic or service."""
         return self.entity.name
 
-    def _declare(self, how: Callable[[Any], Any], *, by_dropping: bool = False) -> ZenohDeclared:
-        declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).of(how)
+    def _declare(
+        self, declare: Callable[[Any], Any], *, by_dropping: bool = False
+    ) -> ZenohDeclared:
+        declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).of(declare)
         self._declared.append(declared)
         return declared
 
-    def _appear(self) -> None:
-        """Declare the token, which makes the complete endpoint visible in the graph."""
+    def _declare_token(self) -> None:
+        """Declare the token, which makes the endpoint visible in the graph."""
         token = self.entity.token
         self._declare(lambda session: session.liveliness().declare_token(token))
-        self._context.add(self.entity)
+        self._context.add_endpoint(self.entity)
 
     def close(self) -> None:
         """Undeclare the endpoint. Idempotent."""
         if self._closed:
             return
         self._closed = True
-        self._context.remove(self.entity)
+        self._context.remove_endpoint(self.entity)
         for declared in reversed(self._declared):  # the token first
             declared.close()
         self._on_close(self)
@@ -101,7 +103,7 @@ class RosEnd:
         self.close()
 
 
-class RosPublisher(RosEnd):
+class RosPublisher(RosEndpoint):
     """Publishes on a topic; created by :meth:`Node.publisher`.
 
     Attributes:
@@ -114,11 +116,11 @@ class RosPublisher(RosEnd):
         self,
         context: RosContext,
         entity: Entity,
-        kind: MessageType,
-        on_close: Callable[[RosEnd], None],
+        message_type: MessageType,
+        on_close: Callable[[RosEndpoint], None],
     ) -> None:
         super().__init__(context, entity, on_close)
-        self.type: MessageType = kind
+        self.type: MessageType = message_type
         self.published: int = 0
         self.dropped: int = 0
         self._number = 0
@@ -127,40 +129,46 @@ class RosPublisher(RosEnd):
         self._bytes = 0
         self._publisher: Any = None
         qos = entity.qos  # a message that must not be dropped may block, which the loop cannot
-        self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
-        self._patient: dict[str, Any] = {}  # publishers that wait for room, by lane
-        self._hasty: Any = None  # publisher that skips links with a message in transmission
+        self._may_send_directly = not qos.latched and not (qos.reliable and qos.depth is None)
+        # publishers that wait for room, by thread name
+        self._blocking_publishers: dict[str, Any] = {}
+        # publisher that skips links with a message in transmission
+        self._newest_publisher: Any = None
         self._slot: NewestSlot | None = None
-        self._lane = "latched" if qos.latched else "short"
-        self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
-        self._appear()
+        self._thread_name = "latched" if qos.latched else "short"
+        self._declared_publisher = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(
+            self._declare_publisher
+        )
+        self._declare_token()
 
-    def _make(self, session: Any) -> Any:
+    def _declare_publisher(self, session: Any) -> Any:
         zenoh, qos = self._context.zenoh.engine, self.entity.qos
         drop = zenoh.CongestionControl.DROP
         block = zenoh.CongestionControl.BLOCK
-        waits = qos.latched or (qos.depth is None and qos.reliable)
-        how: dict[str, Any] = {
-            "congestion_control": block if waits else drop,
+        is_blocking = qos.latched or (qos.depth is None and qos.reliable)
+        declare: dict[str, Any] = {
+            "congestion_control": block if is_blocking else drop,
             "reliability": zenoh.Reliability.RELIABLE
             if qos.reliable
             else zenoh.Reliability.BEST_EFFORT,
             "express": True,
         }
         if qos.latched:
-            import zenoh.ext as more
+            import zenoh.ext as zenoh_ext
 
-            misses = more.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_INTERVAL)
-            self._publisher = more.declare_advanced_publisher(
+            miss_detection = zenoh_ext.MissDetectionConfig(
+                heartbeat=None, sporadic_heartbeat=HEARTBEAT_INTERVAL
+            )
+            self._publisher = zenoh_ext.declare_advanced_publisher(
                 session,
                 self.entity.key,
-                cache=more.CacheConfig(max_samples=qos.kept),
-                sample_miss_detection=misses if qos.reliable else None,
+                cache=zenoh_ext.CacheConfig(max_samples=qos.kept),
+                sample_miss_detection=miss_detection if qos.reliable else None,
                 publisher_detection=True,
-                **how,
+                **declare,
             )
         else:
-            self._publisher = session.declare_publisher(self.entity.key, **how)
+            self._publisher = session.declare_publisher(self.entity.key, **declare)
         return self._publisher
 
     @property
@@ -171,11 +179,13 @@ class RosPublisher(RosEnd):
         return self.entity.qos.latched or bool(self._publisher.matching_status.matching)
 
     def watch(self, call: Callable[[], None]) -> Callable[[], None]:
-        """Call ``call`` when subscribers come and go; return a function that ends that.
+        """Call ``call`` when a subscriber comes or goes; return a function that ends this.
 
         ``has_subscribers`` may change a moment later.
         """
-        return self._context.watch(self.name, SUBSCRIPTION, lambda _entity, _present: call())
+        return self._context.watch_endpoints(
+            self.name, SUBSCRIPTION, lambda _entity, _present: call()
+        )
 
     def publish(self, message: object = None, /, **fields: Any) -> None:
         """Publish a message; never waits.
@@ -188,7 +198,7 @@ class RosPublisher(RosEnd):
             RosMessageError: the value is not a message of the type.
             RosError: the publisher is closed.
         """
-        self.publish_encoded(self.type.encode(message_of(message, fields)))
+        self.publish_encoded(self.type.encode(message_or_fields(message, fields)))
 
     def publish_encoded(self, data: bytes) -> None:
         """Publish an encoded message of the type; never waits.
@@ -198,29 +208,35 @@ class RosPublisher(RosEnd):
         """
         self._check_open()
         attachment = self._attachment()
-        waits = self._context.waits(self)
-        if len(data) > MAX_DIRECT_BYTES and self._lane == "short" and not waits:
-            self._lane = "long"  # all later messages, too: a short one would overtake it
-        if self._direct and self._lane == "short" and not waits and self._context.calm():
+        is_blocking = self._context.has_waiting(self)
+        if len(data) > MAX_DIRECT_BYTES and self._thread_name == "short" and not is_blocking:
+            self._thread_name = "long"  # also for later messages: a short one would overtake it
+        if (
+            self._may_send_directly
+            and self._thread_name == "short"
+            and not is_blocking
+            and self._context.allow_direct_send()
+        ):
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
             return
-        most = MAX_SHORT_MESSAGES if self._lane == "short" else self.entity.qos.kept
+        max_waiting = MAX_SHORT_MESSAGES if self._thread_name == "short" else self.entity.qos.kept
         with self._lock:
             self._waiting.append((data, attachment))
             self._bytes += len(data)
-            while len(self._waiting) > most or self._bytes > MAX_WAITING_BYTES:
+            while len(self._waiting) > max_waiting or self._bytes > MAX_WAITING_BYTES:
                 if len(self._waiting) == 1:
                     break
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
-        self._context.send_later(self, self._send_next, self._lane)
+        self._context.send_in_thread(self, self._send_oldest, self._thread_name)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
-        """Publish a message, a long one except on links where another is being sent.
+        """Publish a message; a long one is left out on links that are still sending another.
 
-        For pictures: for a slow subscriber they do not queue up, delay other subscribers, or get
-        old. Returns when the engine has copied the message; a thread encodes it.
+        It is meant for pictures, which thus never queue up, or get old, for a slow subscriber, and
+        never delay other subscribers. A thread encodes the message; the call returns when the
+        engine has copied it.
 
         Raises:
             RosMessageError: the value is not a message of the type.
@@ -229,45 +245,45 @@ class RosPublisher(RosEnd):
         Cancellation: the message is published or not.
         """
         self._check_open()
-        message = message_of(message, fields)
+        message = message_or_fields(message, fields)
         if self._slot is None:
-            self._slot = self._context.slot()
-            self._lane = self._slot.lane
-        done: concurrent.futures.Future[None] = concurrent.futures.Future()
+            self._slot = self._context.next_slot()
+            self._thread_name = self._slot.thread_name
+        sent: concurrent.futures.Future[None] = concurrent.futures.Future()
 
         def publish() -> None:
-            if not done.set_running_or_notify_cancel():
+            if not sent.set_running_or_notify_cancel():
                 return
             try:
                 self._send_newest(self.type.encode(message))
             except BaseException as exc:  # noqa: BLE001 - passed to the waiting task
-                done.set_exception(exc)
+                sent.set_exception(exc)
             else:
-                done.set_result(None)
+                sent.set_result(None)
 
-        self._context.send_later(self, publish, self._lane)
-        await asyncio.wrap_future(done)
+        self._context.send_in_thread(self, publish, self._thread_name)
+        await asyncio.wrap_future(sent)
 
     def _send_newest(self, data: bytes) -> None:
-        """Send a message; called in the thread for it.
+        """Send a message; called in the topic's thread.
 
-        Long messages have their own publisher. The engine skips its message on each link that is
-        sending one of the same priority; so there is a short pause between messages.
+        Long messages have a publisher of their own. On a link that is still sending a message of
+        the same priority, the engine skips the new one; hence the short pause between messages.
         """
         slot, publisher = self._slot, self._publisher
         if self._closed or slot is None:
             return
         attachment = self._attachment()
         if len(data) > MAX_DIRECT_BYTES:
-            if self._hasty is None:
+            if self._newest_publisher is None:
                 zenoh = self._context.zenoh.engine
-                self._hasty = self._context.zenoh.session.declare_publisher(
+                self._newest_publisher = self._context.zenoh.session.declare_publisher(
                     self.entity.key,
                     congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
                     priority=getattr(zenoh.Priority, slot.priority),
                 )
-            publisher = self._hasty
-            slot.wait(len(data))
+            publisher = self._newest_publisher
+            slot.wait_for_link(len(data))
         quietly(publisher.put, data, attachment=attachment)
         self.published += 1
 
@@ -279,28 +295,28 @@ class RosPublisher(RosEnd):
         self._number += 1
         return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
 
-    def _send_next(self) -> None:
-        """Send the oldest waiting message; called in the thread for it."""
+    def _send_oldest(self) -> None:
+        """Send the oldest waiting message; called in the topic's thread."""
         with self._lock:
             if not self._waiting or self._closed:
                 return
             data, attachment = self._waiting.popleft()
             self._bytes -= len(data)
-        self._patiently().put(data, attachment=attachment)
+        self._blocking_publisher().put(data, attachment=attachment)
         self.published += 1
 
-    def _patiently(self) -> Any:
-        """Return the publisher that waits for room, at a lower priority for long messages."""
-        zenoh, lane = self._context.zenoh.engine, self._lane
+    def _blocking_publisher(self) -> Any:
+        """Return the publisher that waits for room; for long messages it has a lower priority."""
+        zenoh, thread_name = self._context.zenoh.engine, self._thread_name
         if self.entity.qos.latched:
             return self._publisher  # a latched topic's publisher has to keep the messages
-        if lane not in self._patient:
-            self._patient[lane] = self._context.zenoh.session.declare_publisher(
+        if thread_name not in self._blocking_publishers:
+            self._blocking_publishers[thread_name] = self._context.zenoh.session.declare_publisher(
                 self.entity.key,
                 congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA if lane == "short" else zenoh.Priority.DATA_LOW,
+                priority=zenoh.Priority.DATA if thread_name == "short" else zenoh.Priority.DATA_LOW,
             )
-        return self._patient[lane]
+        return self._blocking_publishers[thread_name]
 
     def close(self) -> None:
         """Undeclare the topic, and drop waiting messages. Idempotent."""
@@ -311,26 +327,26 @@ class RosPublisher(RosEnd):
             self.dropped += len(self._waiting)
             self._waiting.clear()
             self._bytes = 0
-        if self._context.waits(self):  # the thread undeclares it after a running send
-            self._context.send_later(self, self._take_back, self._lane)
+        if self._context.has_waiting(self):  # the thread undeclares it after a running send
+            self._context.send_in_thread(self, self._undeclare, self._thread_name)
         else:
-            self._take_back()
+            self._undeclare()
 
-    def _take_back(self) -> None:
-        for publisher in (*self._patient.values(), self._hasty):
+    def _undeclare(self) -> None:
+        for publisher in (*self._blocking_publishers.values(), self._newest_publisher):
             if publisher is not None:
                 quietly(publisher.undeclare)
-        self._patient, self._hasty = {}, None
+        self._blocking_publishers, self._newest_publisher = {}, None
         self._publisher = None
-        self._outlet.close()
+        self._declared_publisher.close()
 
 
-class _FromTopic(NamedTuple):
+class _ReceivedMessage(NamedTuple):
     data: bytes
     attachment: Attachment
 
 
-class RosSubscription(RosEnd, TopicReader[_FromTopic]):
+class RosSubscription(RosEndpoint, TopicReader[_ReceivedMessage]):
     """Subscription to a topic, created by :meth:`Node.subscribe` and read by ``async for``.
 
     Attributes:
@@ -341,51 +357,51 @@ class RosSubscription(RosEnd, TopicReader[_FromTopic]):
         self,
         context: RosContext,
         entity: Entity,
-        kind: MessageType,
-        on_close: Callable[[RosEnd], None],
+        message_type: MessageType,
+        on_close: Callable[[RosEndpoint], None],
     ) -> None:
-        RosEnd.__init__(self, context, entity, on_close)
-        TopicReader.__init__(self, entity.name, kind, entity.qos.kept, MAX_WAITING_BYTES)
+        RosEndpoint.__init__(self, context, entity, on_close)
+        TopicReader.__init__(self, entity.name, message_type, entity.qos.kept, MAX_WAITING_BYTES)
         self.attachment: Attachment | None = None
-        self._declare(self._make, by_dropping=entity.qos.latched)
-        self._appear()
+        self._declare(self._declare_subscriber, by_dropping=entity.qos.latched)
+        self._declare_token()
 
-    def _make(self, session: Any) -> Any:
+    def _declare_subscriber(self, session: Any) -> Any:
         context = self._context.zenoh
 
         def on_sample(sample: Any) -> None:
             data = sample.payload.to_bytes()
             if context.full(len(data)):
                 return
-            extra = None if sample.attachment is None else sample.attachment.to_bytes()
-            context.in_loop(self._take, len(data), data, extra)
+            attachment_bytes = None if sample.attachment is None else sample.attachment.to_bytes()
+            context.in_loop(self._on_message, len(data), data, attachment_bytes)
 
         qos = self.entity.qos
         if not qos.latched:
             return session.declare_subscriber(self.entity.key, direct(on_sample))
-        import zenoh.ext as more
+        import zenoh.ext as zenoh_ext
 
-        recovery = more.RecoveryConfig(periodic_queries=None, heartbeat=True)
-        return more.declare_advanced_subscriber(
+        recovery = zenoh_ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        return zenoh_ext.declare_advanced_subscriber(
             session,
             self.entity.key,
             direct(on_sample),
-            history=more.HistoryConfig(detect_late_publishers=True, max_samples=qos.kept),
+            history=zenoh_ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.kept),
             recovery=recovery if qos.reliable else None,
             subscriber_detection=True,
         )
 
-    def _take(self, data: bytes, extra: bytes | None) -> None:
+    def _on_message(self, data: bytes, attachment_bytes: bytes | None) -> None:
         if self._closed:
             return
         try:
-            attachment = Attachment.decode(extra)
+            attachment = Attachment.decode(attachment_bytes)
         except RosMessageError as exc:
             self._reject(exc)
             return
-        self._queue.offer(_FromTopic(data, attachment), 0.0, len(data))
+        self._queue.offer(_ReceivedMessage(data, attachment), 0.0, len(data))
 
-    def _read(self, item: _FromTopic) -> Any:
+    def _decode_item(self, item: _ReceivedMessage) -> Any:
         message = self.type.decode(item.data)
         self.attachment = item.attachment
         return message

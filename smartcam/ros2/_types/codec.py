@@ -1,8 +1,8 @@
 """CDR: generate the functions that encode and decode messages of a type, when they are needed.
 
-Consecutive fields of fixed size are packed at once. The position of such a run depends on the
-message, so each run has eight forms, one for each position modulo 8; the four bytes of the
-encapsulation do not count for alignment.
+Consecutive fields of fixed size (a run) are packed with one Struct. A run may begin at any
+position, so it has eight Structs, one for each position modulo 8. For alignment, positions count
+from the end of the encapsulation, four bytes.
 """
 
 from __future__ import annotations
@@ -22,32 +22,38 @@ if TYPE_CHECKING:
 
 Numbers: TypeAlias = "np.ndarray[Any, np.dtype[Any]]"
 
-HEAD: Final = b"\0\1\0\0"
+ENCAPSULATION: Final = b"\0\1\0\0"
 _FLAGS: Final = {True: 1, False: 0}
 _SIZES: Final = {code: struct.calcsize(f"<{code}") for code in "bBhHiIqQfd?"}
 
 
 class MisfitError(ValueError):
-    """Bytes or a value do not fit; only within this package."""
+    """Bytes or a value do not fit the type; it does not leave this package."""
 
 
 @functools.lru_cache(4096)
-def _forms(parts: tuple[tuple[str, int], ...], order: str) -> tuple[struct.Struct, ...]:
-    """Return the eight forms of a run of ``(code of struct, alignment)``."""
-    return tuple(_form(parts, order, start - len(HEAD)) for start in range(8))
+def _structs_by_position(
+    parts: tuple[tuple[str, int], ...], order: str
+) -> tuple[struct.Struct, ...]:
+    """Return the eight Structs of a run, whose fields are given as (code of struct, alignment)."""
+    return tuple(_struct_at(parts, order, start - len(ENCAPSULATION)) for start in range(8))
 
 
-def _form(parts: tuple[tuple[str, int], ...], order: str, place: int) -> struct.Struct:
+def _struct_at(parts: tuple[tuple[str, int], ...], order: str, position: int) -> struct.Struct:
     text = [order]
     for code, alignment in parts:
-        pad = -place % alignment
+        pad = -position % alignment
         text.append("x" * pad + code)
-        place += pad + (int(code[:-1]) if code.endswith("s") else _SIZES[code])
+        position += pad + (int(code[:-1]) if code.endswith("s") else _SIZES[code])
     return struct.Struct("".join(text))
 
 
 class _Writer:
-    """Lines of a function: the common part of encoder and decoder."""
+    """Collects the lines of a generated function: the common part of encoder and decoder.
+
+    Fields of fixed size are collected in ``pending_parts`` until :meth:`flush` writes them as one
+    run.
+    """
 
     def __init__(self, order: str) -> None:
         self.order = order
@@ -55,36 +61,38 @@ class _Writer:
         self.names: dict[str, Any] = {}
         self.indent = 1
         self.count = 0
-        self.run: list[tuple[str, int]] = []
-        self.values: list[str] = []
+        self.pending_parts: list[tuple[str, int]] = []
+        self.pending_values: list[str] = []
 
-    def name(self, value: Any = None, prefix: str = "v") -> str:
+    def new_name(self, value: Any = None, prefix: str = "v") -> str:
         self.count += 1
         name = f"{prefix}{self.count}"
         if value is not None:
             self.names[name] = value
         return name
 
-    def line(self, text: str) -> None:
+    def add_line(self, text: str) -> None:
         self.lines.append("    " * self.indent + text)
 
-    def fixed(self, code: str, alignment: int, value: str) -> None:
-        self.run.append((code, alignment))
-        self.values.append(value)
+    def add_fixed(self, code: str, alignment: int, value: str) -> None:
+        self.pending_parts.append((code, alignment))
+        self.pending_values.append(value)
 
     def flush(self) -> None:
-        if self.run:
-            forms = self.name(_forms(tuple(self.run), self.order), "R")
-            self.line(f"s = {forms}[pos & 7]")
-            self.move(", ".join(self.values))
-            self.line("pos += s.size")
-            self.run, self.values = [], []
+        if self.pending_parts:
+            structs = self.new_name(
+                _structs_by_position(tuple(self.pending_parts), self.order), "R"
+            )
+            self.add_line(f"s = {structs}[pos & 7]")
+            self.transfer(", ".join(self.pending_values))
+            self.add_line("pos += s.size")
+            self.pending_parts, self.pending_values = [], []
 
-    def move(self, values: str) -> None:
+    def transfer(self, values: str) -> None:
         raise NotImplementedError
 
-    def compiled(self, head: str, title: str) -> Callable[..., Any]:
-        source = "\n".join([head, *self.lines])
+    def compile_function(self, signature: str, title: str) -> Callable[..., Any]:
+        source = "\n".join([signature, *self.lines])
         scope: dict[str, Any] = dict(self.names)
         exec(compile(source, f"<{title}>", "exec"), scope)  # noqa: S102
         function: Callable[..., Any] = scope["function"]
@@ -94,8 +102,8 @@ class _Writer:
 # -- encoding -----------------------------------------------------------------------------------
 
 
-def packed(value: Any, code: str, least: int, most: int) -> Any:
-    """Return the bytes of ``least`` to ``most`` numbers (0 for any number of them)."""
+def pack_numbers(value: Any, code: str, least: int, most: int) -> Any:
+    """Return the bytes of ``least`` to ``most`` numbers; ``most`` 0 means any count."""
     if isinstance(value, bytes | bytearray | memoryview):
         if code not in "bB":
             raise MisfitError(f"bytes are no numbers of {code}")
@@ -105,7 +113,7 @@ def packed(value: Any, code: str, least: int, most: int) -> Any:
         if value.ndim != 1:
             raise MisfitError(f"expected numbers in one row, got {value.shape}")
         count = len(value)
-        array = _array(value, np.dtype(f"<{code}"))
+        array = _as_array(value, np.dtype(f"<{code}"))
         data = array.tobytes() if least else array.view(np.uint8)
     else:
         if isinstance(value, str | dict):
@@ -119,26 +127,26 @@ def packed(value: Any, code: str, least: int, most: int) -> Any:
     return data
 
 
-def _array(value: Numbers, kind: np.dtype[Any]) -> Numbers:
-    if value.dtype != kind:
-        if kind.kind == "f" and value.dtype.kind in "fiu":
+def _as_array(value: Numbers, dtype: np.dtype[Any]) -> Numbers:
+    if value.dtype != dtype:
+        if dtype.kind == "f" and value.dtype.kind in "fiu":
             with np.errstate(over="ignore"):
-                cast = value.astype(kind)
+                cast = value.astype(dtype)
             if bool(np.any(np.isinf(cast) & np.isfinite(value))):
-                raise MisfitError(f"numbers out of the range of {kind}")
-        elif kind.kind in "iu" and value.dtype.kind in "iu":
-            limits = np.iinfo(kind)
+                raise MisfitError(f"numbers out of the range of {dtype}")
+        elif dtype.kind in "iu" and value.dtype.kind in "iu":
+            limits = np.iinfo(dtype)
             if value.size and not (limits.min <= value.min() and value.max() <= limits.max):
-                raise MisfitError(f"numbers out of the range of {kind}")
-            cast = value.astype(kind)
+                raise MisfitError(f"numbers out of the range of {dtype}")
+            cast = value.astype(dtype)
         else:
-            raise MisfitError(f"expected an array of {kind}, got {value.dtype}")
+            raise MisfitError(f"expected an array of {dtype}, got {value.dtype}")
         value = cast
     return np.ascontiguousarray(value)
 
 
 def text_bytes(text: str, limit: int) -> bytes:
-    """Return a string's bytes with its end."""
+    """Return a string's bytes with NUL at the end."""
     if not isinstance(text, str):
         raise MisfitError(f"expected a string, got {type(text).__name__}")
     if "\0" in text:
@@ -149,8 +157,8 @@ def text_bytes(text: str, limit: int) -> bytes:
     return data + b"\0"
 
 
-def counted(value: Any, least: int, most: int) -> int:
-    """Return the number of messages or strings in a list, after checking it against its bounds."""
+def checked_length(value: Any, least: int, most: int) -> int:
+    """Return the length of a list of messages or strings, after checking its bounds."""
     if not isinstance(value, list | tuple):
         raise MisfitError(f"expected a list, got {type(value).__name__}")
     count = len(value)
@@ -162,83 +170,88 @@ def counted(value: Any, least: int, most: int) -> int:
 class _Encoder(_Writer):
     def __init__(self) -> None:
         super().__init__("<")
-        self.names |= {"F": _FLAGS, "packed": packed, "text_bytes": text_bytes, "counted": counted}
+        self.names |= {
+            "F": _FLAGS,
+            "pack_numbers": pack_numbers,
+            "text_bytes": text_bytes,
+            "checked_length": checked_length,
+        }
 
-    def move(self, values: str) -> None:
-        self.line(f"put(s.pack({values}))")
+    def transfer(self, values: str) -> None:
+        self.add_line(f"put(s.pack({values}))")
 
-    def message(self, kind: MessageType, value: str) -> None:
-        if not kind.fields:
-            self.fixed("B", 1, "0")
-        for field in kind.fields:
-            self.field(kind, field, f"{value}.{field.attribute}")
+    def add_message(self, message_type: MessageType, value: str) -> None:
+        if not message_type.fields:
+            self.add_fixed("B", 1, "0")
+        for field in message_type.fields:
+            self.add_field(message_type, field, f"{value}.{field.attribute}")
 
-    def field(self, kind: MessageType, field: MessageField, value: str) -> None:
+    def add_field(self, message_type: MessageType, field: MessageField, value: str) -> None:
         if field.shape:
-            self.many(kind, field, value)
+            self.add_array(message_type, field, value)
         elif field.nested:
-            name = self.name()
-            self.line(f"{name} = {value}")
-            self.message(kind.nested[field.type], name)
+            name = self.new_name()
+            self.add_line(f"{name} = {value}")
+            self.add_message(message_type.nested[field.type], name)
         elif field.type == "string":
-            name = self.name()
-            self.line(f"{name} = text_bytes({value}, {field.limit})")
-            self.fixed("I", 4, f"len({name})")
+            name = self.new_name()
+            self.add_line(f"{name} = text_bytes({value}, {field.limit})")
+            self.add_fixed("I", 4, f"len({name})")
             self.flush()
-            self.line(f"put({name})")
-            self.line(f"pos += len({name})")
+            self.add_line(f"put({name})")
+            self.add_line(f"pos += len({name})")
         else:
             code = NUMBERS[field.type]
             flag = code == "?"
-            self.fixed("B" if flag else code, _SIZES[code], f"F[{value}]" if flag else value)
+            self.add_fixed("B" if flag else code, _SIZES[code], f"F[{value}]" if flag else value)
 
-    def many(self, kind: MessageType, field: MessageField, value: str) -> None:
+    def add_array(self, message_type: MessageType, field: MessageField, value: str) -> None:
         array = field.shape == "array"
         least = field.size if array else 0
-        name = self.name()
+        name = self.new_name()
         if field.type in NUMBERS:
             code = NUMBERS[field.type]
             size = _SIZES[code]
-            self.line(f"{name} = packed({value}, {code!r}, {least}, {field.size})")
+            self.add_line(f"{name} = pack_numbers({value}, {code!r}, {least}, {field.size})")
             if array:
-                self.fixed(f"{field.size * size}s", size, name)
+                self.add_fixed(f"{field.size * size}s", size, name)
                 return
-            self.fixed("I", 4, f"len({name}) // {size}")
+            self.add_fixed("I", 4, f"len({name}) // {size}")
             self.flush()
             if size == 8:
-                self.line(f"if len({name}):")
+                self.add_line(f"if len({name}):")
                 self.indent += 1
-                self.fixed("0s", size, "b''")
+                self.add_fixed("0s", size, "b''")
                 self.flush()
                 self.indent -= 1
-            self.line(f"put({name})")
-            self.line(f"pos += len({name})")
+            self.add_line(f"put({name})")
+            self.add_line(f"pos += len({name})")
             return
-        item = self.name()
-        self.line(f"{name} = {value}")
-        count = self.name()
-        self.line(f"{count} = counted({name}, {least}, {field.size})")
+        item = self.new_name()
+        self.add_line(f"{name} = {value}")
+        count = self.new_name()
+        self.add_line(f"{count} = checked_length({name}, {least}, {field.size})")
         if not array:
-            self.fixed("I", 4, count)
+            self.add_fixed("I", 4, count)
         self.flush()
-        self.line(f"for {item} in {name}:")
+        self.add_line(f"for {item} in {name}:")
         self.indent += 1
-        self.field(kind, field._replace(shape="", size=0), item)
+        self.add_field(message_type, field._replace(shape="", size=0), item)
         self.flush()
         self.indent -= 1
 
 
-def encoder(kind: MessageType) -> Callable[[Any], bytes]:
+def encoder(message_type: MessageType) -> Callable[[Any], bytes]:
     """Return the function that encodes a message; it raises MisfitError and other errors."""
     writer = _Encoder()
-    writer.names["HEAD"] = HEAD
-    writer.line("parts = [HEAD]")
-    writer.line("put = parts.append")
-    writer.line(f"pos = {len(HEAD)}")
-    writer.message(kind, "m")
+    writer.names["ENCAPSULATION"] = ENCAPSULATION
+    writer.add_line("parts = [ENCAPSULATION]")
+    writer.add_line("put = parts.append")
+    writer.add_line(f"pos = {len(ENCAPSULATION)}")
+    writer.add_message(message_type, "m")
     writer.flush()
-    writer.line("return b''.join(parts)")
-    return writer.compiled("def function(m):", f"encode {kind.name}")
+    writer.add_line("return b''.join(parts)")
+    return writer.compile_function("def function(m):", f"encode {message_type.name}")
 
 
 # -- decoding -----------------------------------------------------------------------------------
@@ -263,32 +276,32 @@ def read_text(data: Any, start: int, size: int, limit: int) -> str:
     return text
 
 
-def read_numbers(data: Any, start: int, count: int, kind: np.dtype[Any], most: int) -> Any:
+def read_numbers(data: Any, start: int, count: int, dtype: np.dtype[Any], most: int) -> Any:
     """Return ``count`` numbers as a view of the bytes, or for another byte order as a copy."""
     if most and count > most:
         raise MisfitError(f"expected up to {most} numbers, got {count}")
-    if count * kind.itemsize > len(data) - start:
+    if count * dtype.itemsize > len(data) - start:
         raise MisfitError(
-            f"{count} numbers of {kind} at {start}, where {len(data) - start} bytes are left"
+            f"{count} numbers of {dtype} at {start}, where {len(data) - start} bytes are left"
         )
     if not count:
-        return np.zeros(0, kind.newbyteorder("="))
-    return own_numbers(np.frombuffer(data, kind, count, start))
+        return np.zeros(0, dtype.newbyteorder("="))
+    return native_numbers(np.frombuffer(data, dtype, count, start))
 
 
-def own_numbers(array: Numbers) -> Numbers:
+def native_numbers(array: Numbers) -> Numbers:
     """Return numbers in this machine's byte order, after checking flags."""
     if array.dtype.kind == "b" and array.view(np.uint8).max() > 1:
         raise MisfitError("a flag is neither 0 nor 1")
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
-def checked_count(count: int, most: int, left: int) -> int:
-    """Return the number of following items, after checking that a byte is left for each."""
+def checked_count(count: int, most: int, bytes_left: int) -> int:
+    """Return the count of items that follow, after checking that each can have a byte."""
     if most and count > most:
         raise MisfitError(f"expected up to {most} items, got {count}")
-    if count > left:
-        raise MisfitError(f"{count} items where {left} bytes are left")
+    if count > bytes_left:
+        raise MisfitError(f"{count} items where {bytes_left} bytes are left")
     return count
 
 
@@ -299,77 +312,77 @@ class _Decoder(_Writer):
             "F": _FLAG_OF,
             "read_text": read_text,
             "read_numbers": read_numbers,
-            "own_numbers": own_numbers,
+            "native_numbers": native_numbers,
             "frombuffer": np.frombuffer,
             "checked_count": checked_count,
         }
 
-    def move(self, values: str) -> None:
-        self.line(f"{values}, = s.unpack_from(data, pos)")
+    def transfer(self, values: str) -> None:
+        self.add_line(f"{values}, = s.unpack_from(data, pos)")
 
-    def message(self, kind: MessageType) -> str:
+    def add_message(self, message_type: MessageType) -> str:
         """Write the lines that read a message; return the expression that creates it."""
-        if not kind.fields:
-            self.fixed("B", 1, self.name())
-        parts = [self.field(kind, field) for field in kind.fields]
-        return f"{self.name(kind.cls, 'C')}({', '.join(parts)})"
+        if not message_type.fields:
+            self.add_fixed("B", 1, self.new_name())
+        parts = [self.add_field(message_type, field) for field in message_type.fields]
+        return f"{self.new_name(message_type.cls, 'C')}({', '.join(parts)})"
 
-    def field(self, kind: MessageType, field: MessageField) -> str:
+    def add_field(self, message_type: MessageType, field: MessageField) -> str:
         if field.shape:
-            return self.many(kind, field)
+            return self.add_array(message_type, field)
         if field.nested:
-            return self.message(kind.nested[field.type])
-        name = self.name()
+            return self.add_message(message_type.nested[field.type])
+        name = self.new_name()
         if field.type == "string":
-            size = self.name()
-            self.fixed("I", 4, size)
+            size = self.new_name()
+            self.add_fixed("I", 4, size)
             self.flush()
-            self.line(f"{name} = read_text(data, pos, {size}, {field.limit})")
-            self.line(f"pos += {size}")
+            self.add_line(f"{name} = read_text(data, pos, {size}, {field.limit})")
+            self.add_line(f"pos += {size}")
             return name
         code = NUMBERS[field.type]
         flag = code == "?"
-        self.fixed("B" if flag else code, _SIZES[code], name)
+        self.add_fixed("B" if flag else code, _SIZES[code], name)
         return f"F[{name}]" if flag else name
 
-    def many(self, kind: MessageType, field: MessageField) -> str:
+    def add_array(self, message_type: MessageType, field: MessageField) -> str:
         array = field.shape == "array"
-        name, count = self.name(), self.name()
+        name, count = self.new_name(), self.new_name()
         if field.type in NUMBERS:
             size = _SIZES[NUMBERS[field.type]]
-            dtype = self.name(np.dtype(self.order + NUMBERS[field.type]), "D")
+            dtype = self.new_name(np.dtype(self.order + NUMBERS[field.type]), "D")
             if array:
-                self.fixed(f"{field.size * size}s", size, name)
-                return f"own_numbers(frombuffer({name}, {dtype}))"
-            self.fixed("I", 4, count)
+                self.add_fixed(f"{field.size * size}s", size, name)
+                return f"native_numbers(frombuffer({name}, {dtype}))"
+            self.add_fixed("I", 4, count)
             self.flush()
             if size == 8:
-                self.line(f"if {count}: pos += (4 - pos) & 7")
-            self.line(f"{name} = read_numbers(data, pos, {count}, {dtype}, {field.size})")
-            self.line(f"pos += {count} * {size}")
+                self.add_line(f"if {count}: pos += (4 - pos) & 7")
+            self.add_line(f"{name} = read_numbers(data, pos, {count}, {dtype}, {field.size})")
+            self.add_line(f"pos += {count} * {size}")
             return name
         if array:
             self.flush()
-            self.line(f"{count} = {field.size}")
+            self.add_line(f"{count} = {field.size}")
         else:
-            self.fixed("I", 4, count)
+            self.add_fixed("I", 4, count)
             self.flush()
-            self.line(f"checked_count({count}, {field.size}, len(data) - pos)")
-        self.line(f"{name} = []")
-        self.line(f"for _ in range({count}):")
+            self.add_line(f"checked_count({count}, {field.size}, len(data) - pos)")
+        self.add_line(f"{name} = []")
+        self.add_line(f"for _ in range({count}):")
         self.indent += 1
-        made = self.field(kind, field._replace(shape="", size=0))
+        expression = self.add_field(message_type, field._replace(shape="", size=0))
         self.flush()
-        self.line(f"{name}.append({made})")
+        self.add_line(f"{name}.append({expression})")
         self.indent -= 1
         return name
 
 
-def decoder(kind: MessageType, order: str) -> Callable[[Any], tuple[Any, int]]:
-    """Return the function that decodes a message, and returns also the position of its end."""
+def decoder(message_type: MessageType, order: str) -> Callable[[Any], tuple[Any, int]]:
+    """Return the function that decodes a message, and returns it with the position of its end."""
     writer = _Decoder(order)
-    writer.line(f"pos = {len(HEAD)}")
-    made = writer.message(kind)
+    writer.add_line(f"pos = {len(ENCAPSULATION)}")
+    expression = writer.add_message(message_type)
     writer.flush()
-    writer.line(f"return {made}, pos")
-    return writer.compiled("def function(data):", f"decode {kind.name}")
+    writer.add_line(f"return {expression}, pos")
+    return writer.compile_function("def function(data):", f"decode {message_type.name}")

@@ -18,27 +18,27 @@ INTEGERS: Final = {
 """The codes of ``struct`` and numpy by the type."""
 
 NUMBERS: Final = {**INTEGERS, "float32": "f", "float64": "d", "bool": "?"}
-BASES: Final = frozenset({*NUMBERS, "string"})
-OTHER_NAMES: Final = {"char": "uint8", "octet": "byte"}
+BASIC_TYPES: Final = frozenset({*NUMBERS, "string"})
+TYPE_ALIASES: Final = {"char": "uint8", "octet": "byte"}
 
 _PART = r"[a-z][a-z0-9]*(?:_[a-z0-9]+)*"  # one way to match only: no name takes long
-NAME: Final = re.compile(rf"({_PART})/(msg|srv)/([A-Z][A-Za-z0-9]*)")
+TYPE_NAME: Final = re.compile(rf"({_PART})/(msg|srv)/([A-Z][A-Za-z0-9]*)")
 _FIELD: Final = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=(?P<limit>\d+))?"
     r"(?:\[(?P<bound><=)?(?P<size>\d*)\])?\s+"
     r"(?P<name>[A-Za-z]\w*)\s*(?:=(?P<constant>.*)|\s(?P<default>.*))?"
 )
-_OLD_NAMES: Final = {"Header": "std_msgs/msg/Header"}
+_SHORT_NAMES: Final = {"Header": "std_msgs/msg/Header"}
 
 
 class MessageField(NamedTuple):
-    """One field: ``shape`` is "" (one value), "array" (of ``size``) or "sequence" (up to ``size``).
+    """A field; ``shape`` is "" for one value, "array" of ``size``, or "sequence" up to ``size``.
 
     Attributes:
         type: a basic type, or a message's full name.
         limit: largest number of bytes of a string; 0 for any.
         size: number of elements of an array, largest number for a sequence; 0 for any.
-        default: value where none is given; None is zero.
+        default: value of the field in a new message; None is zero.
     """
 
     name: str
@@ -56,7 +56,7 @@ class MessageField(NamedTuple):
     @property
     def nested(self) -> bool:
         """True if the field consists of messages."""
-        return self.type not in BASES
+        return self.type not in BASIC_TYPES
 
     def __str__(self) -> str:
         """Return the type of the field as a ``.msg`` has it."""
@@ -69,7 +69,7 @@ class MessageField(NamedTuple):
         )
 
 
-EMPTY: Final = MessageField("structure_needs_at_least_one_member", "uint8")
+EMPTY_MESSAGE_FIELD: Final = MessageField("structure_needs_at_least_one_member", "uint8")
 """Field that a message without fields has in its description and its bytes."""
 
 
@@ -84,16 +84,17 @@ class Definition:
     name: str
     fields: tuple[MessageField, ...]
     constants: dict[str, Any]
-    kinds: dict[str, str]
+    constant_types: dict[str, str]
 
     def text(self, *, defaults: bool = False) -> str:
         """Return the fields and constants as a ``.msg`` has them.
 
         Args:
-            defaults: whether fields have their defaults behind them.
+            defaults: True to add the fields' defaults.
         """
         constants = (
-            f"{self.kinds[name]} {name}={value}\n" for name, value in self.constants.items()
+            f"{self.constant_types[name]} {name}={value}\n"
+            for name, value in self.constants.items()
         )
         fields = (
             f"{field} {field.name}{_default_text(field.default) if defaults else ''}\n"
@@ -101,27 +102,27 @@ class Definition:
         )
         return "".join((*constants, *fields))
 
-    def needs(self) -> set[str]:
-        """Return the names of the messages inside."""
+    def nested_names(self) -> set[str]:
+        """Return the names of the types of nested messages."""
         return {field.type for field in self.fields if field.nested}
 
 
 def _default_text(value: Any) -> str:
-    """Return a default as it stands behind a field's name, with a blank before it."""
+    """Return a default as it follows a field's name, with a blank before it."""
     if value is None:
         return ""
     return f" {str(value).lower() if isinstance(value, bool) else repr(value)}"
 
 
-def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
+def split_name(name: str, category: str = "") -> tuple[str, str, str]:
     """Return package, kind and name of a type.
 
     Raises:
         ConfigurationError: the text is no name of a type, or not of this kind.
     """
-    matched = NAME.fullmatch(name) if isinstance(name, str) else None
-    if matched is None or kind not in ("", matched[2]):
-        example = "std_srvs/srv/Trigger" if kind == "srv" else "std_msgs/msg/String"
+    matched = TYPE_NAME.fullmatch(name) if isinstance(name, str) else None
+    if matched is None or category not in ("", matched[2]):
+        example = "std_srvs/srv/Trigger" if category == "srv" else "std_msgs/msg/String"
         raise ConfigurationError(
             f"not a name of a ROS type: expected a name such as {example}, got {name!r:.80}"
         )
@@ -130,8 +131,8 @@ def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
 
 def dds_name(name: str) -> str:
     """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
-    package, kind, short_name = name.split("/")
-    return f"{package}::{kind}::dds_::{short_name}_"
+    package, category, short_name = name.split("/")
+    return f"{package}::{category}::dds_::{short_name}_"
 
 
 def parse_message(name: str, text: str) -> Definition:
@@ -143,7 +144,7 @@ def parse_message(name: str, text: str) -> Definition:
     package = name.partition("/")[0]
     fields: dict[str, MessageField] = {}
     constants: dict[str, Any] = {}
-    kinds: dict[str, str] = {}
+    constant_types: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         text_line = line.strip()
         if not text_line or text_line.startswith("#"):
@@ -153,12 +154,12 @@ def parse_message(name: str, text: str) -> Definition:
             if field.name in fields or field.name in constants:
                 raise ValueError(f"there are two {field.name}")
             if constant:
-                constants[field.name], kinds[field.name] = field.default, field.type
+                constants[field.name], constant_types[field.name] = field.default, field.type
             else:
                 fields[field.name] = field
         except (ValueError, SyntaxError, MemoryError, RecursionError) as exc:
             raise ConfigurationError(f"{name}, line {number}: {text_line!r:.80}: {exc}") from exc
-    return Definition(name, tuple(fields.values()), constants, kinds)
+    return Definition(name, tuple(fields.values()), constants, constant_types)
 
 
 def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
@@ -173,10 +174,10 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
     return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
 
 
-def bare(definition: Any) -> Any:
-    """Return the fields of a message, or of a service's two, without defaults."""
+def without_defaults(definition: Any) -> Any:
+    """Return the fields of a message, or of a service's two messages, without defaults."""
     if isinstance(definition, tuple):
-        return [bare(part) for part in definition]
+        return [without_defaults(part) for part in definition]
     return [field._replace(default=None) for field in definition.fields]
 
 
@@ -184,48 +185,48 @@ def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
     matched = _FIELD.fullmatch(line) or _FIELD.fullmatch(line.partition("#")[0].strip())
     if matched is None:
         raise ValueError("expected a type and a name")
-    kind = _full_name(package, matched["type"])
+    type_name = _full_name(package, matched["type"])
     limit = int(matched["limit"] or 0)
-    if limit and kind != "string":
+    if limit and type_name != "string":
         raise ValueError("only a string is bounded by <=")
     size, bound = matched["size"], matched["bound"]
     if bound and not size:
         raise ValueError("expected a number after <=")
     shape = "" if size is None else "array" if size and not bound else "sequence"
-    field = MessageField(matched["name"], kind, shape, int(size or 0), limit)
+    field = MessageField(matched["name"], type_name, shape, int(size or 0), limit)
     if shape == "array" and not field.size:
         raise ValueError("an array of 0 elements")
     value = matched["constant"] if matched["constant"] is not None else matched["default"]
-    constant = matched["constant"] is not None
-    if constant and (shape or kind not in BASES):
+    is_constant = matched["constant"] is not None
+    if is_constant and (shape or type_name not in BASIC_TYPES):
         raise ValueError("a constant is of one basic value")
-    return field._replace(default=_value(field, value, entire=constant)), constant
+    return field._replace(default=_parse_value(field, value, is_constant=is_constant)), is_constant
 
 
 def _full_name(package: str, name: str) -> str:
-    name = OTHER_NAMES.get(name, name)
+    name = TYPE_ALIASES.get(name, name)
     if name in ("wstring", "float128"):
         raise ValueError(f"{name} is not supported")
-    if name in BASES:
+    if name in BASIC_TYPES:
         return name
     if "/" not in name:
-        name = _OLD_NAMES.get(name, f"{package}/msg/{name}")
+        name = _SHORT_NAMES.get(name, f"{package}/msg/{name}")
     elif "/msg/" not in name:
         name = name.replace("/", "/msg/", 1)
-    if NAME.fullmatch(name) is None:
+    if TYPE_NAME.fullmatch(name) is None:
         raise ValueError(f"{name} is no type")
     return name
 
 
-def _value(field: MessageField, text: str | None, *, entire: bool) -> Any:
-    """Return a constant or default; a constant's text is the ``entire`` rest of its line."""
-    if text is None or not (text := text.strip()) or (not entire and text.startswith("#")):
+def _parse_value(field: MessageField, text: str | None, *, is_constant: bool) -> Any:
+    """Return the value of a constant, whose text is the whole rest of the line, or of a default."""
+    if text is None or not (text := text.strip()) or (not is_constant and text.startswith("#")):
         return None
     if field.type == "string" and not field.shape:
         quoted = re.match(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"", text)
         if quoted is None:
-            return text if entire else text.partition("#")[0].strip()
-        return _fitting(field, [ast.literal_eval(quoted[0])])[0]
+            return text if is_constant else text.partition("#")[0].strip()
+        return _checked_values(field, [ast.literal_eval(quoted[0])])[0]
     if field.type != "string":
         text = text.partition("#")[0].strip()
         text = re.sub(r"(?i)\btrue\b", "True", re.sub(r"(?i)\bfalse\b", "False", text))
@@ -233,14 +234,14 @@ def _value(field: MessageField, text: str | None, *, entire: bool) -> Any:
     value = value if field.shape else [value]
     convert = float if field.type.startswith("float") else bool if field.type == "bool" else None
     values = [convert(x) for x in value] if convert else list(value)
-    return _fitting(field, values) if field.shape else _fitting(field, values)[0]
+    return _checked_values(field, values) if field.shape else _checked_values(field, values)[0]
 
 
-def _fitting(field: MessageField, values: list[Any]) -> list[Any]:
+def _checked_values(field: MessageField, values: list[Any]) -> list[Any]:
     if field.nested:
         raise ValueError("a message has no default")
-    most = field.size or len(values)
-    if len(values) > most or (field.shape == "array" and len(values) != most):
+    max_count = field.size or len(values)
+    if len(values) > max_count or (field.shape == "array" and len(values) != max_count):
         raise ValueError(f"expected {field.size} values, got {len(values)}")
     for value in values:
         if field.type == "string":

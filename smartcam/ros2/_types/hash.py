@@ -10,7 +10,7 @@ import hashlib
 import json
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.ros2._types.definitions import EMPTY, Definition, MessageField
+from smartcam.ros2._types.definitions import EMPTY_MESSAGE_FIELD, Definition, MessageField
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +27,7 @@ _BOUNDED_STRING: Final = 21
 _ARRAY, _BOUNDED, _SEQUENCE = 48, 96, 144
 
 
-def _field(field: MessageField) -> dict[str, Any]:
+def _field_description(field: MessageField) -> dict[str, Any]:
     number = _NESTED if field.nested else _IDS[field.type]
     if field.limit:
         number = _BOUNDED_STRING
@@ -44,35 +44,37 @@ def _field(field: MessageField) -> dict[str, Any]:
     }
 
 
-def _described(definition: Definition) -> dict[str, Any]:
-    fields = [_field(field) for field in definition.fields or (EMPTY,)]
+def _type_description(definition: Definition) -> dict[str, Any]:
+    fields = [_field_description(field) for field in definition.fields or (EMPTY_MESSAGE_FIELD,)]
     return {"type_name": definition.name, "fields": fields}
 
 
-def description(definition: Definition, find: Callable[[str], Definition]) -> dict[str, Any]:
+def describe_with_nested(
+    definition: Definition, find: Callable[[str], Definition]
+) -> dict[str, Any]:
     """Return the description of a type and of all nested types."""
-    within: dict[str, Definition] = {}
-    ahead = definition.needs()
-    while ahead:
-        name = ahead.pop()
-        within[name] = find(name)
-        ahead |= within[name].needs() - within.keys()
+    nested: dict[str, Definition] = {}
+    missing = definition.nested_names()
+    while missing:
+        name = missing.pop()
+        nested[name] = find(name)
+        missing |= nested[name].nested_names() - nested.keys()
     return {
-        "type_description": _described(definition),
+        "type_description": _type_description(definition),
         "referenced_type_descriptions": [
-            _described(within[name]) for name in sorted(within) if name != definition.name
+            _type_description(nested[name]) for name in sorted(nested) if name != definition.name
         ],
     }
 
 
-def hash_of_description(described: dict[str, Any]) -> str:
+def hash_of_description(full_description: dict[str, Any]) -> str:
     """Return the hash of a message or service, ``RIHS01_`` and 64 digits."""
-    text = json.dumps(described)
+    text = json.dumps(full_description)
     return f"RIHS01_{hashlib.sha256(text.encode()).hexdigest()}"
 
 
-def event_of(name: str) -> Definition:
-    """Return a service's event, which introspection publishes; it is part of the hash."""
+def event_definition(name: str) -> Definition:
+    """Return the message that introspection publishes for a service; it is part of the hash."""
     return Definition(
         f"{name}_Event",
         (
@@ -85,8 +87,8 @@ def event_of(name: str) -> Definition:
     )
 
 
-def service_of(name: str) -> Definition:
-    """Return the form of a service from which its hash is made."""
+def service_definition(name: str) -> Definition:
+    """Return the definition of a service from which its hash is made."""
     parts = ("request", "response", "event")
     fields = tuple(MessageField(f"{part}_message", f"{name}_{part.title()}") for part in parts)
     return Definition(name, fields, {}, {})

@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._extras import load
 from smartcam.exceptions import ConfigurationError
-from smartcam.ros2._types.definitions import EMPTY, OTHER_NAMES, Definition, MessageField
+from smartcam.ros2._types.definitions import (
+    EMPTY_MESSAGE_FIELD,
+    TYPE_ALIASES,
+    Definition,
+    MessageField,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,11 +24,11 @@ DISTRIBUTIONS: Final = {
     "lyrical": "lyrical",
     "rolling": "lyrical",
 }
-"""The store of rosbags by the distribution; rolling uses the newest."""
+"""The store of rosbags for each distribution; rolling uses the newest store."""
 
 WITHOUT_HASHES: Final = frozenset({"humble"})
 
-LACKING: Final = {
+MISSING_BUILT_INS: Final = {
     "humble": frozenset(
         {
             "rcl_interfaces/srv/GetLoggerLevels",
@@ -38,13 +43,14 @@ _DEFAULTS: Final[dict[tuple[str, str], float | str]] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): "STATUS_UNKNOWN",
 }
-"""Defaults that the stores leave out; a text is the name of a constant, if the type has it."""
+"""Defaults that the stores leave out, by type and field. A text names a constant of the type; if
+the type has no such constant, there is no default."""
 
 _NAME, _ARRAY, _SEQUENCE = 2, 3, 4
 
 
 @functools.cache
-def stored(distribution: str) -> Mapping[str, Any]:
+def stored_fields(distribution: str) -> Mapping[str, Any]:
     """Return the fields of a distribution's messages, from rosbags.
 
     Raises:
@@ -61,27 +67,29 @@ def stored(distribution: str) -> Mapping[str, Any]:
     return definitions
 
 
-def read_stored(name: str, stored: Any) -> Definition:
+def read_stored(name: str, store_entry: Any) -> Definition:
     """Return the definition of a message that a store holds."""
-    constants = {constant: value for constant, _, value in stored[0]}
+    constants = {constant: value for constant, _, value in store_entry[0]}
     fields = []
-    for field, kind in stored[1]:
-        if field != EMPTY.name:
+    for field, kind in store_entry[1]:
+        if field != EMPTY_MESSAGE_FIELD.name:
             default = _DEFAULTS.get((name, field))
             if isinstance(default, str):
                 default = constants.get(default)
             fields.append(_field(field, kind)._replace(default=default))
-    kinds = {constant: str(OTHER_NAMES.get(kind, kind)) for constant, kind, _ in stored[0]}
-    return Definition(name, tuple(fields), constants, kinds)
+    constant_types = {
+        constant: str(TYPE_ALIASES.get(kind, kind)) for constant, kind, _ in store_entry[0]
+    }
+    return Definition(name, tuple(fields), constants, constant_types)
 
 
-def _field(name: str, stored: Any) -> MessageField:
+def _field(name: str, stored_type: Any) -> MessageField:
     shape, size = "", 0
-    if stored[0] in (_ARRAY, _SEQUENCE):
-        shape = "array" if stored[0] == _ARRAY else "sequence"
-        stored, size = stored[1]
-    if stored[0] == _NAME:
-        return MessageField(name, stored[1], shape, size)
+    if stored_type[0] in (_ARRAY, _SEQUENCE):
+        shape = "array" if stored_type[0] == _ARRAY else "sequence"
+        stored_type, size = stored_type[1]
+    if stored_type[0] == _NAME:
+        return MessageField(name, stored_type[1], shape, size)
     kind: str
-    kind, limit = stored[1]
-    return MessageField(name, OTHER_NAMES.get(kind, kind), shape, size, limit)
+    kind, limit = stored_type[1]
+    return MessageField(name, TYPE_ALIASES.get(kind, kind), shape, size, limit)

@@ -12,30 +12,35 @@ from smartcam._forks import cached_property
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, RosMessageError
 from smartcam.ros2._types.built_in import MESSAGES, SERVICES
-from smartcam.ros2._types.codec import HEAD, MisfitError, decoder, encoder
+from smartcam.ros2._types.codec import ENCAPSULATION, MisfitError, decoder, encoder
 from smartcam.ros2._types.definitions import (
     Definition,
     MessageField,
-    bare,
     dds_name,
     parse_message,
     parse_service,
     split_name,
+    without_defaults,
 )
 from smartcam.ros2._types.hash import (
     NOT_SUPPORTED,
-    description,
-    event_of,
+    describe_with_nested,
+    event_definition,
     hash_of_description,
-    service_of,
+    service_definition,
 )
-from smartcam.ros2._types.stores import LACKING, WITHOUT_HASHES, read_stored, stored
+from smartcam.ros2._types.stores import (
+    MISSING_BUILT_INS,
+    WITHOUT_HASHES,
+    read_stored,
+    stored_fields,
+)
 from smartcam.ros2._types.values import (
     LocatedError,
-    check,
-    filled,
+    check_message,
+    fill_message,
     message_class,
-    rule_of,
+    value_rule,
     zero_maker,
 )
 
@@ -45,7 +50,7 @@ if TYPE_CHECKING:
     from smartcam.ros2._types.values import RosMessage
 
 _ORDERS: Final = {b"\0\1": "<", b"\0\0": ">"}
-_MISFITS: Final = (
+_MISFIT_ERRORS: Final = (
     MisfitError,
     struct.error,
     KeyError,
@@ -67,8 +72,8 @@ class MessageType:
         fields: name, type, shape, bounds and default of each field.
         constants: constants by name; they are attributes of ``cls``, too.
         nested: the nested types by name.
-        cls: the class of the messages, created with all fields in their order; values are checked
-            when they are encoded: the fastest way.
+        cls: the class of the messages. Creating one with all fields in their order is the fastest
+            way; values are checked when the message is encoded.
     """
 
     def __init__(
@@ -94,14 +99,14 @@ class MessageType:
     @cached_property
     def description(self) -> dict[str, Any]:
         """The fields of ``type_description_interfaces/msg/TypeDescription``."""
-        return description(self._definition, self._types.definition)
+        return describe_with_nested(self._definition, self._types.definition)
 
     @cached_property
     def text(self) -> str:
-        """The definitions of the type and all nested ones, in recordings' form (``ros2msg``)."""
-        within = description(self._definition, self._types.definition)
+        """The definitions of the type and of all nested types in recordings' form (``ros2msg``)."""
+        full_description = describe_with_nested(self._definition, self._types.definition)
         parts = [self._definition.text()]
-        for referenced in within["referenced_type_descriptions"]:
+        for referenced in full_description["referenced_type_descriptions"]:
             name: str = referenced["type_name"]
             head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
             parts.append(head + self._types.definition(name).text())
@@ -114,8 +119,8 @@ class MessageType:
 
     @cached_property
     def rules(self) -> dict[str, tuple[MessageField, Callable[[Any], Any]]]:
-        """Each field by its name in Python, and the function that checks and converts a value."""
-        return {field.attribute: (field, rule_of(self, field)) for field in self.fields}
+        """Field by its name in Python, with the function that checks and converts a value."""
+        return {field.attribute: (field, value_rule(self, field)) for field in self.fields}
 
     @cached_property
     def _encode(self) -> Callable[[Any], bytes]:
@@ -133,7 +138,7 @@ class MessageType:
         Raises:
             RosMessageError: there is no such field, or a value does not fit.
         """
-        return self._filled(fields)
+        return self._fill(fields)
 
     def encode(self, message: Any) -> bytes:
         """Return a message, or a mapping of its fields, in CDR: little-endian, with encapsulation.
@@ -142,31 +147,31 @@ class MessageType:
             RosMessageError: the value is of another type, or a field does not fit.
         """
         if isinstance(message, Mapping):
-            message = self._filled(message)
+            message = self._fill(message)
         elif getattr(message, "__msgtype__", None) != self.name:
             actual = getattr(message, "__msgtype__", type(message).__name__)
             raise RosMessageError(f"{self.name}: expected a message of this type, got {actual}")
         try:
             return self._encode(message)
-        except _MISFITS as exc:
-            raise RosMessageError(f"{self.name}: {self._reason(message) or exc}") from exc
+        except _MISFIT_ERRORS as exc:
+            raise RosMessageError(f"{self.name}: {self._find_misfit(message) or exc}") from exc
 
-    def _flat(self, data: object) -> memoryview:
-        """Return the contents of other kinds of buffers as flat bytes."""
+    def _as_flat_bytes(self, data: object) -> memoryview:
+        """Return the contents of a bytearray or memoryview as a flat view of bytes."""
         if not isinstance(data, bytearray | memoryview):
             raise RosMessageError(f"{self.name}: expected bytes, got {type(data).__name__}")
         view = memoryview(data)
         return view.cast("B") if view.c_contiguous else memoryview(view.tobytes())
 
-    def _filled(self, fields: Mapping[str, Any]) -> Any:
+    def _fill(self, fields: Mapping[str, Any]) -> Any:
         try:
-            return filled(self, fields)
+            return fill_message(self, fields)
         except LocatedError as exc:
             raise RosMessageError(f"{self.name}: {exc}") from exc
 
-    def _reason(self, message: Any) -> str:
+    def _find_misfit(self, message: Any) -> str:
         try:
-            check(self, message)
+            check_message(self, message)
         except LocatedError as exc:
             return str(exc)
         return ""
@@ -178,16 +183,16 @@ class MessageType:
 
         Args:
             data: bytes of the message.
-            whole: whether the message has to fill the bytes; ROS' own serializer may add further
+            whole: True if the message has to fill the bytes; ROS' own serializer may add further
                 bytes with any contents.
 
         Raises:
             RosMessageError: the bytes are not such a message, or too few, or too many.
         """
         if not isinstance(data, bytes):
-            data = self._flat(data)
+            data = self._as_flat_bytes(data)
         order = _ORDERS.get(bytes(data[:2]))
-        if order is None or len(data) < len(HEAD):
+        if order is None or len(data) < len(ENCAPSULATION):
             raise RosMessageError(
                 f"{self.name}: expected CDR with its encapsulation 00 01 or 00 00, got "
                 f"{len(data)} bytes: {bytes(data[:4]).hex(' ') or 'none'}"
@@ -197,14 +202,14 @@ class MessageType:
             decode = self._decoders[order] = decoder(self, order)
         try:
             message, end = decode(data)
-        except _MISFITS as exc:
+        except _MISFIT_ERRORS as exc:
             raise RosMessageError(
                 f"{self.name}: {len(data)} bytes are no such message: {exc}"
             ) from exc
-        left = len(data) - end
-        if whole and left and (left > 3 or len(data) % 4 or any(data[end:])):
+        extra = len(data) - end
+        if whole and extra and (extra > 3 or len(data) % 4 or any(data[end:])):
             raise RosMessageError(
-                f"{self.name}: expected {end} bytes, got {len(data)}: {left} follow the message"
+                f"{self.name}: expected {end} bytes, got {len(data)}: {extra} follow the message"
             )
         return message
 
@@ -232,12 +237,12 @@ class ServiceType:
     @cached_property
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
-        return self._types.hash_of(service_of(self.name))
+        return self._types.hash_of(service_definition(self.name))
 
     @cached_property
     def description(self) -> dict[str, Any]:
         """The fields of ``type_description_interfaces/msg/TypeDescription``."""
-        return description(service_of(self.name), self._types.definition)
+        return describe_with_nested(service_definition(self.name), self._types.definition)
 
     @cached_property
     def event(self) -> MessageType:
@@ -265,7 +270,7 @@ class RosTypes:
 
     def __init__(self, distribution: str = "jazzy") -> None:
         self.distribution = distribution
-        self._stored = stored(distribution)
+        self._stored = stored_fields(distribution)
         self._shared = None if isinstance(self, _Shared) else _shared(distribution)
         self._lock = threading.RLock()
         self._definitions: dict[str, Definition] = {}
@@ -278,8 +283,8 @@ class RosTypes:
 
     def names(self) -> list[str]:
         """Return the names of all messages and services, sorted."""
-        lacking = LACKING.get(self.distribution, frozenset())
-        return sorted({*self._stored, *MESSAGES, *SERVICES, *self._added} - lacking)
+        missing = MISSING_BUILT_INS.get(self.distribution, frozenset())
+        return sorted({*self._stored, *MESSAGES, *SERVICES, *self._added} - missing)
 
     def message(self, name: str) -> MessageType:
         """Return a type of message, such as ``std_msgs/msg/String``.
@@ -287,8 +292,8 @@ class RosTypes:
         Raises:
             ConfigurationError: there is no message of this name, or a nested one is not known.
         """
-        if (made := self._messages.get(name)) is not None:
-            return made
+        if (cached := self._messages.get(name)) is not None:
+            return cached
         split_name(name, "msg")
         return self.message_of(name)
 
@@ -299,19 +304,19 @@ class RosTypes:
             ConfigurationError: there is no service of this name, or a nested message is not
                 known.
         """
-        if (made := self._services.get(name)) is not None:
-            return made
+        if (cached := self._services.get(name)) is not None:
+            return cached
         split_name(name, "srv")
         if self._shared is not None and name not in self._added:
             return self._shared.service(name)
         if (text := self._service_text(name)) is None:
             raise self._unknown_type_error(name)
         with self._lock:
-            if (made := self._services.get(name)) is None:
-                for definition in (*parse_service(name, text), event_of(name)):
+            if (cached := self._services.get(name)) is None:
+                for definition in (*parse_service(name, text), event_definition(name)):
                     self._definitions[definition.name] = definition
-                made = self._services[name] = ServiceType(name, self)
-        return made
+                cached = self._services[name] = ServiceType(name, self)
+        return cached
 
     def add(self, name: str, text: str) -> None:
         """Add a message (``pkg/msg/Name``) or service (``pkg/srv/Name``) by the text of its file.
@@ -322,16 +327,16 @@ class RosTypes:
             ConfigurationError: the text defines no message or service, or another type has the
                 name.
         """
-        _, kind, _ = split_name(name)
-        parse = parse_service if kind == "srv" else parse_message
+        _, category, _ = split_name(name)
+        parse = parse_service if category == "srv" else parse_message
         parsed = parse(name, text)
         with self._lock:
             if name in self.names():
-                if kind == "srv":
+                if category == "srv":
                     known: Any = parse(name, self._service_text(name) or "")
                 else:
                     known = self.definition(name)
-                if bare(known) != bare(parsed):
+                if without_defaults(known) != without_defaults(parsed):
                     raise ConfigurationError(
                         f"{name}: {self.distribution} has it with other fields, expected the same"
                     )
@@ -344,41 +349,45 @@ class RosTypes:
         Raises:
             ConfigurationError: the message is not known.
         """
-        made = self._definitions.get(name)
-        if made is None:
+        cached = self._definitions.get(name)
+        if cached is None:
             if name in self._added:
-                made = parse_message(name, self._added[name])
+                cached = parse_message(name, self._added[name])
             elif self._shared is not None:
                 return self._shared.definition(name)
             elif name in self._stored:
-                made = read_stored(name, self._stored[name])
+                cached = read_stored(name, self._stored[name])
             elif name in MESSAGES:
-                made = parse_message(name, MESSAGES[name])
+                cached = parse_message(name, MESSAGES[name])
             else:
                 raise self._unknown_type_error(name)
-            self._definitions[name] = made
-        return made
+            self._definitions[name] = cached
+        return cached
 
-    def message_of(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
-        """Return a message's type; only for this module, like the methods below."""
-        if (made := self._messages.get(name)) is not None:
-            return made
+    def message_of(self, name: str, outer_names: tuple[str, ...] = ()) -> MessageType:
+        """Return a message's type; like the methods below, it is for this package only."""
+        if (cached := self._messages.get(name)) is not None:
+            return cached
         if self._shared is not None and name not in self._added and name not in self._definitions:
             return self._shared.message_of(name)
-        if name in within:
-            raise ConfigurationError(f"{name} has itself within: {' > '.join((*within, name))}")
+        if name in outer_names:
+            raise ConfigurationError(
+                f"{name} has itself within: {' > '.join((*outer_names, name))}"
+            )
         with self._lock:
-            if (made := self._messages.get(name)) is None:
+            if (cached := self._messages.get(name)) is None:
                 definition = self.definition(name)
-                needs = sorted(definition.needs())
-                nested = {need: self.message_of(need, (*within, name)) for need in needs}
-                made = self._messages[name] = MessageType(definition, nested, self)
-        return made
+                nested_names = sorted(definition.nested_names())
+                nested = {
+                    need: self.message_of(need, (*outer_names, name)) for need in nested_names
+                }
+                cached = self._messages[name] = MessageType(definition, nested, self)
+        return cached
 
     def _service_text(self, name: str) -> str | None:
         if name in self._added:
             return self._added[name]
-        return None if name in LACKING.get(self.distribution, ()) else SERVICES.get(name)
+        return None if name in MISSING_BUILT_INS.get(self.distribution, ()) else SERVICES.get(name)
 
     def source(self, name: str) -> tuple[str, str]:
         """Return the encoding and the text of a type's file.
@@ -398,18 +407,18 @@ class RosTypes:
         """Return a type's hash."""
         if self.distribution in WITHOUT_HASHES:
             return NOT_SUPPORTED
-        return hash_of_description(description(definition, self.definition))
+        return hash_of_description(describe_with_nested(definition, self.definition))
 
     def _unknown_type_error(self, name: str) -> ConfigurationError:
-        close = did_you_mean(name, self.names())
+        suggestion = did_you_mean(name, self.names())
         return ConfigurationError(
             f"{name}: no such type in {self.distribution}, expected a name of it or add() first"
-            f"{close}"
+            f"{suggestion}"
         )
 
 
 class _Shared(RosTypes):
-    """The own types of a distribution, to which none are added."""
+    """The types of a distribution itself, without added types."""
 
 
 @functools.cache

@@ -10,25 +10,25 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-class SaysWhatWasExpected:
+class ExplainedChecks:
     """Base of the suites: a failed check shows its expectation before the comparison."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         for name, check in list(vars(cls).items()):
             if name.startswith("test_") and inspect.isfunction(check):
-                setattr(cls, name, _in_words(check))
+                setattr(cls, name, _with_explained_failure(check))
 
 
-def _in_words(check: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a check whose failure begins with its expectation."""
+def _with_explained_failure(check: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a check whose failure's text begins with the check's name and docstring."""
     words = check.__name__.removeprefix("test_").replace("_", " ")
     text = " ".join((check.__doc__ or "").split())
 
     @functools.wraps(check)
-    def run(*args: Any, **given: Any) -> Any:
+    def run(*args: Any, **kwargs: Any) -> Any:
         try:
-            return check(*args, **given)
+            return check(*args, **kwargs)
         except AssertionError as exc:
             exc.args = (f"expected: {words}. {text}\nfound otherwise: {exc}",)
             raise

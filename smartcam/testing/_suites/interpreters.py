@@ -35,7 +35,7 @@ from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader
 from smartcam.layout import Layout
 from smartcam.models import Pose, jsonable
 from smartcam.registry import INTERPRETERS
-from smartcam.testing._suites.in_words import SaysWhatWasExpected
+from smartcam.testing._suites.in_words import ExplainedChecks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -45,15 +45,15 @@ if TYPE_CHECKING:
     from smartcam.interpreters._inside import Spec
 
 MAX_ERROR_LENGTH = 500
-"""Largest number of characters of an error's text, which has at most 64 of a container's bytes."""
+"""Largest number of characters of an error's text. It may show 64 bytes of a container."""
 
-MAX_PLACES = 256
-"""Largest number of places of a container at which one variation is tried."""
+MAX_OFFSETS = 256
+"""Largest number of offsets in a container at which one variation is tried."""
 
-TRAILING = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
+TRAILING_BYTES = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
 """Bytes that may follow a container."""
 
-NOT_FINITE = tuple(
+NON_FINITE_NUMBERS = tuple(
     struct.pack(order + code, number)
     for order in "<>"
     for code in "fd"
@@ -64,7 +64,7 @@ NOT_FINITE = tuple(
 LAYOUTS = ("x: int8", "x: real32 mm, y: real32 mm, theta: real32 deg", "(name: string[3])*")
 """Layouts that a user may write after an interpreter's name."""
 
-_AT = datetime(2024, 2, 29, 23, 59, 30, tzinfo=UTC)
+_RECEIVED_AT = datetime(2024, 2, 29, 23, 59, 30, tzinfo=UTC)
 _ADDRESS = re.compile(r"<.* at 0x[0-9A-Fa-f]+>")
 
 
@@ -77,8 +77,8 @@ class ContainerSample:
         value: value that the interpreter returns; for an array its ``tolist()`` suffices.
         layout: text that the user writes after the interpreter's name, None without one.
         big: bytes of the container with big-endian numbers, equal to ``data`` if it has no
-            numbers. It may be left out if the interpreter has a layout, which gives the places
-            of numbers.
+            numbers. It may be left out if the interpreter has a layout, which says where the
+            numbers are.
         sequence: sequence number of the container.
         name: name of the sample for people.
     """
@@ -91,7 +91,7 @@ class ContainerSample:
     name: str = ""
 
 
-class InterpreterSuite(SaysWhatWasExpected):
+class InterpreterSuite(ExplainedChecks):
     """The tests that every interpreter has to pass.
 
     Attributes:
@@ -145,7 +145,9 @@ class InterpreterSuite(SaysWhatWasExpected):
         interpreter = self.make(sample.layout)
         for _ in range(2):
             value = interpret(interpreter, sample.data)
-            assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
+            assert _equals_expected(value, sample.value), (
+                f"expected {sample.value!r}, got {value!r}"
+            )
 
     def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
         """Check that the number is the value of the layout's field, or None, or an error."""
@@ -153,11 +155,11 @@ class InterpreterSuite(SaysWhatWasExpected):
         reader = _reader(interpreter, sample.data)
         sequence = interpreter.sequence(reader)
         assert sequence == sample.sequence, f"expected number {sample.sequence}, got {sequence}"
-        for data in (*_cuts(sample.data), *(sample.data + more for more in TRAILING)):
+        for data in (*_prefixes(sample.data), *(sample.data + more for more in TRAILING_BYTES)):
             try:
                 number = interpreter.sequence(_reader(interpreter, data))
             except InterpretationError as error:
-                see_error(error, data)
+                check_error(error, data)
             else:
                 assert number is None or isinstance(number, int), f"{data!r}: number {number!r}"
 
@@ -167,22 +169,26 @@ class InterpreterSuite(SaysWhatWasExpected):
         first = interpret(interpreter, sample.data)
         between = [each.data for each in self.samples if each.layout == sample.layout]
         for data in (*between, sample.data[:-1], sample.data + b"\0", b""):
-            outcome(interpreter, data)
+            interpret_or_none(interpreter, data)
             again = interpret(interpreter, sample.data)
-            assert _same(again, first), f"first {first!r}, after {data!r} {again!r}"
-            shared = [part for part in _mutable(first) if id(part) in set(map(id, _mutable(again)))]
+            assert _is_identical(again, first), f"first {first!r}, after {data!r} {again!r}"
+            shared = [
+                part
+                for part in _mutable_parts(first)
+                if id(part) in set(map(id, _mutable_parts(again)))
+            ]
             assert not shared, f"two values share {shared[0]!r}"
         other = interpret(self.make(sample.layout), sample.data)
-        assert _same(other, first), f"first {first!r}, of another interpreter {other!r}"
+        assert _is_identical(other, first), f"first {first!r}, of another interpreter {other!r}"
 
     def test_nothing_is_kept(self, sample: ContainerSample) -> None:
-        """Keeps neither bytes nor anything else; the bytes stay unchanged."""
+        """Check that the interpreter keeps neither bytes nor other state, nor changes the bytes."""
         interpreter = self.make(sample.layout)
-        outcome(interpreter, sample.data)  # facts learned at the first call may be kept
+        interpret_or_none(interpreter, sample.data)  # facts learned at the first call may be kept
         data = bytes(bytearray(sample.data))
         state, before = repr(vars(interpreter)), sys.getrefcount(data)
         for _ in range(3):
-            outcome(interpreter, data)
+            interpret_or_none(interpreter, data)
         assert data == sample.data, f"the container was changed to {data!r}"
         now = repr(vars(interpreter))
         assert now == state, f"the interpreter was changed from {state} to {now}"
@@ -194,8 +200,8 @@ class InterpreterSuite(SaysWhatWasExpected):
         """Check the value's JSON, which ``--json`` and monitoring tools write."""
         value = interpret(self.make(sample.layout), sample.data)
         text = json.dumps(jsonable(value), allow_nan=False)
-        nameless = _ADDRESS.search(text)
-        assert nameless is None, f"JSON has no word for {nameless and nameless[0]!r} in {value!r}"
+        address = _ADDRESS.search(text)
+        assert address is None, f"JSON has no word for {address and address[0]!r} in {value!r}"
 
     def test_big_endian_gives_the_same_value(self, sample: ContainerSample) -> None:
         """Check both byte orders; the camera's status tells the order, in ``reader.context``."""
@@ -206,24 +212,26 @@ class InterpreterSuite(SaysWhatWasExpected):
                 pytest.skip(
                     "ContainerSample(big=...) is missing: the container with big-endian numbers"
                 )
-            big = _turned(interpreter.layout, sample.data)
+            big = _swap_byte_order(interpreter.layout, sample.data)
         value = interpret(interpreter, big, byte_order="big")
-        assert _like(value, sample.value), f"{big!r}: expected {sample.value!r}, got {value!r}"
+        assert _equals_expected(value, sample.value), (
+            f"{big!r}: expected {sample.value!r}, got {value!r}"
+        )
 
     # ------------------------------------------------------------------ bytes that do not fit
 
     def test_cut_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
         """Check each length: it gives a value, or an InterpretationError with the expectation."""
         interpreter = self.make(sample.layout)
-        for data in (b"", *_cuts(sample.data)):
-            see(interpreter, data)
+        for data in (b"", *_prefixes(sample.data)):
+            check_outcome(interpreter, data)
 
     def test_longer_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
         """Check that bytes after a container cause no other kind of error either."""
         interpreter = self.make(sample.layout)
-        for more in TRAILING:
-            see(interpreter, sample.data + more)
-            see(interpreter, sample.data + sample.data + more)
+        for more in TRAILING_BYTES:
+            check_outcome(interpreter, sample.data + more)
+            check_outcome(interpreter, sample.data + sample.data + more)
 
     def test_any_bytes_are_a_value_or_told(self, sample: ContainerSample) -> None:
         """Check any bytes, since the user may have named the wrong interpreter."""
@@ -234,31 +242,36 @@ class InterpreterSuite(SaysWhatWasExpected):
         orders = strategies.st.sampled_from(["little", "big"])
 
         def check(data: DataObject) -> None:
-            see(interpreter, data.draw(contents), byte_order=data.draw(orders))
+            check_outcome(interpreter, data.draw(contents), byte_order=data.draw(orders))
 
-        strategies.each_drawn(check)
+        strategies.run_with_examples(check)
 
     def test_poses_are_of_finite_numbers(self, sample: ContainerSample) -> None:
-        """NaN or infinity at any place are an error if a robot would move to them."""
+        """Check NaN and infinity at any offset: a pose with such numbers must be an error."""
         interpreter = self.make(sample.layout)
         size = len(sample.data)
-        for number in NOT_FINITE:
+        for number in NON_FINITE_NUMBERS:
             last = size - len(number)
-            for place in range(0, last + 1, 1 + size // MAX_PLACES):
-                data = sample.data[:place] + number + sample.data[place + len(number) :]
+            for offset in range(0, last + 1, 1 + size // MAX_OFFSETS):
+                data = sample.data[:offset] + number + sample.data[offset + len(number) :]
                 for order in ("little", "big"):
-                    see(interpreter, data, byte_order=order)
+                    check_outcome(interpreter, data, byte_order=order)
 
     def test_any_context_is_borne(self, sample: ContainerSample) -> None:
         """Check unusual names, numbers and options of the client."""
         interpreter = self.make(sample.layout)
         for options in (
-            {"camera": "é " * 100, "application": -1, "number": 1 << 40, "received_at": _AT},
+            {
+                "camera": "é " * 100,
+                "application": -1,
+                "number": 1 << 40,
+                "received_at": _RECEIVED_AT,
+            },
             {"application": (1 << 32) - 1, "y_down": True},
             {"lenient": True},
         ):
             for data in (sample.data, sample.data[:-1], b"\x01" * len(sample.data)):
-                see(interpreter, data, **options)
+                check_outcome(interpreter, data, **options)
 
     # ------------------------------------------------------------------ self-description
 
@@ -268,28 +281,32 @@ class InterpreterSuite(SaysWhatWasExpected):
         if not isinstance(interpreter, PlainInterpreter):
             return  # the client reads them one by one
         burst = [each.data for each in self.samples if each.layout == sample.layout] * 2
-        context = Context(camera="burst", number=5, received_at=_AT)
+        context = Context(camera="burst", number=5, received_at=_RECEIVED_AT)
         values = interpreter.read_all(burst, context)
         assert len(values) == len(burst), f"{len(burst)} containers gave {len(values)} values"
         empty = 0
         for number, (data, value) in enumerate(zip(burst, values, strict=True), 5):
-            single = Context(camera="burst", number=number, received_at=_AT)
+            single = Context(camera="burst", number=number, received_at=_RECEIVED_AT)
             read = interpreter.read(data, single)
-            assert _same(value, read), f"read() gives {read!r}, read_all() {value!r}"
-            by_reader = interpreter.interpret(Reader(data, Context("burst", 0, number, _AT)))
-            assert _same(by_reader, read), f"read() gives {read!r}, interpret() {by_reader!r}"
+            assert _is_identical(value, read), f"read() gives {read!r}, read_all() {value!r}"
+            by_reader = interpreter.interpret(
+                Reader(data, Context("burst", 0, number, _RECEIVED_AT))
+            )
+            assert _is_identical(by_reader, read), (
+                f"read() gives {read!r}, interpret() {by_reader!r}"
+            )
             empty += single.empty_slots
         assert context.empty_slots == empty, f"empty_slots: {context.empty_slots}, not {empty}"
 
     def test_layout_is_taken_or_refused(self, sample: ContainerSample) -> None:
-        """Any text after the name, or none, raises a ConfigurationError at most."""
+        """Check that any layout, or none, gives an interpreter or a ConfigurationError."""
         for layout in (None, *LAYOUTS):
             try:
                 interpreter = self.make(layout)
             except ConfigurationError:
                 continue
             assert isinstance(interpreter, Interpreter), f"{layout}: {interpreter!r}"
-            see(interpreter, sample.data)
+            check_outcome(interpreter, sample.data)
 
     def test_entry_point_gives_the_interpreter(self, sample: ContainerSample) -> None:
         """Check that ``interpret_as="name"`` finds the interpreter: its package is installed."""
@@ -304,7 +321,9 @@ class InterpreterSuite(SaysWhatWasExpected):
         assert isinstance(spec, str) or loaded is spec, f"{self.name!r} gives {loaded!r:.200}"
         text = self.name if sample.layout is None else f"{self.name}: {sample.layout}"
         value = interpret(resolve(text), sample.data)
-        assert _like(value, sample.value), f"{text!r}: expected {sample.value!r}, got {value!r}"
+        assert _equals_expected(value, sample.value), (
+            f"{text!r}: expected {sample.value!r}, got {value!r}"
+        )
 
 
 def _reader(interpreter: Interpreter, data: bytes, **context: Any) -> Reader:
@@ -316,7 +335,7 @@ def interpret(interpreter: Interpreter, data: bytes, **context: Any) -> object:
     return interpreter.interpret(_reader(interpreter, data, **context))
 
 
-def outcome(interpreter: Interpreter, data: bytes) -> object:
+def interpret_or_none(interpreter: Interpreter, data: bytes) -> object:
     """Return an interpreter's value, None if it raises an InterpretationError."""
     try:
         return interpret(interpreter, data)
@@ -324,7 +343,7 @@ def outcome(interpreter: Interpreter, data: bytes) -> object:
         return None
 
 
-def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
+def check_outcome(interpreter: Interpreter, data: bytes, **context: Any) -> None:
     """Check that bytes give a sensible value, or the right kind of error.
 
     Raises:
@@ -334,7 +353,7 @@ def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
     try:
         value = interpret(interpreter, data, **context)
     except InterpretationError as error:
-        see_error(error, data)
+        check_error(error, data)
         return
     except Exception as error:
         message = f"{where}: expected a value or an InterpretationError, got {error!r}"
@@ -344,8 +363,8 @@ def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
         assert all(map(math.isfinite, numbers)), f"{where}: a pose that is not finite: {pose}"
 
 
-def see_error(error: InterpretationError, data: bytes) -> None:
-    """Check that an error is short, says what was expected at which place, and survives pickle.
+def check_error(error: InterpretationError, data: bytes) -> None:
+    """Check that an error is short, says what was expected at which offset, and can be pickled.
 
     Raises:
         AssertionError: the error fails.
@@ -363,26 +382,26 @@ def see_error(error: InterpretationError, data: bytes) -> None:
     assert (type(copy), str(copy), copy.field, copy.offset) == same, f"{where}: a copy is {copy!r}"
 
 
-def _cuts(data: bytes) -> Iterator[bytes]:
-    for end in range(0, len(data), 1 + len(data) // MAX_PLACES):
+def _prefixes(data: bytes) -> Iterator[bytes]:
+    for end in range(0, len(data), 1 + len(data) // MAX_OFFSETS):
         yield data[:end]
     yield data[:-1]
 
 
-def _turned(layout: Layout, data: bytes) -> bytes:
+def _swap_byte_order(layout: Layout, data: bytes) -> bytes:
     """Return a container with its numbers in the other byte order."""
-    turned, place = bytearray(), 0
-    todo = [*layout.head, *layout.fields]
-    while place < len(data) and todo:
-        for field in todo:
-            piece = data[place : place + field.size]
-            turned += piece[::-1] if field.wire.is_number else piece
-            place += field.size
-        todo = list(layout.fields)
-    return bytes(turned)
+    swapped, offset = bytearray(), 0
+    fields_left = [*layout.head, *layout.fields]
+    while offset < len(data) and fields_left:
+        for field in fields_left:
+            piece = data[offset : offset + field.size]
+            swapped += piece[::-1] if field.wire.is_number else piece
+            offset += field.size
+        fields_left = list(layout.fields)
+    return bytes(swapped)
 
 
-def _parts(value: object) -> Iterator[object]:
+def _nested_values(value: object) -> Iterator[object]:
     """Yield a value and everything in it."""
     yield value
     inside: Sequence[object] = ()
@@ -394,19 +413,19 @@ def _parts(value: object) -> Iterator[object]:
     elif is_dataclass(value) and not isinstance(value, type):
         inside = [getattr(value, field.name) for field in fields(value)]
     for item in inside:
-        yield from _parts(item)
+        yield from _nested_values(item)
 
 
 def _poses(value: object) -> Iterator[Pose]:
-    return (part for part in _parts(value) if isinstance(part, Pose))
+    return (part for part in _nested_values(value) if isinstance(part, Pose))
 
 
-def _mutable(value: object) -> list[object]:
+def _mutable_parts(value: object) -> list[object]:
     """Return the mutable objects in a value."""
     kinds = (list, dict, set, bytearray)
     return [
         part
-        for part in _parts(value)
+        for part in _nested_values(value)
         if isinstance(part, kinds)
         or bool(getattr(getattr(part, "flags", None), "writeable", False))
         or _is_open(part)
@@ -414,7 +433,7 @@ def _mutable(value: object) -> list[object]:
 
 
 def _is_open(value: object) -> bool:
-    """Return True if a value is a dataclass's object that can be changed."""
+    """Return True if a value is an object of a dataclass that is not frozen."""
     if not is_dataclass(value) or isinstance(value, type):
         return False
     return not cast("Any", value).__dataclass_params__.frozen
@@ -425,16 +444,16 @@ def _is_array(value: object) -> bool:
     return numpy is not None and isinstance(value, numpy.ndarray)
 
 
-def _like(value: Any, expected: Any) -> bool:
+def _equals_expected(value: Any, expected: Any) -> bool:
     """Return True if a value equals the author's value."""
     if _is_array(value):
-        return _same(value, expected) if _is_array(expected) else value.tolist() == expected
+        return _is_identical(value, expected) if _is_array(expected) else value.tolist() == expected
     if isinstance(value, float) and isinstance(expected, float):
         return value == expected or (math.isnan(value) and math.isnan(expected))
     return bool(value == expected)
 
 
-def _same(one: Any, other: Any) -> bool:
+def _is_identical(one: Any, other: Any) -> bool:
     """Return True if two values are equal, including types and NaN."""
     if type(one) is not type(other):
         return False
@@ -444,9 +463,9 @@ def _same(one: Any, other: Any) -> bool:
     if isinstance(one, float):
         return one == other or (math.isnan(one) and math.isnan(other))
     if isinstance(one, dict):
-        return [*one] == [*other] and all(_same(one[key], other[key]) for key in one)
+        return [*one] == [*other] and all(_is_identical(one[key], other[key]) for key in one)
     if isinstance(one, (list, tuple)):
-        return len(one) == len(other) and all(map(_same, one, other))
+        return len(one) == len(other) and all(map(_is_identical, one, other))
     if is_dataclass(one):
-        return all(_same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+        return all(_is_identical(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
     return bool(one == other) or repr(one) == repr(other)

@@ -1,7 +1,7 @@
 """Hypothesis strategies for the suites: bytes, and places to cut them.
 
-:func:`each_drawn` calls a check with each drawing, and makes a test of its own for that, since a
-method that several classes inherit cannot be one. The profile sets the number of examples.
+Hypothesis refuses a method that several classes inherit as a test, so :func:`run_with_examples`
+defines one for each call. Hypothesis' profile sets the number of examples.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ MAX_NOISE_BYTES = 200
 """Largest number of bytes of one piece of noise."""
 
 
-def each_drawn(check: Callable[[DataObject], None]) -> None:
-    """Call a check with one drawing after the other; the smallest that fails is shown.
+def run_with_examples(check: Callable[[DataObject], None]) -> None:
+    """Call a check with one drawing after the other; the smallest drawing that fails is shown.
 
     Raises:
         AssertionError: the check's error, with the drawing as a note.
     """
-    quiet = [HealthCheck.too_slow, HealthCheck.data_too_large]
+    suppressed_checks = [HealthCheck.too_slow, HealthCheck.data_too_large]
 
-    @settings(deadline=None, report_multiple_bugs=False, suppress_health_check=quiet)
+    @settings(deadline=None, report_multiple_bugs=False, suppress_health_check=suppressed_checks)
     @given(data=st.data())
     def drawn(data: DataObject) -> None:
         check(data)
@@ -54,17 +54,17 @@ def noise(samples: Sequence[bytes]) -> SearchStrategy[bytes]:
         sample,
         st.builds(lambda data, end: data[:end], sample, st.integers(0, MAX_NOISE_BYTES)),
         st.builds(lambda data, begin: data[begin:], sample, st.integers(0, MAX_NOISE_BYTES)),
-        st.builds(_changed, sample, st.integers(0, MAX_NOISE_BYTES), st.integers(0, 255)),
+        st.builds(_change_byte, sample, st.integers(0, MAX_NOISE_BYTES), st.integers(0, 255)),
         st.builds(lambda data, times: data * times, sample, st.integers(2, 3)),
     )
 
 
-def _changed(data: bytes, place: int, byte: int) -> bytes:
-    place %= len(data)
-    return data[:place] + bytes([byte]) + data[place + 1 :]
+def _change_byte(data: bytes, offset: int, byte: int) -> bytes:
+    offset %= len(data)
+    return data[:offset] + bytes([byte]) + data[offset + 1 :]
 
 
-def cut(data: DataObject, whole: bytes) -> list[bytes]:
+def draw_pieces(data: DataObject, whole: bytes) -> list[bytes]:
     """Draw places to cut bytes at, and return the pieces; none is empty."""
     places = data.draw(st.lists(st.integers(0, len(whole)), max_size=8), label="cut at")
     edges = sorted({0, *places, len(whole)})

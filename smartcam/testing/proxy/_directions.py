@@ -1,7 +1,7 @@
 """One direction of a TCP connection through the proxy: bytes in, edits, bytes out.
 
 A byte's way: ``Pipe._receive`` -> ``Editor.feed`` -> ``DelayLine`` -> ``Pipe._carry`` -> the other
-socket. A pipe that cannot write, or holds enough, reads no more.
+socket. A pipe stops reading while it cannot write, or while enough bytes wait in it.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ CHUNK = 1 << 16
 """Size of one read in bytes."""
 
 MAX_HELD_BYTES = 1 << 18
-"""Largest number of bytes that wait in one direction before the proxy stops reading; one more chunk
-and inserted bytes may be added. It leaves room for the bytes that a rule may hold back."""
+"""Number of waiting bytes in one direction at which the proxy stops reading. One more chunk and
+inserted bytes may be added. The number exceeds the bytes that a rule may hold back."""
 
 WRITE_INTERVAL = 0.01
 """Seconds between two writes if the rate is limited."""
 
 TURNS_BETWEEN_WRITES = 2
-"""Turns of the event loop between two writes that have to arrive separately: in the first, a
-receiver on this loop gets the written bytes, but after this callback."""
+"""Turns of the event loop between two writes that have to arrive separately. A receiver on the same
+loop reads the first write in the first turn, after the callback that wrote."""
 
 
 class Pipe:
@@ -50,11 +50,11 @@ class Pipe:
     ) -> None:
         self.source = source
         self.target = target
-        self.finished: bool = False  # whether the sender's end was passed on
+        self.eof_passed: bool = False  # whether the sender's end was passed on
         self._connection = connection
         self._direction: Direction = direction
         self._editor = Editor(rules)
-        self._line = DelayLine[Edit](
+        self._delay_line = DelayLine[Edit](
             RealClock(),
             ordered=True,
             turns=TURNS_BETWEEN_WRITES,
@@ -63,48 +63,48 @@ class Pipe:
             end=self._end,
             lost=lambda _: None,
         )
-        self._delay: tuple[DelayBytes, Random] | None = None
-        self._rate: Rate | None = None
-        self._set_pace(rules)
+        self._delay_rule: tuple[DelayBytes, Random] | None = None
+        self._rate_rule: Rate | None = None
+        self._set_timing_rules(rules)
         self._loop = asyncio.get_running_loop()
         self._unsent = bytearray()  # bytes after the delay line that wait for socket or rate
-        self._free_at = 0.0  # time before which nothing is written
+        self._next_write_at = 0.0  # time before which nothing is written
         self._timer: asyncio.TimerHandle | None = None
         self._reading = self._writing = self._eof = self._closed = False
 
     def start(self) -> None:
-        """Begin to read; rules at offset 0 act first."""
-        self._take(self._editor.feed(b""))
+        """Start reading; rules at offset 0 act first."""
+        self._queue_edits(self._editor.feed(b""))
         self.run()
 
-    def add(self, rules: Sequence[Rule]) -> None:
-        """Add rules after the others; their places count from here."""
-        self._set_pace(rules)
-        self._editor.add([rule.ahead(self._editor.position) for rule in rules])
-        self._take(self._editor.feed(b""))
+    def add_rules(self, rules: Sequence[Rule]) -> None:
+        """Add rules after the present ones; their offsets count from the current position."""
+        self._set_timing_rules(rules)
+        self._editor.add_rules([rule.ahead(self._editor.position) for rule in rules])
+        self._queue_edits(self._editor.feed(b""))
         self.run()
 
     def run(self) -> None:
-        """Do all actions that are possible now."""
-        self._stop_waiting()
+        """Write and read as far as possible now."""
+        self._cancel_write_waits()
         if self._stopped or not self._write_out():
-            self._line.stop()
+            self._delay_line.stop()
         else:
-            self._line.go_on()
-        self._read_on()
+            self._delay_line.go_on()
+        self._update_reading()
 
     def close(self) -> None:
         """Release both sockets; nothing is written any more."""
         self._closed = True
-        self._line.close()
+        self._delay_line.close()
         self.run()
 
     # ------------------------------------------------------------------ in
 
     @property
-    def held(self) -> int:
+    def held_bytes(self) -> int:
         """The number of bytes that wait."""
-        return self._line.size + len(self._unsent)
+        return self._delay_line.size + len(self._unsent)
 
     def _receive(self) -> None:
         try:
@@ -112,42 +112,42 @@ class Pipe:
         except (BlockingIOError, InterruptedError):
             return
         except OSError:
-            self._connection.lost(self._direction, self._editor.position)
+            self._connection.report_lost(self._direction, self._editor.position)
             return
         if data:
-            self._take(self._editor.feed(data))
+            self._queue_edits(self._editor.feed(data))
         else:
             self._eof = True
-            self._take([Edit([], end=Ending("eof", "eof"))])
-        self._line.run()
-        self._read_on()
+            self._queue_edits([Edit([], end=Ending("eof", "eof"))])
+        self._delay_line.run()
+        self._update_reading()
 
-    def _set_pace(self, rules: Sequence[Rule]) -> None:
-        """Apply the last rule of each kind."""
+    def _set_timing_rules(self, rules: Sequence[Rule]) -> None:
+        """Keep the last rate rule and the last delay rule."""
         for rule in rules:
             if isinstance(rule, Rate):
-                self._rate = rule
+                self._rate_rule = rule
             elif isinstance(rule, DelayBytes):
                 seed = f"{rule.seed}:{self._connection.number}:{self._direction}"
-                self._delay = rule, Random(seed)  # noqa: S311 - jitter, not a secret
+                self._delay_rule = rule, Random(seed)  # noqa: S311 - jitter, not a secret
 
-    def _take(self, edits: list[Edit]) -> None:
+    def _queue_edits(self, edits: list[Edit]) -> None:
         delay = 0.0
-        if self._delay is not None and edits:
-            rule, chance = self._delay
-            delay = rule.seconds + chance.random() * rule.jitter
+        if self._delay_rule is not None and edits:
+            rule, rng = self._delay_rule
+            delay = rule.seconds + rng.random() * rule.jitter
         for edit in edits:
             edit.delay = delay
-            plain = edit.end is None and edit.gather is None and not edit.pauses
-            self._line.put([edit], edit.size if plain else MAX_HOLD_BYTES)
+            has_no_action = edit.end is None and edit.gather is None and not edit.pauses
+            self._delay_line.put([edit], edit.size if has_no_action else MAX_HOLD_BYTES)
 
-    def _read_on(self) -> None:
-        wanted = not (self._eof or self._stopped or self.held >= MAX_HELD_BYTES)
-        if wanted and not self._reading:
+    def _update_reading(self) -> None:
+        should_read = not (self._eof or self._stopped or self.held_bytes >= MAX_HELD_BYTES)
+        if should_read and not self._reading:
             self._loop.add_reader(self.source, self._receive)
-        elif self._reading and not wanted:
+        elif self._reading and not should_read:
             self._loop.remove_reader(self.source)
-        self._reading = wanted
+        self._reading = should_read
 
     # ------------------------------------------------------------------ out
 
@@ -157,27 +157,31 @@ class Pipe:
                 self._connection.note(edit.faults.pop(0), self._direction, edit.at)
             self._unsent += data
         if not self._write_out():
-            self._line.stop()
+            self._delay_line.stop()
 
     def _write_out(self) -> bool:
-        """Write waiting bytes; return whether all is written, else :meth:`run` will be called."""
-        while self._free_at <= self._loop.time():
+        """Write waiting bytes and return True if none is left, else schedule :meth:`run`."""
+        while self._next_write_at <= self._loop.time():
             if not self._unsent:
                 return True
             size = len(self._unsent)
-            if self._rate is not None:
-                size = min(size, max(1, int(self._rate.bytes_per_second * WRITE_INTERVAL)))
+            if self._rate_rule is not None:
+                size = min(size, max(1, int(self._rate_rule.bytes_per_second * WRITE_INTERVAL)))
             written = self._write(self._unsent[:size])
             if not written:
                 return False
             del self._unsent[:written]
-            if self._rate is not None:
-                self._free_at = self._loop.time() + written / self._rate.bytes_per_second
-        self._timer = self._loop.call_at(self._free_at, self.run)
+            if self._rate_rule is not None:
+                self._next_write_at = self._loop.time() + written / self._rate_rule.bytes_per_second
+        self._timer = self._loop.call_at(self._next_write_at, self.run)
         return False
 
     def _write(self, data: bytearray) -> int:
-        """Write once; at 0 the socket is full, and :meth:`run` is called when it is writable."""
+        """Write once and return the number of written bytes.
+
+        If it is 0, the socket is full, and :meth:`run` is called when it is writable, or the
+        connection is lost.
+        """
         try:
             written = self.target.send(data)
         except (BlockingIOError, InterruptedError):
@@ -185,9 +189,9 @@ class Pipe:
             self._loop.add_writer(self.target, self.run)
             return 0
         except OSError:
-            self._connection.lost(self._direction, self._editor.position)
+            self._connection.report_lost(self._direction, self._editor.position)
             return 0
-        self._connection.carried(self._direction)
+        self._connection.note_carried(self._direction)
         self._connection.log.passed.add(self._direction, written)
         return written
 
@@ -200,17 +204,17 @@ class Pipe:
             self._connection.reset()
         elif ending.how == "close":
             self._connection.cut()
-        else:  # end of the sender
+        else:  # the sender has sent FIN
             self._connection.note("eof", self._direction, self._editor.position)
-            self.finished = True
+            self.eof_passed = True
             end_sending(self.target)
-            self._connection.end_if_finished()
+            self._connection.close_if_finished()
 
     @property
     def _stopped(self) -> bool:
         return self._closed or self._direction in self._connection.stalled
 
-    def _stop_waiting(self) -> None:
+    def _cancel_write_waits(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

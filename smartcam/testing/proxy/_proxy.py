@@ -102,7 +102,7 @@ class LinkProxy:
     @property
     def open_connections(self) -> int:
         """Number of open connections; on UDP, of known client addresses."""
-        return len(self._relay.members)
+        return len(self._relay.clients)
 
     async def wait_for(self, what: str, count: int = 1, *, timeout: float = 5.0) -> None:
         """Wait until an entry is in the log ``count`` times, counted from the beginning.
@@ -136,7 +136,7 @@ class LinkProxy:
             ConfigurationError: a rule is for the other transport.
         """
         check_rules(rules, self._relay.rule_kind, self._transport)
-        self._relay.add(rules)
+        self._relay.add_rules(rules)
 
     def cut(self, connection: int | None = None) -> None:
         """End a connection, or all, in order: FIN to both sides. On UDP: forget the client."""

@@ -29,16 +29,16 @@ class Proxied(ABC):
         self.log.note(what, self.number, direction, at)
 
     @abstractmethod
-    def add(self, rules: Sequence[Rule]) -> None:
-        """Apply rules from here on."""
+    def add_rules(self, rules: Sequence[Rule]) -> None:
+        """Apply rules to the traffic from now on."""
 
     @abstractmethod
     def cut(self) -> None:
-        """End the traffic in order."""
+        """End the traffic in order, on TCP with FIN."""
 
     @abstractmethod
     def reset(self) -> None:
-        """End the traffic hard."""
+        """End the traffic at once, on TCP with RST."""
 
 
 C = TypeVar("C", bound=Proxied)
@@ -58,36 +58,36 @@ class Relay(ABC, Generic[C]):
         self.target: Any = None  # address of the target, set by open()
         # directions in which nothing passes, also for new connections
         self.stalled: set[Direction] = set()
-        self.members: dict[Any, C] = {}  # connected clients
+        self.clients: dict[Any, C] = {}  # connected clients
         self._socket: socket.socket | None = None
         self._address: Any = None
         self._refusing = False
-        self._number = 0
+        self._last_number = 0
 
     def open(self, host: str, family: socket.AddressFamily, target: Any) -> int:
-        """Listen on a free port of ``host``; return it."""
+        """Listen on a free port of ``host``; return the port."""
         self.family, self.target = family, target
         self._bind((host, 0))
         self._listen()
         return int(self._address[1])
 
-    def chosen(self, connection: int | None) -> list[C]:
-        """Return one connection, if it is open, or all."""
-        return [member for member in self.members.values() if connection in {None, member.number}]
+    def select_clients(self, connection: int | None) -> list[C]:
+        """Return the open connection of this number in a list; for None return all."""
+        return [member for member in self.clients.values() if connection in {None, member.number}]
 
-    def add(self, rules: Sequence[Rule]) -> None:
-        """Apply rules from here on."""
-        for member in self.chosen(None):
-            member.add(rules)
+    def add_rules(self, rules: Sequence[Rule]) -> None:
+        """Apply rules to the open connections from now on."""
+        for member in self.select_clients(None):
+            member.add_rules(rules)
 
     def cut(self, connection: int | None) -> None:
-        """End connections in order."""
-        for member in self.chosen(connection):
+        """End one connection, or all, in order."""
+        for member in self.select_clients(connection):
             member.cut()
 
     def reset(self, connection: int | None) -> None:
-        """End connections hard."""
-        for member in self.chosen(connection):
+        """End one connection, or all, at once."""
+        for member in self.select_clients(connection):
             member.reset()
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
@@ -100,20 +100,20 @@ class Relay(ABC, Generic[C]):
         self.stalled.clear()
 
     def refuse(self, refused: bool) -> None:
-        """Close the port for new clients, or open it again; the port stays reserved."""
+        """Refuse new clients, or accept them again; the port stays reserved."""
         if refused == self._refusing:
             return
         self._refusing = refused
         if refused:
-            self._shut()
+            self._close_socket()
             self._bind(self._address)
-            self._turn_away()
+            self._refuse_clients()
         else:
-            self._take_again()
+            self._accept_clients()
 
     def close(self) -> None:
         """Close the port and end all connections, at once."""
-        self._shut()
+        self._close_socket()
         self.reset(None)
 
     def _bind(self, address: Any) -> None:
@@ -130,25 +130,25 @@ class Relay(ABC, Generic[C]):
 
     def _listen(self) -> None:
         if self._socket is not None:
-            self._watch(self._socket)
+            self._start_accepting(self._socket)
 
-    def _shut(self) -> None:
+    def _close_socket(self) -> None:
         sock, self._socket = self._socket, None
         if sock is not None:
-            self._unwatch(sock)
+            self._stop_accepting(sock)
             sock.close()
 
     @abstractmethod
-    def _watch(self, sock: socket.socket) -> None:
-        """Accept traffic on the port from now on."""
+    def _start_accepting(self, sock: socket.socket) -> None:
+        """Start accepting traffic on the port."""
 
     @abstractmethod
-    def _unwatch(self, sock: socket.socket) -> None:
-        """Accept nothing more."""
+    def _stop_accepting(self, sock: socket.socket) -> None:
+        """Stop accepting traffic on the port."""
 
-    def _turn_away(self) -> None:
+    def _refuse_clients(self) -> None:
         """Make the system refuse traffic to the port."""
 
-    def _take_again(self) -> None:
+    def _accept_clients(self) -> None:
         """Accept traffic to the port again."""
         self._listen()

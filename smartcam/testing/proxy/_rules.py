@@ -40,7 +40,7 @@ reading."""
 
 
 _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
-"""Text on the allowed values, and the function that checks a value."""
+"""Text on the allowed values, and the function that returns True for a valid value."""
 
 _BOUNDS: Mapping[str, _Bound] = {
     "direction": ("direction must be 'up' or 'down'", lambda direction: direction in DIRECTIONS),
@@ -92,31 +92,31 @@ class Rule:
     def __post_init__(self) -> None:
         for field in fields(self):
             if field.name in self._bounds:
-                text, holds = self._bounds[field.name]
-                _check(self, holds(getattr(self, field.name)), text)
+                text, is_valid = self._bounds[field.name]
+                _require(self, is_valid(getattr(self, field.name)), text)
 
     def concerns(self, connection: int, direction: Direction) -> bool:
         """Return True if the rule is for this direction of this connection."""
         return self.direction == direction and self.connection in {None, connection}
 
     def ahead(self, by: int) -> Self:
-        """Return the rule for a place so many bytes, or datagrams, later."""
+        """Return the rule, acting ``by`` bytes, or datagrams, later."""
         return self
 
 
-def _check(rule: Rule, right: bool, text: str) -> None:
-    if not right:
+def _require(rule: Rule, is_valid: bool, text: str) -> None:
+    if not is_valid:
         raise ConfigurationError(f"{rule}: {text}")
 
 
 def check_rules(rules: Sequence[Rule], kind: type[Rule], transport: str) -> None:
-    """Refuse rules of the other transport.
+    """Check that all rules are for one transport.
 
     Raises:
-        ConfigurationError: names the first one.
+        ConfigurationError: a rule is for the other transport; the text names the first one.
     """
     for rule in rules:
-        _check(rule, isinstance(rule, kind), f"it means nothing on {transport.upper()}")
+        _require(rule, isinstance(rule, kind), f"it means nothing on {transport.upper()}")
 
 
 # ---------------------------------------------------------------------- TCP
@@ -133,7 +133,7 @@ class PlacedRule(StreamRule):
     at: int = 0
 
     def ahead(self, by: int) -> Self:
-        """Return the rule for a place so many bytes later."""
+        """Return the rule, acting ``by`` bytes later."""
         return replace(self, at=self.at + by)
 
 
@@ -149,7 +149,7 @@ class RangeRule(PlacedRule):
 
     @property
     def end(self) -> int | None:
-        """The place after its last byte, None for a range without an end."""
+        """Offset after the range's last byte, None for a range without an end."""
         return None if self.count is None else self.at + self.count
 
     def change(self, data: bytes) -> bytes:
@@ -202,7 +202,7 @@ class CoalesceBytes(PointRule, name="coalesce"):
 
     Args:
         size: bytes to wait for; bytes that came with them are in the same write.
-        seconds: the longest wait. The sender's end and a rule that acts in between end it, too.
+        seconds: the longest wait. The sender's FIN, or another rule that acts, ends it earlier.
     """
 
     size: int
@@ -245,7 +245,7 @@ class DuplicateBytes(RangeRule, name="duplicate"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(
+        _require(
             self,
             self.count is not None and self.count <= MAX_COPY_BYTES,
             f"count must be at most {MAX_COPY_BYTES} bytes",
@@ -315,7 +315,7 @@ class DatagramRule(Rule):
         return number == self.number
 
     def ahead(self, by: int) -> Self:
-        """Return the rule for a datagram so many later."""
+        """Return the rule for the datagram that comes ``by`` datagrams later."""
         return self if self.number is None else replace(self, number=self.number + by)
 
 

@@ -1,8 +1,8 @@
 """The TCP half of the link proxy: a listening socket, and a pair of sockets for each connection.
 
-It works on bare sockets, not on transports: one write is one ``send()``, an end is exactly the FIN
-or RST of the rule, and a socket is closed at once. Everything runs in callbacks of the loop
-and there is no task; a connection owns at most one timer, and so does each of its pipes.
+It works on bare sockets, not on transports: one write is one ``send()``, a connection ends with
+exactly the FIN or RST of the rule, and a socket is closed at once. Everything runs in callbacks of
+the loop, without tasks. A connection owns at most one timer, and so does each of its pipes.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.testing")
 
 MAX_CONNECTIONS = 64
-"""Largest number of connections open at once; the connection without an answer for longest makes
-room."""
+"""Largest number of open connections. For another one, the proxy closes the connection that has
+waited longest for the target's first answer."""
 
 CONNECT_TIMEOUT = 5.0
 """Seconds that the target has to accept a connection."""
 
-LINGER = 1.0
-"""Seconds that a cut connection is still read after its FIN, so that it does not end in a RST."""
+LINGER_TIME = 1.0
+"""Seconds for which a cut connection is read after its FIN: closing it with unread bytes would send
+RST."""
 
-CALLING = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
+CONNECTING_ERRNOS = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
 """Results of ``connect_ex`` for a connection that may succeed."""
 
 HARD_END = struct.pack("ii", 1, 0)
-"""SO_LINGER of no time, with which closing sends RST."""
+"""Value of SO_LINGER, 0 seconds, with which closing a socket sends RST."""
 
 
 class ProxiedConnection(Proxied):
@@ -65,11 +66,11 @@ class ProxiedConnection(Proxied):
 
     def connect(self) -> None:
         """Connect to the target."""
-        if self._target.connect_ex(self._relay.target) not in CALLING:
-            self._refused()
+        if self._target.connect_ex(self._relay.target) not in CONNECTING_ERRNOS:
+            self._on_refused()
             return
-        self._loop.add_writer(self._target, self._connected)
-        self._timer = self._loop.call_later(CONNECT_TIMEOUT, self._refused)
+        self._loop.add_writer(self._target, self._on_connected)
+        self._timer = self._loop.call_later(CONNECT_TIMEOUT, self._on_refused)
 
     # ------------------------------------------------------------------ its end
 
@@ -79,63 +80,63 @@ class ProxiedConnection(Proxied):
         return len(self._carried) == len(DIRECTIONS)
 
     def turn_away(self, why: str) -> None:
-        """End the connection to make room, or since client and target were silent for too long."""
+        """Log that the connection was turned away, and reset it."""
         self.note("turned away")
         self.reset()
 
-    def carried(self, direction: Direction) -> None:
-        """Note that bytes went in a direction."""
+    def note_carried(self, direction: Direction) -> None:
+        """Note that bytes passed in a direction."""
         self._carried.add(direction)
 
-    def lost(self, direction: Direction, at: int) -> None:
-        """Tell the other side that a socket is broken."""
+    def report_lost(self, direction: Direction, at: int) -> None:
+        """Log that a socket is broken, and reset both sides."""
         self.note("lost", direction, at)
         self.reset()
 
-    def end_if_finished(self) -> None:
+    def close_if_finished(self) -> None:
         """Close when both sides have ended."""
-        if all(pipe.finished for pipe in self._pipes.values()):
+        if all(pipe.eof_passed for pipe in self._pipes.values()):
             self._close()
 
     def cut(self) -> None:
-        """End in order: FIN to both; later bytes are read and dropped for a while."""
+        """Send FIN to both sides; bytes that still come are dropped for ``LINGER_TIME``."""
         self._stop()
         self._connecting = False
         self._lingering = {self._client, self._target}
         for sock in tuple(self._lingering):
             end_sending(sock)
-            self._loop.add_reader(sock, self._drop, sock)
-        self._timer = self._loop.call_later(LINGER, self._close)
+            self._loop.add_reader(sock, self._drop_input, sock)
+        self._timer = self._loop.call_later(LINGER_TIME, self._close)
 
     def reset(self) -> None:
-        """End hard: RST to both."""
+        """Send RST to both sides."""
         for sock in (self._client, self._target):
             with contextlib.suppress(OSError):
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, HARD_END)
         self._close()
 
-    def add(self, rules: Sequence[Rule]) -> None:
-        """Apply rules from here on."""
+    def add_rules(self, rules: Sequence[Rule]) -> None:
+        """Apply rules to the bytes from now on."""
         for direction, pipe in tuple(self._pipes.items()):
             chosen = [rule for rule in rules if rule.concerns(self.number, direction)]
             if chosen:
-                pipe.add(chosen)
+                pipe.add_rules(chosen)
 
     def stall(self, direction: Direction | None) -> None:
         """Pass nothing any more; None is both directions."""
         self.stalled |= set(DIRECTIONS if direction is None else [direction])
-        self._refresh()
+        self._run_pipes()
 
     def resume(self) -> None:
         """Pass everything again, beginning with waiting bytes."""
         self.stalled.clear()
-        self._refresh()
+        self._run_pipes()
 
     # ------------------------------------------------------------------ inside
 
-    def _connected(self) -> None:
+    def _on_connected(self) -> None:
         if self._target.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-            self._refused()
+            self._on_refused()
             return
         self._stop()
         self._connecting = False
@@ -147,29 +148,29 @@ class ProxiedConnection(Proxied):
         for pipe in tuple(self._pipes.values()):
             pipe.start()
 
-    def _refused(self) -> None:
+    def _on_refused(self) -> None:
         self.note("no target")
         self.reset()
 
-    def _refresh(self) -> None:
+    def _run_pipes(self) -> None:
         for pipe in tuple(self._pipes.values()):
             pipe.run()
 
-    def _drop(self, sock: socket.socket) -> None:
+    def _drop_input(self, sock: socket.socket) -> None:
         try:
-            gone = not sock.recv(CHUNK)
+            has_ended = not sock.recv(CHUNK)
         except (BlockingIOError, InterruptedError):
             return
         except OSError:
-            gone = True
-        if gone:
+            has_ended = True
+        if has_ended:
             self._loop.remove_reader(sock)
             self._lingering.discard(sock)
             if not self._lingering:
                 self._close()
 
     def _stop(self) -> None:
-        """Stop all transfers and timers; the sockets stay."""
+        """Stop all transfers and timers; the sockets stay open."""
         for pipe in self._pipes.values():
             pipe.close()
         self._pipes.clear()
@@ -200,7 +201,7 @@ class _RawAcceptor(Acceptor[ProxiedConnection]):
 
     def adopt(self, connection: socket.socket) -> None:
         """Pair the connection with a socket to the target."""
-        self._relay.take(connection)
+        self._relay.add_client(connection)
 
 
 class StreamRelay(Relay[ProxiedConnection]):
@@ -219,26 +220,26 @@ class StreamRelay(Relay[ProxiedConnection]):
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Pass nothing any more."""
         super().stall(direction, connection)
-        for member in self.chosen(connection):
+        for member in self.select_clients(connection):
             member.stall(direction)
 
     def resume(self) -> None:
         """Pass everything again."""
         super().resume()
-        for member in self.chosen(None):
+        for member in self.select_clients(None):
             member.resume()
 
-    def take(self, client: socket.socket) -> None:
+    def add_client(self, client: socket.socket) -> None:
         """Pair a client's socket with one to the target."""
-        self._number += 1
+        self._last_number += 1
         try:
             address = client.getpeername()
-            connection = ProxiedConnection(self, self._number, client)
+            connection = ProxiedConnection(self, self._last_number, client)
         except OSError:  # the client is gone, or no file descriptor is left
-            self.log.note("not accepted", self._number)
+            self.log.note("not accepted", self._last_number)
             client.close()
             return
-        self.members[self._number] = connection
+        self.clients[self._last_number] = connection
         refusal = self._acceptor.enter(connection, address)
         if refusal:
             connection.turn_away(refusal)
@@ -248,11 +249,11 @@ class StreamRelay(Relay[ProxiedConnection]):
     def forget(self, connection: ProxiedConnection) -> None:
         """Forget a closed connection."""
         self._acceptor.leave(connection)
-        del self.members[connection.number]
+        del self.clients[connection.number]
 
-    def _watch(self, sock: socket.socket) -> None:
+    def _start_accepting(self, sock: socket.socket) -> None:
         sock.listen(BACKLOG)
         self._acceptor.open(sock)
 
-    def _unwatch(self, sock: socket.socket) -> None:
+    def _stop_accepting(self, sock: socket.socket) -> None:
         self._acceptor.close()

@@ -30,13 +30,14 @@ if TYPE_CHECKING:
     from smartcam.testing.proxy._rules import Rule
 
 MAX_SIZE_BYTES = 1 << 16
-"""Largest number of bytes read of a datagram; none is longer."""
+"""Largest number of bytes read of a datagram: UDP allows no longer one."""
 
 MAX_CLIENTS = 64
-"""Largest number of client addresses that are known; the longest unanswered one makes room."""
+"""Largest number of client addresses. For another one, the proxy forgets the client that has waited
+longest for an answer of the target."""
 
 ANSWERED_GRACE = 60.0
-"""Seconds for which a client surely keeps its place after the target has answered it."""
+"""Seconds after an answer of the target in which its client is not forgotten for another."""
 
 MAX_WAITING_DATAGRAMS = 1024
 """Largest number of datagrams that rules hold back; more are lost and counted as ``full``."""
@@ -49,7 +50,7 @@ class _Peer(Proxied):
         super().__init__(relay, number)
         self.address = address
         self._relay = relay
-        self._answered = -ANSWERED_GRACE
+        self._answered_at = -ANSWERED_GRACE
         self._sock = socket.socket(relay.family, socket.SOCK_DGRAM)
         try:
             self._sock.setblocking(False)
@@ -59,58 +60,60 @@ class _Peer(Proxied):
             raise
         self._loop.add_reader(self._sock, self._receive)
         self._datagrams: Counter[Direction] = Counter()
-        self._lines = {direction: self._line(direction) for direction in DIRECTIONS}
+        self._delay_lines = {
+            direction: self._make_delay_line(direction) for direction in DIRECTIONS
+        }
         self._rules: dict[Direction, list[tuple[DatagramRule, Random]]] = {
             direction: [] for direction in DIRECTIONS
         }
-        self.add(relay.rules)
+        self.add_rules(relay.rules)
 
-    def add(self, rules: Sequence[Rule]) -> None:
-        """Add rules after the others; their numbers count from here."""
+    def add_rules(self, rules: Sequence[Rule]) -> None:
+        """Add rules after the present ones; their numbers count from the next datagram."""
         for direction in DIRECTIONS:
             for rule in rules:
                 if isinstance(rule, DatagramRule) and rule.concerns(self.number, direction):
                     seed = f"{rule.seed}:{self.number}:{direction}"
-                    chance = Random(seed)  # noqa: S311 - no secret
-                    self._rules[direction].append((rule.ahead(self._datagrams[direction]), chance))
+                    rng = Random(seed)  # noqa: S311 - no secret
+                    self._rules[direction].append((rule.ahead(self._datagrams[direction]), rng))
 
-    def take(self, direction: Direction, data: bytes) -> None:
-        """Apply the rules to a datagram."""
+    def pass_datagram(self, direction: Direction, data: bytes) -> None:
+        """Apply the rules to a datagram, and send what they leave of it."""
         self._datagrams[direction] += 1
         number = self._datagrams[direction]
         if direction in self._relay.stalled:
             self.note("stall", direction, number)
             return
-        sent = Transmission([data])
-        for rule, chance in self._rules[direction]:
-            if not rule.picks(number, chance):
+        transmission = Transmission([data])
+        for rule, rng in self._rules[direction]:
+            if not rule.picks(number, rng):
                 continue
             self.note(rule.name, direction, number)
             if isinstance(rule, Lose):
                 return
             if isinstance(rule, Repeat):
-                sent.parts += [data] * rule.copies
-                sent.pauses += [0.0] * rule.copies
+                transmission.parts += [data] * rule.copies
+                transmission.pauses += [0.0] * rule.copies
             elif isinstance(rule, Late):
-                sent.delay += rule.seconds + chance.random() * rule.jitter
+                transmission.delay += rule.seconds + rng.random() * rule.jitter
             elif isinstance(rule, Reorder):
-                sent.gather, sent.behind = (rule.behind, rule.seconds), True
-        if (sent.delay or sent.behind) and sum(
-            map(len, self._lines.values())
+                transmission.gather, transmission.behind = (rule.behind, rule.seconds), True
+        if (transmission.delay or transmission.behind) and sum(
+            map(len, self._delay_lines.values())
         ) >= MAX_WAITING_DATAGRAMS:
             self.note("full", direction)
             return
-        line = self._lines[direction]
-        line.put([sent], 0 if sent.behind else 1)
+        line = self._delay_lines[direction]
+        line.put([transmission], 0 if transmission.behind else 1)
         line.run()
 
     @property
     def settled(self) -> bool:
         """True if the target has answered the client recently."""
-        return self._loop.time() - self._answered < ANSWERED_GRACE
+        return self._loop.time() - self._answered_at < ANSWERED_GRACE
 
     def turn_away(self, why: str) -> None:
-        """Forget the client, to make room for another."""
+        """Log that the client was turned away, and forget it."""
         self.note("turned away")
         self.reset()
 
@@ -123,20 +126,20 @@ class _Peer(Proxied):
 
         Datagrams on their way are lost.
         """
-        del self._relay.members[self.address]
+        del self._relay.clients[self.address]
         self._relay.places.leave(self)
-        for line in self._lines.values():
+        for line in self._delay_lines.values():
             line.close()
         self._loop.remove_reader(self._sock)
         self._sock.close()
 
     # ------------------------------------------------------------------ inside
 
-    def _line(self, direction: Direction) -> DelayLine[Transmission]:
+    def _make_delay_line(self, direction: Direction) -> DelayLine[Transmission]:
         return DelayLine(
             RealClock(),
             ordered=False,
-            wake=lambda: self._lines[direction].run(),
+            wake=lambda: self._delay_lines[direction].run(),
             carry=functools.partial(self._send, direction),
             end=lambda _: None,
             lost=lambda _: None,
@@ -150,9 +153,9 @@ class _Peer(Proxied):
         except OSError:  # the system reports that nothing listens there
             self.note("no target", "up")
             return
-        self._answered = self._loop.time()
-        self._relay.places.move_back(self, self._answered)
-        self.take("down", data)
+        self._answered_at = self._loop.time()
+        self._relay.places.move_back(self, self._answered_at)
+        self.pass_datagram("down", data)
 
     def _send(self, direction: Direction, batch: list[tuple[Transmission, bytes]]) -> None:
         for _, data in batch:
@@ -197,42 +200,43 @@ class DatagramRelay(Relay[_Peer]):
 
     # ------------------------------------------------------------------ inside
 
-    def _turn_away(self) -> None:
+    def _refuse_clients(self) -> None:
         if self._socket is not None:
             # connected to itself, the socket gets no datagrams of others
             self._socket.connect(self._address)
 
-    def _take_again(self) -> None:
-        self._shut()
+    def _accept_clients(self) -> None:
+        self._close_socket()
         self._bind(self._address)
         self._listen()
 
-    def _watch(self, sock: socket.socket) -> None:
+    def _start_accepting(self, sock: socket.socket) -> None:
         asyncio.get_running_loop().add_reader(sock, self._receive, sock)
 
-    def _unwatch(self, sock: socket.socket) -> None:
+    def _stop_accepting(self, sock: socket.socket) -> None:
         asyncio.get_running_loop().remove_reader(sock)
 
     def _receive(self, sock: socket.socket) -> None:
         try:
             data, address = sock.recvfrom(MAX_SIZE_BYTES)
-        except OSError:  # nothing there, or an error of a client's closed socket
+        except OSError:  # no datagram, or an error that a client's closed socket caused
             return
-        peer = self.members.get(address) or self._newcomer(address)
+        peer = self.clients.get(address) or self._add_peer(address)
         if peer is not None:
-            peer.take("up", data)
+            peer.pass_datagram("up", data)
 
-    def _newcomer(self, address: Any) -> _Peer | None:
-        """Return an unknown client; None if there is no room for it."""
-        self._number += 1
+    def _add_peer(self, address: Any) -> _Peer | None:
+        """Return the client for a new address; None if there is no room for it."""
+        self._last_number += 1
         try:
-            peer = _Peer(self, self._number, address)
+            peer = _Peer(self, self._last_number, address)
         except OSError:  # no file descriptor is left
-            self.log.note("not accepted", self._number)
+            self.log.note("not accepted", self._last_number)
             return None
-        self.members[address] = peer
-        if self.places.enter(peer, str(address[0]), asyncio.get_running_loop().time()):
+        self.clients[address] = peer
+        refusal = self.places.enter(peer, str(address[0]), asyncio.get_running_loop().time())
+        if refusal:
             peer.turn_away("all other clients were answered recently")
             return None
-        self.log.note("connect", self._number)
+        self.log.note("connect", self._last_number)
         return peer

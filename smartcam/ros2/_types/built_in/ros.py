@@ -5,19 +5,19 @@ from __future__ import annotations
 from typing import Final
 
 
-def _texts(package: str, kind: str, short: dict[str, str]) -> dict[str, str]:
-    """Return texts of files; in short texts ``;`` ends a line, and ``|`` ends a request."""
+def _expand_texts(package: str, category: str, short_texts: dict[str, str]) -> dict[str, str]:
+    """Return the texts of files from short texts: ``;`` is a new line, ``|`` ends a request."""
     return {
-        f"{package}/{kind}/{name}": "\n".join(
+        f"{package}/{category}/{name}": "\n".join(
             "---" if part == "|" else part
             for line in text.replace("|", ";|;").split(";")
             if (part := line.strip())
         )
-        for name, text in short.items()
+        for name, text in short_texts.items()
     }
 
 
-ROS_MESSAGES: Final = _texts(
+ROS_MESSAGES: Final = _expand_texts(
     "vision_msgs",
     "msg",
     {
@@ -45,7 +45,7 @@ ROS_MESSAGES: Final = _texts(
 )
 
 ROS_SERVICES: Final = {
-    **_texts(
+    **_expand_texts(
         "std_srvs",
         "srv",
         {
@@ -54,7 +54,7 @@ ROS_SERVICES: Final = {
             "Trigger": "| bool success; string message",
         },
     ),
-    **_texts(
+    **_expand_texts(
         "lifecycle_msgs",
         "srv",
         {
@@ -64,7 +64,7 @@ ROS_SERVICES: Final = {
             "GetState": "| State current_state",
         },
     ),
-    **_texts(
+    **_expand_texts(
         "rcl_interfaces",
         "srv",
         {
@@ -79,7 +79,7 @@ ROS_SERVICES: Final = {
             "SetParametersAtomically": "Parameter[] parameters | SetParametersResult result",
         },
     ),
-    **_texts(
+    **_expand_texts(
         "type_description_interfaces",
         "srv",
         {
@@ -89,7 +89,7 @@ ROS_SERVICES: Final = {
             "TypeSource[] type_sources; KeyValue[] extra_information",
         },
     ),
-    **_texts(
+    **_expand_texts(
         "composition_interfaces",
         "srv",
         {
@@ -101,7 +101,7 @@ ROS_SERVICES: Final = {
             "UnloadNode": "uint64 unique_id | bool success; string error_message",
         },
     ),
-    **_texts(
+    **_expand_texts(
         "diagnostic_msgs",
         "srv",
         {
@@ -109,12 +109,12 @@ ROS_SERVICES: Final = {
             "SelfTest": "| string id; byte passed; DiagnosticStatus[] status",
         },
     ),
-    **_texts(
+    **_expand_texts(
         "sensor_msgs",
         "srv",
         {"SetCameraInfo": "CameraInfo camera_info | bool success; string status_message"},
     ),
-    **_texts(
+    **_expand_texts(
         "example_interfaces",
         "srv",
         {"AddTwoInts": "int64 a; int64 b | int64 sum"},

@@ -3,7 +3,7 @@
 A :class:`CameraKind` is one kind of camera; a :class:`LiveCamera` is an open camera. Neither knows
 the checks. The client knows what a camera can do in its dialect: ``camera.capabilities``.
 
-On each camera stand the same applications: :class:`LiveCamera` has their ids.
+Each camera has the same applications; :class:`LiveCamera` has their ids.
 """
 
 from __future__ import annotations
@@ -62,29 +62,29 @@ class LiveCamera:
     @property
     def has_session(self) -> bool:
         """True while a client has the camera."""
-        self._cannot("tell whether a client has the camera")
+        self._skip_check("tell whether a client has the camera")
 
     @property
     def inspects(self) -> bool:
         """True while an inspection is running."""
-        self._cannot("tell whether an inspection is under way")
+        self._skip_check("tell whether an inspection is under way")
 
     def trigger(self) -> None:
         """Trigger by the digital input; do nothing on a camera without one."""
 
     def switch(self, application: int) -> None:
         """Load and run another application, like an operator."""
-        self._cannot("switch as an operator does")
+        self._skip_check("switch as an operator does")
 
     async def restart(self) -> None:
-        """Disconnect every client and be available again at once, in the first state."""
-        self._cannot("restart the camera")
+        """Disconnect every client; the camera is available again at once, in its initial state."""
+        self._skip_check("restart the camera")
 
     async def kill(self) -> None:
-        """Be gone for good."""
-        self._cannot("have the camera gone")
+        """Stop the camera for good."""
+        self._skip_check("stop the camera for good")
 
-    def _cannot(self, action: str) -> NoReturn:
+    def _skip_check(self, action: str) -> NoReturn:
         pytest.skip(f"{type(self).__name__} cannot {action}")
 
 
@@ -104,7 +104,8 @@ class CameraKind:
         foreign_request: an id of another kind than the protocol's.
         silent_request: id of a request that the camera leaves without an answer, None if there is
             none; unused if there are result codes.
-        datagrams: True if messages may be lost, and no message reports that the camera is gone.
+        datagrams: True for a camera over UDP: messages may be lost, and the client gets no end of
+            a connection.
         exclusive: True if a second client takes the camera from the first.
         has_zero: True if an application may have the id 0.
     """

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.cameras_under_test import CameraKind, LiveCamera
 
     Suite = TypeVar("Suite")
-    Given = ParamSpec("Given")
+    Params = ParamSpec("Params")
 
 SHORT_TIMEOUT = 0.05
 """Seconds of a timeout that is meant to fire."""
 
-SOON_TIMEOUT = 5.0
-"""Seconds after which an event that should happen at once fails the check."""
+EVENT_TIMEOUT = 5.0
+"""Seconds to wait for an event that should happen at once."""
 
 CHECK_TIMEOUT = 60.0
 """Seconds for a whole check."""
@@ -38,25 +38,25 @@ GRACE_STEPS = 100
 """Largest number of steps of the loop in which a cancelled task has to end."""
 
 
-def in_a_loop(
-    check: Callable[Concatenate[Suite, Given], Coroutine[Any, Any, None]],
-) -> Callable[Concatenate[Suite, Given], None]:
+def with_event_loop(
+    check: Callable[Concatenate[Suite, Params], Coroutine[Any, Any, None]],
+) -> Callable[Concatenate[Suite, Params], None]:
     """Turn a check into an ordinary test, with an event loop of its own.
 
-    So it needs no plugin for asynchronous tests, and works with any of them. Tasks that a check
-    leaves running fail it.
+    The test needs no plugin for asynchronous tests, and works with any such plugin. A check that
+    leaves tasks running fails.
     """
 
     @functools.wraps(check)
-    def run(suite: Suite, /, *args: Given.args, **kwargs: Given.kwargs) -> None:
+    def run(suite: Suite, /, *args: Params.args, **kwargs: Params.kwargs) -> None:
         # with a factory the thread's current loop is not changed
         with asyncio.Runner(loop_factory=asyncio.new_event_loop) as runner:
-            runner.run(_watched(check(suite, *args, **kwargs)))
+            runner.run(_run_without_leftovers(check(suite, *args, **kwargs)))
 
     return run
 
 
-async def _watched(check: Coroutine[Any, Any, None]) -> None:
+async def _run_without_leftovers(check: Coroutine[Any, Any, None]) -> None:
     async with asyncio.timeout(CHECK_TIMEOUT):
         await check
     steps = 0
@@ -67,56 +67,56 @@ async def _watched(check: Coroutine[Any, Any, None]) -> None:
         await asyncio.sleep(0)
 
 
-def needs(camera_kind: CameraKind, *applications: int) -> None:
+def skip_without_applications(camera_kind: CameraKind, *applications: int) -> None:
     """Skip the check if a camera does not have all of these applications."""
     missing = [number for number in applications if number not in camera_kind.applications]
     if missing:
         pytest.skip(f"{camera_kind} has no application {', '.join(map(str, missing))}")
 
 
-def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> Camera:
-    """Return a client that interprets numbers, and does not reconnect."""
+def make_client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> Camera:
+    """Return a client that reads results as numbers and never reconnects, unless options differ."""
     options = {"reconnect": None, "interpret_as": camera_kind.numbers, **options}
     return smartcam.connect(live.url, **options)
 
 
 @contextlib.asynccontextmanager
-async def visiting(
+async def open_session(
     camera_kind: CameraKind, **options: Any
 ) -> AsyncIterator[tuple[LiveCamera, Camera]]:
-    """Open a camera, and a client in a session with it."""
+    """Open a camera and connect a client to it."""
     if "application" in options:
-        needs(camera_kind, options["application"])
-    async with camera_kind.open() as live, client(camera_kind, live, **options) as camera:
+        skip_without_applications(camera_kind, options["application"])
+    async with camera_kind.open() as live, make_client(camera_kind, live, **options) as camera:
         yield live, camera
 
 
-async def number(camera: Camera, application: int | None = None, **options: Any) -> int:
+async def trigger_and_read(camera: Camera, application: int | None = None, **options: Any) -> int:
     """Trigger and return the number in the result."""
-    options.setdefault("timeout", SOON_TIMEOUT)
+    options.setdefault("timeout", EVENT_TIMEOUT)
     result = await camera.trigger(application, **options)
     return int(result.value.n)
 
 
-async def until(condition: Callable[[], object]) -> None:
+async def wait_until(condition: Callable[[], object]) -> None:
     """Run the loop until a condition is true."""
-    async with asyncio.timeout(SOON_TIMEOUT):
+    async with asyncio.timeout(EVENT_TIMEOUT):
         while not condition():  # noqa: ASYNC110 - whatever the condition is
             await asyncio.sleep(0)
 
 
-async def refused(camera: Camera, call: Coroutine[Any, Any, object]) -> None:
-    """Check that a call is an UnsupportedError, and that the session continues."""
+async def check_unsupported(camera: Camera, call: Coroutine[Any, Any, object]) -> None:
+    """Check that a call raises an UnsupportedError, and that the session continues."""
     dialect = re.escape(camera.capabilities.dialect)
     abilities = re.escape(", ".join(camera.capabilities.names))
     with pytest.raises(UnsupportedError, match=rf"dialect {dialect} .*{abilities}"):
         await call
     assert camera.connected
-    await number(camera)
+    await trigger_and_read(camera)
 
 
-def balance(statistics: Statistics) -> None:
-    """Check that both accounts balance."""
+def check_balance(statistics: Statistics) -> None:
+    """Check that the fates of all results, and each subscriber's counts, add up."""
     assert statistics.received == (
         statistics.triggered
         + statistics.streamed

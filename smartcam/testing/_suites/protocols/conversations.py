@@ -58,7 +58,7 @@ Step: TypeAlias = Sent | Received
 
 @dataclass(frozen=True, kw_only=True)
 class Conversation:
-    """Bytes from the protocol's documents: the messages on one link, in order, from its beginning.
+    """The messages on one link from its beginning, with bytes from the protocol's documents.
 
     Attributes:
         name: name of the conversation for people.
@@ -89,8 +89,8 @@ class Conversation:
         return tries[0]
 
 
-def flat(events: Iterable[Event]) -> list[Any]:
-    """Return events with each burst as its containers, and errors by their kind."""
+def flatten_events(events: Iterable[Event]) -> list[Any]:
+    """Return events with containers in place of bursts, and error types in place of failures."""
     flattened: list[Any] = []
     for event in events:
         if isinstance(event, ResultBurst):
@@ -116,62 +116,64 @@ class Player:
             trace=trace,
             kin=self.group,
         )
-        self.place: int = 0
+        self.step_index: int = 0
 
-    def play(self, until: int | None = None) -> Player:
-        """Continue to a place, by default to the end; return the player.
+    def play(self, end: int | None = None) -> Player:
+        """Do the steps before index ``end``, by default all that are left; return the player.
 
         Raises:
             AssertionError: the machine's bytes or events differ.
         """
-        for step in self.conversation.steps[self.place : until]:
+        for step in self.conversation.steps[self.step_index : end]:
             self.step(step)
         return self
 
-    def step(self, step: Step, chunks: Sequence[bytes] | None = None, *, room: bool = True) -> None:
-        """Do one step; ``chunks`` are the received bytes, cut in another way.
+    def step(
+        self, step: Step, chunks: Sequence[bytes] | None = None, *, use_buffer: bool = True
+    ) -> None:
+        """Do one step; ``chunks`` are the step's received bytes, cut in another way.
 
-        With ``room`` a stream's bytes are written into the machine's own buffer.
+        With ``use_buffer``, received bytes of a stream are written into the machine's own buffer.
 
         Raises:
             AssertionError: the machine's bytes or events differ.
         """
-        where = f"{self.conversation}, step {self.place}, {step!r:.300}"
+        where = f"{self.conversation}, step {self.step_index}, {step!r:.300}"
         events: list[Any] = []
         if isinstance(step, Sent):
             self.machine.send(step.message)
-            wanted: list[Any] = []
-            events = flat(self.machine.events())
+            expected_events: list[Any] = []
+            events = flatten_events(self.machine.events())
         else:
-            wanted = list(step.events)
+            expected_events = list(step.events)
             for chunk in [step.data] if chunks is None else chunks:
-                events += self.deliver(chunk, room=room)
-        wire = self.written()
-        if events != wanted:
-            raise AssertionError(f"{where}: expected events {wanted}, got {events}")
+                events += self.feed_machine(chunk, use_buffer=use_buffer)
+        wire = self.take_output()
+        if events != expected_events:
+            raise AssertionError(f"{where}: expected events {expected_events}, got {events}")
         if wire != step.wire:
             raise AssertionError(f"{where}: expected {step.wire!r} on the wire, got {wire!r}")
         if wire and not isinstance(step, Sent) and not self.machine.replies:
-            raise AssertionError(f"{where}: the machine replies by itself: replies must be True")
-        self.place += 1
+            raise AssertionError(f"{where}: the machine replies by itself, so replies must be True")
+        self.step_index += 1
 
-    def deliver(self, chunk: bytes, *, room: bool = True) -> list[Any]:
+    def feed_machine(self, chunk: bytes, *, use_buffer: bool = True) -> list[Any]:
         """Give bytes to the machine as a link does, and return its events."""
-        if not room or self.machine.transport is Transport.UDP:
+        if not use_buffer or self.machine.transport is Transport.UDP:
             self.machine.receive_data(chunk)
-            return flat(self.machine.events())
+            return flatten_events(self.machine.events())
         events: list[Any] = []
         while chunk:
-            place = self.machine.room()
-            if not len(place):
+            buffer = self.machine.room()
+            if not len(buffer):
                 raise AssertionError("room() gave no room for a single byte")
-            count = min(len(place), len(chunk))
-            place[:count] = chunk[:count]
+            count = min(len(buffer), len(chunk))
+            buffer[:count] = chunk[:count]
             chunk = chunk[count:]
             if self.machine.filled(count, 0.0):
-                events += flat(self.machine.events())
-        return events + flat(self.machine.events())
+                events += flatten_events(self.machine.events())
+        return events + flatten_events(self.machine.events())
 
-    def written(self) -> bytes:
-        """Return the bytes that the machine has to write."""
+    def take_output(self) -> bytes:
+        """Take the bytes that the machine has to write, and return them."""
         return b"".join(self.machine.data_to_send())

@@ -25,7 +25,13 @@ from smartcam.protocols._inside import Framer, Spelled
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, parse_address
 from smartcam.testing._suites.protocols.parameters import Parameters
-from smartcam.testing._suites.protocols.words import ABILITIES, MESSAGES, NEEDED, REQUESTS, example
+from smartcam.testing._suites.protocols.words import (
+    MESSAGES,
+    MESSAGES_BY_CAPABILITY,
+    REQUESTS,
+    REQUIRED_MESSAGES,
+    make_example,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -41,7 +47,7 @@ CODES = (*range(-300, 301), -(1 << 31), (1 << 16) - 1, (1 << 32) - 1)
 """Result codes whose meanings are checked."""
 
 
-def _is_line(text: object) -> bool:
+def _is_printable_line(text: object) -> bool:
     return isinstance(text, str) and bool(text.strip()) and text.isprintable()
 
 
@@ -53,7 +59,7 @@ class DialectChecks(Parameters):
     def test_protocol_describes_itself(self) -> None:
         """Check that a URL can name schemes, port, models and dialects."""
         protocol = self.protocol
-        assert _is_line(protocol.name), f"name: expected a line, got {protocol.name!r}"
+        assert _is_printable_line(protocol.name), f"name: expected a line, got {protocol.name!r}"
         assert protocol.schemes, "schemes: expected at least one"
         for scheme, transport in protocol.schemes.items():
             assert SCHEME.fullmatch(scheme), f"scheme {scheme!r}: expected lower case"
@@ -67,7 +73,9 @@ class DialectChecks(Parameters):
             assert dialect.name == name, f"dialects[{name!r}] calls itself {dialect.name!r}"
         for name, about in protocol.parameters.items():
             assert name not in {"dialect", "quirks"}, f"parameter {name!r} is reserved"
-            assert _is_line(about), f"parameter {name!r}: expected a line that says what it is"
+            assert _is_printable_line(about), (
+                f"parameter {name!r}: expected a line that says what it is"
+            )
 
     def test_entry_point_gives_the_protocol(self) -> None:
         """Check that ``connect()`` finds the protocol: it is installed, and the names agree."""
@@ -82,10 +90,10 @@ class DialectChecks(Parameters):
     def test_every_dialect_is_tried(self) -> None:
         """Check that a client tries each dialect, and only the pinned one if one is pinned."""
         protocol = self.protocol
-        used = set(protocol.schemes.values())
-        surplus = set(protocol.detection) - used
+        used_transports = set(protocol.schemes.values())
+        surplus = set(protocol.detection) - used_transports
         assert not surplus, f"detection: no scheme has {surplus}"
-        for transport in used:
+        for transport in used_transports:
             tries = protocol.tries(transport)
             tried = {dialect.name for group in tries for dialect in group}
             assert all(tries), f"detection over {transport.value}: a group is empty"
@@ -110,8 +118,10 @@ class DialectChecks(Parameters):
 
     def test_dialect_describes_itself(self, dialect: Dialect) -> None:
         """Check a dialect's name, source, and the ids that an application may have."""
-        assert _is_line(dialect.about), f"about: expected a line, got {dialect.about!r}"
-        assert _is_line(dialect.source), f"source: expected a line, got {dialect.source!r}"
+        assert _is_printable_line(dialect.about), f"about: expected a line, got {dialect.about!r}"
+        assert _is_printable_line(dialect.source), (
+            f"source: expected a line, got {dialect.source!r}"
+        )
         assert dialect.label.startswith(dialect.name), f"label: {dialect.label!r}"
         abilities = dialect.capabilities
         assert abilities.dialect == dialect.name, f"capabilities.dialect: {abilities.dialect!r}"
@@ -127,7 +137,7 @@ class DialectChecks(Parameters):
 
     def test_dialect_has_what_a_client_needs(self, dialect: Dialect) -> None:
         """Check for a session, a sign of life, results, and the status: by itself or on request."""
-        missing = [kind.__name__ for kind in NEEDED if not dialect.has(kind)]
+        missing = [kind.__name__ for kind in REQUIRED_MESSAGES if not dialect.has(kind)]
         assert not missing, f"has() is False for {', '.join(missing)}"
         assert dialect.answers(m.Connect), "Connect must be answered"
         assert dialect.answers(m.Query), "Query must be answered: it is the sign of life"
@@ -138,21 +148,25 @@ class DialectChecks(Parameters):
 
     def test_capabilities_are_those_of_its_messages(self, dialect: Dialect) -> None:
         """Check that each ability has its messages, and the other way round."""
-        for name, needed in ABILITIES.items():
-            can = getattr(dialect.capabilities, name)
-            has = [dialect.has(kind) for kind in needed]
+        for name, needed in MESSAGES_BY_CAPABILITY.items():
+            has_ability = getattr(dialect.capabilities, name)
+            has_messages = [dialect.has(kind) for kind in needed]
             names = " and ".join(kind.__name__ for kind in needed)
-            if can:
-                assert all(has), f"capabilities.{name} is True, but has() is False for {names}"
+            if has_ability:
+                assert all(has_messages), (
+                    f"capabilities.{name} is True, but has() is False for {names}"
+                )
             else:
-                assert not has[0], f"capabilities.{name} is False, but has() is True for {names}"
+                assert not has_messages[0], (
+                    f"capabilities.{name} is False, but has() is True for {names}"
+                )
 
     def test_messages_have_ids_names_and_fields(self, dialect: Dialect) -> None:
         """Check that each message has an id and a name, and that its fields are the message's."""
         for kind in MESSAGES:
             if not dialect.has(kind):
                 continue
-            message = example(kind, dialect)
+            message = make_example(kind, dialect)
             assert isinstance(dialect.message_id(kind), int), f"message_id({kind.__name__})"
             assert dialect.message_id(message) == dialect.message_id(kind), kind.__name__
             called = dialect.called(message)
@@ -165,13 +179,13 @@ class DialectChecks(Parameters):
         for kind in MESSAGES:
             if dialect.has(kind):
                 continue
-            for message in (kind, example(kind, dialect)):
-                text = _refusal(UnsupportedError, dialect.message_id, message)
+            for message in (kind, make_example(kind, dialect)):
+                text = _error_text(UnsupportedError, dialect.message_id, message)
                 assert text is not None, f"has() is False for {kind.__name__}, but it has an id"
                 assert dialect.name in text, f"{text}: expected the name of the dialect in it"
 
     def test_codes_mean_something(self, dialect: Dialect) -> None:
-        """Check that any code has a text and a verdict, and that one is good and one is not."""
+        """Check that each code has a text and a verdict; codes for success and refusal exist."""
         verdicts: set[Verdict] = set()
         for request in (None, *filter(dialect.has, REQUESTS)):
             for code in CODES:
@@ -180,7 +194,9 @@ class DialectChecks(Parameters):
                 assert isinstance(meaning, CodeMeaning), (
                     f"{where}: expected a CodeMeaning, got {meaning!r}"
                 )
-                assert _is_line(meaning.text), f"{where}: expected a text, got {meaning.text!r}"
+                assert _is_printable_line(meaning.text), (
+                    f"{where}: expected a text, got {meaning.text!r}"
+                )
                 assert isinstance(meaning.verdict, Verdict), f"{where}: {meaning.verdict!r}"
                 verdicts.add(meaning.verdict)
         assert Verdict.DONE in verdicts, "no code says that a request was done"
@@ -197,7 +213,7 @@ class DialectChecks(Parameters):
                 for message_id in (0, 1, 2, 0x12, 0x20, 0x40, 0xFFFF):
                     check_described(dialect, sender, Frame(message_id, payload))
 
-        strategies.each_drawn(check)
+        strategies.run_with_examples(check)
 
     def test_any_raw_request_is_taken_or_refused(self, dialect: Dialect) -> None:
         """Check that any id, known or not, is a request or one of smartcam's errors."""
@@ -217,11 +233,11 @@ class DialectChecks(Parameters):
             assert isinstance(body, bytes), f"body({other}): expected bytes, got {body!r}"
 
     def test_unknown_quirk_is_a_mistake(self, dialect: Dialect) -> None:
-        """Check that a dialect with its own quirks is the same; an unknown one is an error."""
+        """Check that a dialect with its own quirks is the same, and an unknown quirk an error."""
         same = dialect.with_quirks(dialect.quirks)
         assert same.label == dialect.label, f"with its own quirks it is {same.label!r}"
         assert dialect.with_parameters({}).name == dialect.name
-        text = _refusal(ConfigurationError, dialect.with_quirks, ["no such quirk"])
+        text = _error_text(ConfigurationError, dialect.with_quirks, ["no such quirk"])
         assert text is not None, "with_quirks(['no such quirk']) did not fail"
         assert "no such quirk" in text, f"{text}: expected the name of the quirk in it"
 
@@ -260,20 +276,29 @@ class DialectChecks(Parameters):
             row = data.draw(strategies.st.sampled_from(dialect.table))
             values: dict[str, Any] = {}
             for name, wire in row.fields:
-                top = _TOPS.get((wire, dialect.word))
-                drawn = strategies.st.integers(0, top) if top else strategies.st.binary(max_size=64)
+                largest = _MAX_VALUES.get((wire, dialect.word))
+                drawn = (
+                    strategies.st.integers(0, largest)
+                    if largest
+                    else strategies.st.binary(max_size=64)
+                )
                 values[name] = data.draw(drawn, label=name)
             check_read_back(dialect, row.type, values)
 
         for row in dialect.table:
             for choice in (0, 1, -1):
-                tops = [(name, _TOPS.get((wire, dialect.word))) for name, wire in row.fields]
-                edges = {name: (0, 1, top)[choice] if top else b"\0\xff" for name, top in tops}
+                largest_values = [
+                    (name, _MAX_VALUES.get((wire, dialect.word))) for name, wire in row.fields
+                ]
+                edges = {
+                    name: (0, 1, largest)[choice] if largest else b"\0\xff"
+                    for name, largest in largest_values
+                }
                 check_read_back(dialect, row.type, edges)
-        strategies.each_drawn(check)
+        strategies.run_with_examples(check)
 
 
-_TOPS: Mapping[tuple[m.Wire, str], int] = {
+_MAX_VALUES: Mapping[tuple[m.Wire, str], int] = {
     (m.Wire.WORD, "I"): (1 << 32) - 1,
     (m.Wire.WORD, "H"): (1 << 16) - 1,
     (m.Wire.UINT32, "I"): (1 << 32) - 1,
@@ -282,13 +307,13 @@ _TOPS: Mapping[tuple[m.Wire, str], int] = {
 """Largest value of each kind of number, by the format of the dialect's words."""
 
 
-def _refusal(
-    error: type[SmartCamError], call: Callable[[Any], object], given: object
+def _error_text(
+    error_type: type[SmartCamError], call: Callable[[Any], object], argument: object
 ) -> str | None:
-    """Return the text of the error that a call raises, None without one."""
+    """Return the text of the error that a call raises, None if it raises no error."""
     try:
-        call(given)
-    except error as exc:
+        call(argument)
+    except error_type as exc:
         return str(exc)
     return None
 
@@ -301,7 +326,7 @@ def check_described(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled
     """
     spelled = dialect.spell(sender, frame)
     assert isinstance(spelled, Spelled), f"spell({frame}): expected a Spelled, got {spelled!r}"
-    assert _is_line(spelled.message), f"spell({frame}): message {spelled.message!r}"
+    assert _is_printable_line(spelled.message), f"spell({frame}): message {spelled.message!r}"
     assert isinstance(spelled.data, bytes), f"spell({frame}): data {spelled.data!r}"
     json.dumps(jsonable(spelled.fields), allow_nan=False)
     return spelled
@@ -314,11 +339,11 @@ def check_address(address: Address) -> None:
         AssertionError: the address differs.
     """
     url = address.url
-    read = parse_address(url)
-    assert read.url == url, f"{url} is read as {read.url}"
-    assert read[:6] == address[:6], f"{url} is read as {read!r}, not as {address!r}"
+    parsed = parse_address(url)
+    assert parsed.url == url, f"{url} is read as {parsed.url}"
+    assert parsed[:6] == address[:6], f"{url} is read as {parsed!r}, not as {address!r}"
     secret = dict(address.parameters).get("password")
-    assert not secret or secret not in f"{url} {address!r} {read!r}", f"{url} has the password"
+    assert not secret or secret not in f"{url} {address!r} {parsed!r}", f"{url} has the password"
 
 
 def check_read_back(
@@ -338,5 +363,5 @@ def check_read_back(
     frame = framer.next_frame()
     assert frame is not None, f"{encoded.hex(' ')} of {message} makes no frame"
     assert framer.buffered == 0, f"{encoded.hex(' ')} of {message}: bytes are left over"
-    read = dialect.decode(kind.sender, frame)
-    assert read == message, f"{encoded.hex(' ')} of {message} is read as {read}"
+    decoded = dialect.decode(kind.sender, frame)
+    assert decoded == message, f"{encoded.hex(' ')} of {message} is read as {decoded}"

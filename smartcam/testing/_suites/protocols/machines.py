@@ -22,7 +22,7 @@ from smartcam.protocols._inside import Counters, ResultBurst
 from smartcam.testing._suites.protocols.conversations import Player, Received, Sent
 from smartcam.testing._suites.protocols.dialects import check_described
 from smartcam.testing._suites.protocols.parameters import Parameters
-from smartcam.testing._suites.protocols.words import REQUESTS, example
+from smartcam.testing._suites.protocols.words import REQUESTS, make_example
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.conversations import Conversation, Step
 
 MAX_CUTS = 64
-"""Largest number of places at which one delivery is cut in two."""
+"""Largest number of offsets at which one delivery is cut in two."""
 
 MAX_ERROR_CHARACTERS = 500
-"""Largest number of characters of an error's text, with at most 64 bytes of a peer."""
+"""Largest number of characters of an error's text. It may show 64 bytes that the peer sent."""
 
 FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
 """Bytes that a camera repeats endlessly, one at a time."""
@@ -45,10 +45,10 @@ FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
 REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 
 MAX_MESSAGES = 1000
-"""Number of messages after which endless bytes count as a valid series of messages."""
+"""Number of messages in endless bytes after which the check accepts them as valid messages."""
 
-MAX_HIDDEN_FACTOR = 2
-"""Largest memory of a machine for waiting bytes, without events, in multiples of the bound."""
+MAX_MEMORY_FACTOR = 2
+"""Largest growth of a machine's memory with endless bytes, in multiples of ``max_waiting``."""
 
 
 class MachineChecks(Parameters):
@@ -71,47 +71,47 @@ class MachineChecks(Parameters):
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
         """Check any cut of a stream: each piece may come alone, or with the next."""
-        for room in (True, False):
-            for cuts in (_bytewise, _unsplit):
+        for use_buffer in (True, False):
+            for split in (_split_bytewise, _keep_whole):
                 player = Player(self.protocol, stream)
                 for step in stream.steps:
-                    player.step(step, cuts(step), room=room)
-        for place, step in enumerate(stream.steps):
+                    player.step(step, split(step), use_buffer=use_buffer)
+        for step_index, step in enumerate(stream.steps):
             if isinstance(step, Received):
                 size = len(step.data)
                 for cut in range(1, size, 1 + size // MAX_CUTS):
-                    player = Player(self.protocol, stream).play(place)
+                    player = Player(self.protocol, stream).play(step_index)
                     player.step(step, [step.data[:cut], step.data[cut:]])
-        joined = dataclasses.replace(stream, steps=_joined(stream.steps))
-        Player(self.protocol, joined).play()
+        joined_stream = dataclasses.replace(stream, steps=_join_deliveries(stream.steps))
+        Player(self.protocol, joined_stream).play()
 
     def test_any_cutting_of_any_bytes_tells_the_same(self, stream: Conversation) -> None:
         """Check any cut of bytes that no camera sends as well."""
         from smartcam.testing._suites import strategies
 
-        places = range(len(stream.steps) + 1)
-        samples = _samples(stream)
-        pieces = strategies.st.lists(strategies.noise(samples), max_size=3)
+        step_indices = range(len(stream.steps) + 1)
+        deliveries = _received_data(stream)
+        pieces = strategies.st.lists(strategies.noise(deliveries), max_size=3)
 
-        def outcome(place: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
-            player = Player(self.protocol, stream).play(place)
-            events = [event for chunk in cut for event in player.deliver(chunk)]
+        def outcome(step_index: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
+            player = Player(self.protocol, stream).play(step_index)
+            events = [event for chunk in cut for event in player.feed_machine(chunk)]
             return events, player.machine.state
 
-        def compare(place: int, whole: bytes, chunks: list[bytes]) -> None:
-            first = outcome(place, [whole])
+        def compare(step_index: int, whole: bytes, chunks: list[bytes]) -> None:
+            first = outcome(step_index, [whole])
             for cut in (chunks, [bytes([byte]) for byte in whole]):
-                other = outcome(place, cut)
+                other = outcome(step_index, cut)
                 assert other == first, f"whole: {first}, in pieces: {other}"
 
         def check(data: DataObject) -> None:
-            place = data.draw(strategies.st.sampled_from(places), label="at step")
+            step_index = data.draw(strategies.st.sampled_from(step_indices), label="at step")
             whole = b"".join(data.draw(pieces, label="comes"))
-            compare(place, whole, strategies.cut(data, whole))
+            compare(step_index, whole, strategies.draw_pieces(data, whole))
 
-        for place in places:
-            compare(place, b"".join(samples), samples)
-        strategies.each_drawn(check)
+        for step_index in step_indices:
+            compare(step_index, b"".join(deliveries), deliveries)
+        strategies.run_with_examples(check)
 
     # ------------------------------------------------------------------ anything
 
@@ -119,50 +119,54 @@ class MachineChecks(Parameters):
         """Check that any bytes and requests give events, of which a failure is the last."""
         from smartcam.testing._suites import strategies
 
-        places = range(len(conversation.steps) + 1)
-        comes = strategies.noise(_samples(conversation))
+        step_indices = range(len(conversation.steps) + 1)
+        any_bytes = strategies.noise(_received_data(conversation))
         dialect = conversation.group(self.protocol)[0]
-        says = strategies.st.sampled_from([example(kind, dialect) for kind in REQUESTS])
-        actions = strategies.st.lists(strategies.st.one_of(comes, says), max_size=8)
+        requests = strategies.st.sampled_from([make_example(kind, dialect) for kind in REQUESTS])
+        actions = strategies.st.lists(strategies.st.one_of(any_bytes, requests), max_size=8)
 
         def check(data: DataObject) -> None:
-            place = data.draw(strategies.st.sampled_from(places), label="at step")
-            player = Player(self.protocol, conversation).play(place)
-            judge = _Judge(player.machine)
+            step_index = data.draw(strategies.st.sampled_from(step_indices), label="at step")
+            player = Player(self.protocol, conversation).play(step_index)
+            checker = _LinkChecker(player.machine)
             for action in data.draw(actions, label="then"):
-                judge.let(action)
-            judge.end()
+                checker.apply(action)
+            checker.close_link()
 
-        strategies.each_drawn(check)
+        strategies.run_with_examples(check)
 
     def test_end_of_the_link_is_told_once(self, stream: Conversation) -> None:
         """Check an end anywhere, also within an answer; nothing is read after it."""
-        for place, halves in _places(stream):
-            player = Player(self.protocol, stream).play(place)
-            judge = _Judge(player.machine)
+        for step_index, halves in _stop_points(stream):
+            player = Player(self.protocol, stream).play(step_index)
+            checker = _LinkChecker(player.machine)
             for half in halves:
-                judge.let(half)
-            failed = judge.over
-            judge.end()
-            assert failed or isinstance(judge.last, LinkEnded), f"at step {place}: {judge.last}"
+                checker.apply(half)
+            failed = checker.has_ended
+            checker.close_link()
+            assert failed or isinstance(checker.last, LinkEnded), (
+                f"at step {step_index}: {checker.last}"
+            )
 
     def test_what_waits_for_more_has_a_bound(self, conversation: Conversation) -> None:
         """Check that bytes without an end fail, are dropped, or are messages."""
         tracing = tracemalloc.is_tracing()
-        for place, halves in _places(conversation):
+        for step_index, halves in _stop_points(conversation):
             for filler in FILLERS:
-                player = Player(self.protocol, conversation).play(place)
+                player = Player(self.protocol, conversation).play(step_index)
                 for half in halves:
-                    player.deliver(half)
+                    player.feed_machine(half)
                 if not tracing:
                     tracemalloc.start()
                 try:
-                    self._fill(player, filler, f"at step {place}, {filler!r} without an end")
+                    self._feed_endless_bytes(
+                        player, filler, f"at step {step_index}, {filler!r} without an end"
+                    )
                 finally:
                     if not tracing:
                         tracemalloc.stop()
 
-    def _fill(self, player: Player, filler: bytes, where: str) -> None:
+    def _feed_endless_bytes(self, player: Player, filler: bytes, where: str) -> None:
         machine, messages = player.machine, 0
         datagrams = machine.transport is Transport.UDP
         chunk = filler * (60_000 if datagrams else 4096)
@@ -181,9 +185,9 @@ class MachineChecks(Parameters):
                 assert waiting == 0, f"{where}: {waiting} bytes of a datagram are kept"
             if messages > MAX_MESSAGES:
                 break  # reports are messages
-        grown = tracemalloc.get_traced_memory()[0] - before
-        assert grown <= MAX_HIDDEN_FACTOR * self.max_waiting, (
-            f"{where}: the machine has grown by {grown} bytes"
+        memory_growth = tracemalloc.get_traced_memory()[0] - before
+        assert memory_growth <= MAX_MEMORY_FACTOR * self.max_waiting, (
+            f"{where}: the machine has grown by {memory_growth} bytes"
         )
 
     # ------------------------------------------------------------------ requests
@@ -194,73 +198,79 @@ class MachineChecks(Parameters):
         dialect = player.machine.dialect
         for kind in REQUESTS:
             if kind not in {m.Connect, m.Disconnect}:
-                see_refused(player, example(kind, dialect), "before the session")
+                check_refused(player, make_example(kind, dialect), "before the session")
         player.play()
 
     def test_disconnect_before_the_session_is_harmless(self, conversation: Conversation) -> None:
         """Check Disconnect as the first message: it ends a session that a dead client left."""
         player = Player(self.protocol, conversation)
         player.machine.send(m.Disconnect())
-        player.written()
+        player.take_output()
         player.play()
 
     def test_message_that_it_has_not_is_refused(self, conversation: Conversation) -> None:
         """Check the refusal at any time, and that the conversation then goes as written."""
-        for place in range(len(conversation.steps) + 1):
-            player = Player(self.protocol, conversation).play(place)
+        for step_index in range(len(conversation.steps) + 1):
+            player = Player(self.protocol, conversation).play(step_index)
             dialect = player.machine.dialect
             for kind in REQUESTS:
                 if not dialect.has(kind):
-                    see_refused(player, example(kind, dialect), f"at step {place}")
+                    check_refused(player, make_example(kind, dialect), f"at step {step_index}")
             player.play()
 
     def test_second_request_while_the_answer_is_owed_is_refused(
         self, conversation: Conversation
     ) -> None:
         """Check the refusal, since answers do not name their request; a status answers two."""
-        for place, step in enumerate(conversation.steps):
+        for step_index, step in enumerate(conversation.steps):
             if isinstance(step, Sent) and isinstance(step.message, m.Request):
-                player = Player(self.protocol, conversation).play(place + 1)
+                player = Player(self.protocol, conversation).play(step_index + 1)
                 kind = type(step.message)
                 answer = kind.answer
                 if kind is m.Connect or answer is m.StatusReport:
                     continue
                 if player.machine.dialect.answers(kind):
-                    see_refused(player, step.message, f"at step {place + 1}, an answer is owed")
+                    check_refused(
+                        player, step.message, f"at step {step_index + 1}, an answer is owed"
+                    )
                     player.play()
 
     def test_answer_that_nobody_asked_for_is_not_told(self, conversation: Conversation) -> None:
-        """Check that the answer is kept back, since it would pass for the next request's."""
-        for place, answer, data in _answers(conversation):
-            player = Player(self.protocol, conversation).play(place)
-            events = [event for chunk in data for event in player.deliver(chunk)]
+        """Check that the machine drops the answer: a later request could take it for its own."""
+        for step_index, answer, data in _unrequested_answers(conversation):
+            player = Player(self.protocol, conversation).play(step_index)
+            events = [event for chunk in data for event in player.feed_machine(chunk)]
             answers = [event for event in events if isinstance(event, answer)]
-            assert not answers, f"at step {place}, no request was open, but it reported {answers}"
+            assert not answers, (
+                f"at step {step_index}, no request was open, but it reported {answers}"
+            )
 
     def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
         """Check that Disconnect can be sent in any session, and that nothing is sent after it."""
-        for place in range(len(conversation.steps) + 1):
-            player = Player(self.protocol, conversation).play(place)
+        for step_index in range(len(conversation.steps) + 1):
+            player = Player(self.protocol, conversation).play(step_index)
             machine = player.machine
             if machine.state not in {State.CONNECTING, State.CONNECTED}:
                 continue
             machine.send(m.Disconnect())
-            player.written()
-            later = [step.data for step in conversation.steps[place:] if isinstance(step, Received)]
+            player.take_output()
+            later = [
+                step.data for step in conversation.steps[step_index:] if isinstance(step, Received)
+            ]
             for data in (b"", *later):
                 machine.receive_data(data)
                 machine.events()
-                wire = player.written()
-                assert not wire, f"at step {place}, after Disconnect it said {wire!r}"
+                wire = player.take_output()
+                assert not wire, f"at step {step_index}, after Disconnect it said {wire!r}"
                 for kind in REQUESTS:
                     if kind not in {m.Connect, m.Disconnect}:
-                        message = example(kind, machine.dialect)
-                        see_refused(player, message, f"at step {place}, after Disconnect")
+                        message = make_example(kind, machine.dialect)
+                        check_refused(player, message, f"at step {step_index}, after Disconnect")
 
     # ------------------------------------------------------------------ self-description
 
     def test_machine_says_what_it_is(self, conversation: Conversation) -> None:
-        """Check dialect, transport and state, which the client uses, and that lists are copies."""
+        """Check the attributes that a client uses, and that returned lists are not used again."""
         player = Player(self.protocol, conversation)
         machine, group = player.machine, player.group
         assert machine.state is State.IDLE, f"at first it is {machine.state}"
@@ -272,9 +282,9 @@ class MachineChecks(Parameters):
         assert bytes(machine.pending) == b"", f"pending: {machine.pending!r} before anything came"
         for take in (machine.events, machine.data_to_send):
             name = getattr(take, "__name__", "it")
-            taken: list[Any] = take()
-            assert taken == [], f"{name}() gave {taken} before anything was said"
-            taken.append(None)
+            items: list[Any] = take()
+            assert items == [], f"{name}() gave {items} before anything was said"
+            items.append(None)
             assert take() == [], f"{name}() gives what its caller did to an earlier list"
         player.play()
         machine.adopt(machine.kin[0])
@@ -284,13 +294,13 @@ class MachineChecks(Parameters):
         """Check the states: connecting after Connect, connected after its answer, then failed."""
         player = Player(self.protocol, conversation)
         machine = player.machine
-        for place, step in enumerate(conversation.steps):
-            player.play(place + 1)
-            state, where = machine.state, f"after step {place}, {step!r:.200}"
+        for step_index, step in enumerate(conversation.steps):
+            player.play(step_index + 1)
+            state, where = machine.state, f"after step {step_index}, {step!r:.200}"
             if isinstance(step, Sent):
                 if isinstance(step.message, m.Connect):
-                    wanted = {State.CONNECTING, State.CONNECTED}
-                    assert state in wanted, f"{where}: it is {state}"
+                    allowed_states = {State.CONNECTING, State.CONNECTED}
+                    assert state in allowed_states, f"{where}: it is {state}"
                 continue
             for event in step.events:
                 if isinstance(event, m.ConnectAnswer) and step.events[-1] is event:
@@ -309,32 +319,34 @@ class MachineChecks(Parameters):
 
     def test_trace_shows_what_is_said(self, conversation: Conversation) -> None:
         """Check that a trace has both sides' frames, in words, without the password."""
-        seen: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
+        traced: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
         player = Player(
-            self.protocol, conversation, lambda sender, frame: seen.append((sender, frame))
+            self.protocol, conversation, lambda sender, frame: traced.append((sender, frame))
         ).play()
         dialect = player.machine.dialect
         secret = conversation.parameters.get("password", "")
-        for sender, frame in seen:
+        for sender, frame in traced:
             if isinstance(frame, RemoteProtocolError):
                 continue
             assert isinstance(frame, Frame), f"traced: expected a Frame, got {frame!r}"
             spelled = check_described(dialect, sender, frame)
-            shown = f"{frame!r} {spelled!r}"
-            assert not secret or secret not in shown, f"the trace has the password: {shown}"
-        spoken = {
+            trace_text = f"{frame!r} {spelled!r}"
+            assert not secret or secret not in trace_text, (
+                f"the trace has the password: {trace_text}"
+            )
+        speakers = {
             sender
             for sender, frames in (
                 (m.Sender.CLIENT, [step.wire for step in conversation.steps]),
-                (m.Sender.CAMERA, [*_samples(conversation)]),
+                (m.Sender.CAMERA, [*_received_data(conversation)]),
             )
             if any(frames)
         }
-        missing = spoken - {sender for sender, _ in seen}
+        missing = speakers - {sender for sender, _ in traced}
         assert not missing, f"nothing of the {missing} was traced"
 
 
-class _Judge:
+class _LinkChecker:
     """Feeds a machine and checks that a link can process its events."""
 
     def __init__(self, machine: LinkMachine) -> None:
@@ -344,11 +356,11 @@ class _Judge:
             self.last = machine.state
 
     @property
-    def over(self) -> bool:
+    def has_ended(self) -> bool:
         """True if the machine reported the link's end."""
         return isinstance(self.last, (LinkFailed, LinkEnded, State))
 
-    def let(self, action: bytes | m.Message) -> None:
+    def apply(self, action: bytes | m.Message) -> None:
         """Pass bytes or a request to the machine."""
         if isinstance(action, m.Message):
             try:
@@ -356,30 +368,30 @@ class _Judge:
             except REFUSALS:
                 pass
             else:
-                harmless = not self.over or isinstance(action, m.Disconnect)
+                harmless = not self.has_ended or isinstance(action, m.Disconnect)
                 assert harmless, f"it took {action} after {self.last}"
         else:
             self.machine.receive_data(action)
-        self._look()
+        self._check_output()
 
-    def end(self) -> None:
-        """Close the link twice from the camera's side, and pass bytes after that."""
-        before = self.over
+    def close_link(self) -> None:
+        """Close the link from the camera's side, then pass bytes; do both twice."""
+        before = self.has_ended
         for _ in range(2):
             self.machine.receive_eof()
-            self._look()
+            self._check_output()
             self.machine.receive_data(b"too late\r\n\0")
-            self._look()
-        assert self.over, "the link's end was not reported"
-        wanted = {State.FAILED, State.CLOSED} if before else {State.CLOSED}
-        assert self.machine.state in wanted, f"at the end it is {self.machine.state}"
+            self._check_output()
+        assert self.has_ended, "the link's end was not reported"
+        allowed_states = {State.FAILED, State.CLOSED} if before else {State.CLOSED}
+        assert self.machine.state in allowed_states, f"at the end it is {self.machine.state}"
 
-    def _look(self) -> None:
+    def _check_output(self) -> None:
         for event in self.machine.events():
-            assert not self.over, f"{event} after {self.last}, which is the last"
+            assert not self.has_ended, f"{event} after {self.last}, which is the last"
             self.last = event
             if isinstance(event, LinkFailed):
-                self._see_error(event.error)
+                self._check_error(event.error)
             elif isinstance(event, LinkEnded):
                 assert event.pending >= 0, f"{event}: expected the number of bytes left"
             else:
@@ -388,17 +400,17 @@ class _Judge:
         for data in self.machine.data_to_send():
             assert isinstance(data, bytes), f"data_to_send() has {data!r}"
 
-    def _see_error(self, error: RemoteProtocolError) -> None:
+    def _check_error(self, error: RemoteProtocolError) -> None:
         assert isinstance(error, RemoteProtocolError), f"LinkFailed with {error!r}"
         assert str(error), f"{error!r} says nothing"
         length = len(str(error))
         assert length <= MAX_ERROR_CHARACTERS, f"a text of {length}: {error!r:.200}"
         copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
-        assert str(copy) == str(error), f"{error!r} is {copy!r} behind pickle"
+        assert str(copy) == str(error), f"{error!r} is {copy!r} after pickle"
         assert self.machine.state is State.FAILED, f"after {error!r} it is {self.machine.state}"
 
 
-def see_refused(player: Player, message: m.Message, where: str) -> None:
+def check_refused(player: Player, message: m.Message, where: str) -> None:
     """Check that a machine refuses a message, and that nothing has changed.
 
     Raises:
@@ -412,65 +424,67 @@ def see_refused(player: Player, message: m.Message, where: str) -> None:
         pass
     else:
         pytest.fail(f"{where}: {message} was taken")
-    events, wire = machine.events(), player.written()
+    events, wire = machine.events(), player.take_output()
     assert not events, f"{where}: {message} was refused, but it reported {events}"
     assert not wire, f"{where}: {message} was refused, but it said {wire!r}"
     assert machine.state is state, f"{where}: {message} was refused, but it is {machine.state}"
 
 
-def _samples(conversation: Conversation) -> list[bytes]:
+def _received_data(conversation: Conversation) -> list[bytes]:
     return [step.data for step in conversation.steps if isinstance(step, Received)]
 
 
-def _bytewise(step: Step) -> list[bytes] | None:
+def _split_bytewise(step: Step) -> list[bytes] | None:
     return [bytes([byte]) for byte in step.data] if isinstance(step, Received) else None
 
 
-def _unsplit(_: Step) -> None:
+def _keep_whole(_: Step) -> None:
     return None
 
 
-def _joined(steps: Sequence[Step]) -> list[Step]:
+def _join_deliveries(steps: Sequence[Step]) -> list[Step]:
     """Return the steps with consecutive deliveries joined."""
-    joined: list[Step] = []
+    joined_steps: list[Step] = []
     for step in steps:
-        last = joined[-1] if joined else None
+        last = joined_steps[-1] if joined_steps else None
         if isinstance(step, Received) and isinstance(last, Received) and not last.wire:
-            joined[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
+            joined_steps[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
         else:
-            joined.append(step)
-    return joined
+            joined_steps.append(step)
+    return joined_steps
 
 
-def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
-    """Yield each place of a conversation before its failure, and the middle of each answer.
+def _stop_points(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
+    """Yield each index of a step, and for an answer also its first half in a list.
 
-    For the middle of an answer the first half's bytes are included.
+    The index after the last step is included unless the conversation ends with a failure.
     """
     failed = False
-    for place, step in enumerate(conversation.steps):
-        yield place, []
+    for step_index, step in enumerate(conversation.steps):
+        yield step_index, []
         if isinstance(step, Received):
-            yield place, [step.data[: len(step.data) // 2]]
+            yield step_index, [step.data[: len(step.data) // 2]]
             failed = any(isinstance(event, type) for event in step.events)
     if not failed:
         yield len(conversation.steps), []
 
 
-def _answers(conversation: Conversation) -> Iterator[tuple[int, type[m.Message], list[bytes]]]:
-    """Yield each answered request's place, its answer's type, and the bytes before the answer."""
+def _unrequested_answers(
+    conversation: Conversation,
+) -> Iterator[tuple[int, type[m.Message], list[bytes]]]:
+    """Yield each request's index, its answer's type, and the deliveries up to the answer."""
     steps = conversation.steps
-    for place, step in enumerate(steps):
+    for step_index, step in enumerate(steps):
         if not isinstance(step, Sent) or not isinstance(step.message, m.Request):
             continue
         answer = type(step.message).answer
         if answer is None or issubclass(answer, (m.StatusReport, m.ResultContainer)):
             continue
         data: list[bytes] = []
-        for following in steps[place + 1 :]:
+        for following in steps[step_index + 1 :]:
             if isinstance(following, Sent):
                 break
             data.append(following.data)
             if any(isinstance(event, answer) for event in following.events):
-                yield place, answer, data
+                yield step_index, answer, data
                 break

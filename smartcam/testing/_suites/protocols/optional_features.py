@@ -18,14 +18,14 @@ from smartcam import (
 )
 from smartcam.testing._suites.protocols.cameras_under_test import ECHO
 from smartcam.testing._suites.protocols.client_checks import (
+    EVENT_TIMEOUT,
     SHORT_TIMEOUT,
-    SOON_TIMEOUT,
-    in_a_loop,
-    needs,
-    number,
-    refused,
-    until,
-    visiting,
+    check_unsupported,
+    open_session,
+    skip_without_applications,
+    trigger_and_read,
+    wait_until,
+    with_event_loop,
 )
 from smartcam.testing._suites.protocols.parameters import Parameters
 
@@ -38,13 +38,13 @@ LEAP_DAY = datetime(2024, 2, 29, 23, 59, 30)  # noqa: DTZ001 - the camera's cloc
 class OptionalFeatureChecks(Parameters):
     """The checks of optional features: each works, or raises an error and the session goes on."""
 
-    @in_a_loop
+    @with_event_loop
     async def test_start_and_stop(self, camera_kind: CameraKind) -> None:
         """Check that start and stop may be called twice."""
-        async with visiting(camera_kind) as (_, camera):
+        async with open_session(camera_kind) as (_, camera):
             if not camera.capabilities.start_stop:
-                await refused(camera, camera.stop())
-                await refused(camera, camera.start())
+                await check_unsupported(camera, camera.stop())
+                await check_unsupported(camera, camera.start())
                 return
             await camera.stop()
             assert Status.RUNNING not in camera.status
@@ -52,135 +52,135 @@ class OptionalFeatureChecks(Parameters):
             await camera.start()
             await camera.start()
             assert Status.RUNNING in camera.status
-            assert await number(camera) == 0
+            assert await trigger_and_read(camera) == 0
 
-    @in_a_loop
+    @with_event_loop
     async def test_clock(self, camera_kind: CameraKind) -> None:
         """Check that the clock shows the time that was set."""
-        async with visiting(camera_kind) as (_, camera):
+        async with open_session(camera_kind) as (_, camera):
             if camera.capabilities.set_clock:
                 await camera.set_clock(LEAP_DAY)
             else:
-                await refused(camera, camera.set_clock(LEAP_DAY))
+                await check_unsupported(camera, camera.set_clock(LEAP_DAY))
             if camera.capabilities.get_clock:
                 assert timedelta(0) <= await camera.get_clock() - LEAP_DAY < timedelta(seconds=30)
             else:
-                await refused(camera, camera.get_clock())
+                await check_unsupported(camera, camera.get_clock())
 
-    @in_a_loop
+    @with_event_loop
     async def test_input_belongs_to_its_trigger(self, camera_kind: CameraKind) -> None:
         """Check that input data is used by the next inspection."""
-        async with visiting(camera_kind) as (_, camera):
+        async with open_session(camera_kind) as (_, camera):
             data = struct.pack("<I", 4711)
             if not camera.capabilities.input_data:
-                await refused(camera, camera.set_input(data))
+                await check_unsupported(camera, camera.set_input(data))
                 with pytest.raises(UnsupportedError):
                     await camera.trigger(input=data)
                 return
-            needs(camera_kind, ECHO)
+            skip_without_applications(camera_kind, ECHO)
             await camera.switch_application(ECHO)
-            assert await number(camera, input=data) == 4711
+            assert await trigger_and_read(camera, input=data) == 4711
             await camera.set_input(struct.pack("<I", 5))
-            assert await number(camera) == 5
+            assert await trigger_and_read(camera) == 5
 
-    @in_a_loop
+    @with_event_loop
     async def test_input_that_does_not_fit_is_refused_where_there_are_codes(
         self, camera_kind: CameraKind
     ) -> None:
         """Check that the input is refused, and that the camera keeps no part of it."""
-        async with visiting(camera_kind) as (_, camera):
+        async with open_session(camera_kind) as (_, camera):
             if camera.capabilities.input_data and camera.capabilities.result_codes:
-                needs(camera_kind, ECHO)
+                skip_without_applications(camera_kind, ECHO)
                 await camera.switch_application(ECHO)
                 with pytest.raises(CommandRejectedError):
                     await camera.trigger(input=b"too long for it")
-                assert await number(camera, input=struct.pack("<I", 1)) == 1
+                assert await trigger_and_read(camera, input=struct.pack("<I", 1)) == 1
 
-    @in_a_loop
+    @with_event_loop
     async def test_sequence_number(self, camera_kind: CameraKind) -> None:
-        """Check that the number that was set comes with the next result."""
-        async with visiting(camera_kind, interpret_as=camera_kind.numbers_with_sequence) as (
+        """Check that the next result has the number that was set."""
+        async with open_session(camera_kind, interpret_as=camera_kind.numbers_with_sequence) as (
             _,
             camera,
         ):
             if not camera.capabilities.sequence_number:
-                await refused(camera, camera.set_sequence_number(5000))
+                await check_unsupported(camera, camera.set_sequence_number(5000))
                 return
             await camera.set_sequence_number(5000)
             result = await camera.trigger()
             assert (result.sequence, result.value.n) == (5000, 5000)
             assert (await camera.trigger()).sequence not in {None, 5000}
 
-    @in_a_loop
+    @with_event_loop
     async def test_query_status(self, camera_kind: CameraKind) -> None:
         """Check that the answer is the status."""
-        async with visiting(camera_kind) as (_, camera):
+        async with open_session(camera_kind) as (_, camera):
             if camera.capabilities.get_status:
                 assert Status.RUNNING in await camera.query_status()
             else:
-                await refused(camera, camera.query_status())
+                await check_unsupported(camera, camera.query_status())
 
-    @in_a_loop
+    @with_event_loop
     async def test_reset_errors(self, camera_kind: CameraKind) -> None:
         """Check that the answer is a status without the errors."""
-        async with visiting(camera_kind) as (_, camera):
+        async with open_session(camera_kind) as (_, camera):
             if camera.capabilities.reset_errors:
                 assert Status.OVERTRIGGERED not in await camera.reset_errors()
             else:
-                await refused(camera, camera.reset_errors())
+                await check_unsupported(camera, camera.reset_errors())
 
-    @in_a_loop
+    @with_event_loop
     async def test_read_image(self, camera_kind: CameraKind) -> None:
-        """Check that there is a picture."""
-        async with visiting(camera_kind) as (_, camera):
+        """Check that the camera sends a picture."""
+        async with open_session(camera_kind) as (_, camera):
             if camera.capabilities.read_image:
-                assert len(await camera.read_image(timeout=SOON_TIMEOUT)) > 0
+                assert len(await camera.read_image(timeout=EVENT_TIMEOUT)) > 0
             else:
-                await refused(camera, camera.read_image())
+                await check_unsupported(camera, camera.read_image())
 
-    @in_a_loop
+    @with_event_loop
     async def test_load_by_file(self, camera_kind: CameraKind) -> None:
-        """Check that a file that is not there is refused."""
-        async with visiting(camera_kind) as (_, camera):
+        """Check that the camera refuses a file that does not exist."""
+        async with open_session(camera_kind) as (_, camera):
             if camera.capabilities.load_file:
                 with pytest.raises(CommandRejectedError):
                     await camera.switch_application("no such file")
-                await number(camera)
+                await trigger_and_read(camera)
             else:
-                await refused(camera, camera.switch_application("counter"))
+                await check_unsupported(camera, camera.switch_application("counter"))
 
-    @in_a_loop
+    @with_event_loop
     async def test_reboot(self, camera_kind: CameraKind) -> None:
         """Check that the session is over."""
-        async with visiting(camera_kind, close_timeout=0.2) as (_, camera):
+        async with open_session(camera_kind, close_timeout=0.2) as (_, camera):
             if not camera.capabilities.reboot:
-                await refused(camera, camera.reboot())
+                await check_unsupported(camera, camera.reboot())
                 return
             await camera.reboot()
             assert not camera.connected
             with pytest.raises(ConnectionLostError):
                 await camera.trigger()
 
-    @in_a_loop
+    @with_event_loop
     async def test_request_gives_the_answers_body(self, camera_kind: CameraKind) -> None:
-        """Check any request by its id, answered or not."""
-        async with visiting(camera_kind) as (_, camera):
+        """Check that a request by its id returns the answer's body, or does not wait for it."""
+        async with open_session(camera_kind) as (_, camera):
             if camera_kind.raw_request is not None:
                 assert await camera.request(camera_kind.raw_request)
                 assert await camera.request(camera_kind.raw_request, answered=False) is None
                 assert await camera.request(camera_kind.raw_request)
             with pytest.raises(UnsupportedError):
                 await camera.request(camera_kind.foreign_request)
-            assert await number(camera) == 0
+            assert await trigger_and_read(camera) == 0
 
-    @in_a_loop
+    @with_event_loop
     async def test_request_that_nobody_answers_costs_the_link(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the link is given up, since a late answer would pass for the next one."""
-        async with visiting(camera_kind, request_timeout=SHORT_TIMEOUT) as (_, camera):
+        """Check that the link is closed: a late answer could be taken for the next request's."""
+        async with open_session(camera_kind, request_timeout=SHORT_TIMEOUT) as (_, camera):
             if camera.capabilities.result_codes or camera_kind.silent_request is None:
                 return  # such a camera answers everything
             with pytest.raises(ResponseTimeoutError):
                 await camera.request(camera_kind.silent_request)
-            await until(lambda: not camera.connected)
+            await wait_until(lambda: not camera.connected)

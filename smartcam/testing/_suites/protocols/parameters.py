@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import pytest
 
 from smartcam.protocols import Protocol, Transport
-from smartcam.testing._suites.in_words import SaysWhatWasExpected
+from smartcam.testing._suites.in_words import ExplainedChecks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.conversations import Conversation
 
 
-class Parameters(SaysWhatWasExpected):
+class Parameters(ExplainedChecks):
     """Base of the suites: the values that an author gives.
 
     Attributes:
@@ -38,13 +38,15 @@ class Parameters(SaysWhatWasExpected):
         """
         for name in ("dialect", "conversation", "stream", "camera_kind"):
             if name in metafunc.fixturenames:
-                cases = self._parameters_named(name)
+                cases = self._cases_for(name)
                 metafunc.parametrize(name, cases, ids=_label)
 
-    def _parameters_named(self, name: str) -> list[Any]:
+    def _cases_for(self, name: str) -> list[Any]:
         suite = type(self)
         if name == "camera_kind":
-            return list(self.camera_kinds) or _nothing(f"{suite.__name__}.camera_kinds is empty")
+            return list(self.camera_kinds) or _skipped_case(
+                f"{suite.__name__}.camera_kinds is empty"
+            )
         if not isinstance(getattr(suite, "protocol", None), Protocol):
             raise pytest.UsageError(f"{suite.__name__}.protocol: expected a Protocol")
         if name == "dialect":
@@ -54,13 +56,13 @@ class Parameters(SaysWhatWasExpected):
             for conversation in self.conversations
             if name == "conversation" or conversation.transport is Transport.TCP
         ]
-        return conversations or _nothing(
+        return conversations or _skipped_case(
             f"{suite.__name__}.conversations has none"
             + (" over TCP" if name == "stream" and self.conversations else "")
         )
 
 
-def _nothing(reason: str) -> list[Any]:
+def _skipped_case(reason: str) -> list[Any]:
     return [pytest.param(None, id="none", marks=pytest.mark.skip(reason=reason))]
 
 

@@ -22,14 +22,14 @@ from smartcam import (
 )
 from smartcam.testing._suites.protocols.cameras_under_test import COUNTER, OTHER
 from smartcam.testing._suites.protocols.client_checks import (
+    EVENT_TIMEOUT,
     SHORT_TIMEOUT,
-    SOON_TIMEOUT,
-    balance,
-    client,
-    in_a_loop,
-    number,
-    until,
-    visiting,
+    check_balance,
+    make_client,
+    open_session,
+    trigger_and_read,
+    wait_until,
+    with_event_loop,
 )
 from smartcam.testing._suites.protocols.parameters import Parameters
 
@@ -37,16 +37,16 @@ if TYPE_CHECKING:
     from smartcam import Camera
     from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
 
-FAST = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
+FAST_RECONNECT = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
 
 
 class SessionChecks(Parameters):
     """A session: opened, closed, lost, taken."""
 
-    @in_a_loop
+    @with_event_loop
     async def test_connect_pinned_knows_the_camera(self, camera_kind: CameraKind) -> None:
         """Check that URL, application and status are known after ``connect()``."""
-        async with visiting(camera_kind) as (live, camera):
+        async with open_session(camera_kind) as (live, camera):
             assert camera.connected
             assert camera.url == live.url
             assert camera.active_application == COUNTER
@@ -55,9 +55,9 @@ class SessionChecks(Parameters):
             assert await camera.query_application() == COUNTER
             await camera.wait_ready()
 
-    @in_a_loop
+    @with_event_loop
     async def test_connect_unpinned_finds_out_and_pins_it(self, camera_kind: CameraKind) -> None:
-        """Check that the dialect is found out, and then stands in the URL."""
+        """Check that the client finds out the dialect and adds it to its URL."""
         async with camera_kind.open() as live:
             camera = smartcam.connect(
                 live.unpinned, interpret_as=camera_kind.numbers, reconnect=None
@@ -65,69 +65,74 @@ class SessionChecks(Parameters):
             events = camera.events()
             async with camera:
                 assert camera.url == live.url
-                assert await number(camera) == 0
-                async with asyncio.timeout(SOON_TIMEOUT):
+                assert await trigger_and_read(camera) == 0
+                async with asyncio.timeout(EVENT_TIMEOUT):
                     event = await anext(events)
                     while not isinstance(event, Connected):
                         event = await anext(events)
                 assert event.url == live.url
 
-    @in_a_loop
+    @with_event_loop
     async def test_connect_with_an_application_has_it_running(
         self, camera_kind: CameraKind
     ) -> None:
         """Check that the client switches to the application that was named."""
-        async with visiting(camera_kind, application=OTHER) as (_, camera):
+        async with open_session(camera_kind, application=OTHER) as (_, camera):
             assert camera.active_application == OTHER
             result = await camera.trigger()
             assert result.application == OTHER
 
-    @in_a_loop
+    @with_event_loop
     async def test_close_ends_the_session_and_leaves_the_camera_as_it_is(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the camera gets a Disconnect, and runs on; closing twice is harmless."""
+        """Check that closing ends the session, and that the camera keeps running; close twice."""
         async with camera_kind.open() as live:
             assert not live.has_session
-            camera = await client(camera_kind, live)
+            camera = await make_client(camera_kind, live)
             if camera.capabilities.switch and OTHER in camera_kind.applications:
                 await camera.switch_application(OTHER)
-            left_with = camera.active_application
+            last_application = camera.active_application
             assert live.has_session
             await camera.close()
-            await until(lambda: not live.has_session)
+            await wait_until(lambda: not live.has_session)
             await camera.close()
             with pytest.raises(ConnectionClosedError):
                 await camera.trigger()
-            async with client(camera_kind, live) as following:
-                assert following.active_application == left_with
-                assert Status.RUNNING in following.status
+            async with make_client(camera_kind, live) as second:
+                assert second.active_application == last_application
+                assert Status.RUNNING in second.status
 
-    @in_a_loop
+    @with_event_loop
     async def test_lost_camera_is_told_and_comes_back(self, camera_kind: CameraKind) -> None:
         """Check for Disconnected, then Reconnected, and that triggers work again."""
-        async with visiting(camera_kind, reconnect=FAST, liveness_timeout=0.4) as (live, camera):
+        async with open_session(camera_kind, reconnect=FAST_RECONNECT, liveness_timeout=0.4) as (
+            live,
+            camera,
+        ):
             events = camera.events()
-            await number(camera)
+            await trigger_and_read(camera)
             await live.restart()
-            await until(lambda: not camera.connected)
-            async with asyncio.timeout(SOON_TIMEOUT):
+            await wait_until(lambda: not camera.connected)
+            async with asyncio.timeout(EVENT_TIMEOUT):
                 kinds = [type(await anext(events))]
                 while kinds[-1] is not Reconnected:
                     kinds.append(type(await anext(events)))
             assert Disconnected in kinds
-            await camera.wait_connected(SOON_TIMEOUT)
+            await camera.wait_connected(EVENT_TIMEOUT)
             assert (await camera.trigger()).application == COUNTER
             assert camera.statistics().reconnects == 1
-            balance(camera.statistics())
+            check_balance(camera.statistics())
 
-    @in_a_loop
+    @with_event_loop
     async def test_killed_camera_ends_what_waits_for_it(self, camera_kind: CameraKind) -> None:
         """Check that every wait and stream ends with a ConnectionLostError."""
-        async with visiting(camera_kind, liveness_timeout=0.4) as (live, camera):
-            waiting = asyncio.create_task(camera.wait_status(lambda _: False, timeout=SOON_TIMEOUT))
+        async with open_session(camera_kind, liveness_timeout=0.4) as (live, camera):
+            waiting = asyncio.create_task(
+                camera.wait_status(lambda _: False, timeout=EVENT_TIMEOUT)
+            )
             results = camera.results()
-            await number(camera)
+            await trigger_and_read(camera)
             try:
                 await live.kill()
             except pytest.skip.Exception:
@@ -136,51 +141,54 @@ class SessionChecks(Parameters):
             with pytest.raises(ConnectionLostError):
                 await waiting
             with pytest.raises(ConnectionLostError):
-                await camera.trigger(timeout=SOON_TIMEOUT)
+                await camera.trigger(timeout=EVENT_TIMEOUT)
             assert not camera.connected
-            async with asyncio.timeout(SOON_TIMEOUT):
+            async with asyncio.timeout(EVENT_TIMEOUT):
                 assert (await anext(results)).value.n == 0
                 with pytest.raises(ConnectionLostError):
                     await anext(results)
-            balance(camera.statistics())
+            check_balance(camera.statistics())
 
-    @in_a_loop
+    @with_event_loop
     async def test_newcomer_takes_the_camera_or_stands_beside(
         self, camera_kind: CameraKind
     ) -> None:
         """Check that the newcomer is served or refused, by the kind of camera."""
-        async with visiting(camera_kind) as (live, first), client(camera_kind, live) as second:
-            assert await number(second) == 0
+        async with (
+            open_session(camera_kind) as (live, first),
+            make_client(camera_kind, live) as second,
+        ):
+            assert await trigger_and_read(second) == 0
             if not camera_kind.exclusive:
-                assert await number(first) == 1
+                assert await trigger_and_read(first) == 1
             elif camera_kind.datagrams:
                 with pytest.raises(TriggerTimeoutError):
                     await first.trigger(timeout=SHORT_TIMEOUT)
             else:
                 with pytest.raises(ConnectionLostError):
-                    await first.trigger(timeout=SOON_TIMEOUT)
-            await number(second)
+                    await first.trigger(timeout=EVENT_TIMEOUT)
+            await trigger_and_read(second)
 
-    @in_a_loop
+    @with_event_loop
     async def test_two_that_want_the_camera_do_not_fight_for_it(
         self, camera_kind: CameraKind
     ) -> None:
         """Check that one client gives up, and the other keeps the camera."""
         async with (
-            visiting(camera_kind, reconnect=FAST) as (live, first),
-            client(camera_kind, live, reconnect=FAST) as second,
+            open_session(camera_kind, reconnect=FAST_RECONNECT) as (live, first),
+            make_client(camera_kind, live, reconnect=FAST_RECONNECT) as second,
         ):
             if camera_kind.exclusive and not camera_kind.datagrams:
-                await until(lambda: is_taken(first) or is_taken(second))
-                left = second if is_taken(first) else first
-                await left.wait_connected(SOON_TIMEOUT)
-                await number(left)
-                assert not is_taken(left)
-            balance(first.statistics())
-            balance(second.statistics())
+                await wait_until(lambda: was_displaced(first) or was_displaced(second))
+                winner = second if was_displaced(first) else first
+                await winner.wait_connected(EVENT_TIMEOUT)
+                await trigger_and_read(winner)
+                assert not was_displaced(winner)
+            check_balance(first.statistics())
+            check_balance(second.statistics())
 
 
-def is_taken(camera: Camera) -> bool:
+def was_displaced(camera: Camera) -> bool:
     """Return True if a client has given up because another one has the camera."""
     try:
         camera.next_result().close()

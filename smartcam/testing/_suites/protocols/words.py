@@ -27,7 +27,7 @@ REQUESTS: tuple[type[m.Request], ...] = tuple(
 )
 """The types of all messages that a client sends."""
 
-NEEDED: tuple[type[m.Message], ...] = (
+REQUIRED_MESSAGES: tuple[type[m.Message], ...] = (
     m.Connect,
     m.ConnectAnswer,
     m.Disconnect,
@@ -38,7 +38,7 @@ NEEDED: tuple[type[m.Message], ...] = (
 )
 """Messages that every client needs: a session, a sign of life, the status, results."""
 
-ABILITIES: Mapping[str, tuple[type[m.Message], ...]] = {
+MESSAGES_BY_CAPABILITY: Mapping[str, tuple[type[m.Message], ...]] = {
     "switch": (m.SwitchApplication, m.SwitchAnswer),
     "load_file": (m.LoadFile, m.SwitchAnswer),
     "start_stop": (m.Start, m.Stop),
@@ -53,7 +53,7 @@ ABILITIES: Mapping[str, tuple[type[m.Message], ...]] = {
 }
 """The messages that each field of :class:`~smartcam.Capabilities` depends on."""
 
-_VALUES: Mapping[str, Any] = {
+_EXAMPLE_VALUES: Mapping[str, Any] = {
     "status": Status.RUNNING,
     "data": b"1.job",
     "name": b"1.job",
@@ -66,9 +66,9 @@ _VALUES: Mapping[str, Any] = {
 }
 
 
-def example(kind: type[m.Message], dialect: Dialect) -> m.Message:
+def make_example(kind: type[m.Message], dialect: Dialect) -> m.Message:
     """Return a message of a kind, with values that fit any dialect."""
-    values = {name: _VALUES.get(name, 1) for name, _ in m.wire_fields(kind)}
+    values = {name: _EXAMPLE_VALUES.get(name, 1) for name, _ in m.wire_fields(kind)}
     if "application" in values:
         values["application"] = dialect.application_ids[0]
     return kind(**values)
