@@ -306,7 +306,7 @@ LIMITS = (
     "web._feed.MAX_LOG_NEWS",
     "web._feed.MAX_FAULTS_TOLD",
     "web._live.MAX_NEWS",
-    "web._live.CLOCK_LOOKS",
+    "web._live.LOOKS_PER_CLOCK",
     "web._live_view.MAX_RESULTS",
     "web._live_view.MAX_VALUE_CHARACTERS",
     "web._live_view.MAX_PARTS",
