@@ -128,7 +128,7 @@ def fleet_camera(
             f"{url}: {', '.join(refused)}: these are options of the camera's session, which its "
             "agent has: set them in fleet.yaml"
         )
-    program = Program(_end(address), address.fleet, address.camera, called=address.program)
+    program = Program(_end(address), address.fleet, address.camera, display_name=address.program)
     return FleetCamera(settings, address.camera, program, observers=observers)
 
 

@@ -1,4 +1,4 @@
-"""Run an agent's outlets, which deliver its sessions' results."""
+"""Run an agent's outlets, which deliver results of the agent's cameras."""
 
 from __future__ import annotations
 
@@ -39,8 +39,7 @@ class FleetOutlets(Server):
 
     Args:
         server: server of the cameras; not started yet.
-        report: function that is called with an outlet's name and its trouble, and with "" at the
-            end of the trouble.
+        report: callback for an outlet's name and its trouble; "" when the trouble has ended.
 
     Attributes:
         outlets: the outlets.
@@ -57,8 +56,8 @@ class FleetOutlets(Server):
             from smartcam.outlets._inside import StoreQuestion, columns_of, do_command
         if server.file.outlets is None:
             raise ConfigurationError(f"fleet {server.file.fleet}: outlets: is not in its file")
-        self._server, self._do, self._columns_of = server, do_command, columns_of
-        self._question = StoreQuestion
+        self._server, self._do_command, self._columns_of = server, do_command, columns_of
+        self._question_class = StoreQuestion
         self.outlets: Outlets = Outlets(
             server.file.outlets,
             server.folder,
@@ -69,9 +68,9 @@ class FleetOutlets(Server):
             names=self._names,
         )
         self._observer = _OutletObserver(self)
-        self._readings: dict[str, tuple[object, Interpretation]] = {}
-        self._programs: dict[str, FleetCamera[Any]] = {}
-        self._opening = asyncio.Lock()
+        self._interpretations: dict[str, tuple[object, Interpretation]] = {}
+        self._command_cameras: dict[str, FleetCamera[Any]] = {}
+        self._opening_lock = asyncio.Lock()
 
     async def start(self) -> None:
         """Open the spools and begin to deliver.
@@ -87,49 +86,49 @@ class FleetOutlets(Server):
         if self._observer not in self._server.observers:
             self._server.observers.append(self._observer)
         self._server.outlet_states = lambda: self.outlets.states
-        self._server.stored_results = self.stored
+        self._server.stored_results = self.read_stores
 
     async def stop(self) -> None:
         """Stop; undelivered records stay in the spools."""
         if self._observer in self._server.observers:
             self._server.observers.remove(self._observer)
-        programs, self._programs = [*self._programs.values()], {}
-        for program in programs:
-            await program.close()
+        cameras, self._command_cameras = [*self._command_cameras.values()], {}
+        for camera in cameras:
+            await camera.close()
         await self.outlets.stop()
 
-    async def stored(self, request: StoredRequest) -> dict[str, dict[str, Any]]:
+    async def read_stores(self, request: StoredRequest) -> dict[str, dict[str, Any]]:
         """Return the answers of the stores, by the outlet's name.
 
         Raises:
             ConfigurationError: one of the stores cannot be read now.
 
-        Cancellation: its thread finishes its work.
+        Cancellation: the thread that reads finishes its work.
         """
         since = None if request.since is None else datetime.fromisoformat(request.since)
-        question = self._question(since, request.failed, request.camera, request.most)
+        question = self._question_class(since, request.failed, request.camera, request.most)
         answers = await asyncio.to_thread(self.outlets.stored, question)
         return {name: {"rows": answer.rows, **answer.summary} for name, answer in answers.items()}
 
-    def reading(self, camera: str) -> Interpretation | None:
-        """Return the interpretation of a camera's results; None for a camera that is not known."""
-        planned = self._server.reloads.now.plan.get(camera)
+    def interpretation(self, camera: str) -> Interpretation | None:
+        """Return the interpretation of a camera's results; None if the file has no such camera."""
+        planned = self._server.reloads.current.plan.get(camera)
         if planned is None:
             return None
         entry = planned.entry
-        seeing = entry.software is not None and entry.interpret_as is None
-        host = self._server.hosts.get(camera) if seeing else None
-        of: object = entry if host is None else host.settings
-        known = self._readings.get(camera)
-        if known is None or known[0] is not of:
+        is_software = entry.software is not None and entry.interpret_as is None
+        host = self._server.hosts.get(camera) if is_software else None
+        source: object = entry if host is None else host.settings
+        known = self._interpretations.get(camera)
+        if known is None or known[0] is not source:
             spec: Any = "raw" if entry.interpret_as is None else entry.interpret_as
             if host is not None:
                 spec = host.settings.interpret_as
-            elif seeing:  # waiting entries of an earlier run may be requested first
-                made = software_camera(camera, entry.software or {}, self._server.folder)
-                spec = {number: program.interpret_as for number, program in made.programs.items()}
-            read = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
-            known = self._readings[camera] = of, read
+            elif is_software:  # waiting entries of an earlier run may be requested first
+                device = software_camera(camera, entry.software or {}, self._server.folder)
+                spec = {number: program.interpret_as for number, program in device.programs.items()}
+            interpretation = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
+            known = self._interpretations[camera] = source, interpretation
         return known[1]
 
     def endian(self, camera: str) -> int:
@@ -138,32 +137,34 @@ class FleetOutlets(Server):
         return 0 if host is None else host.camera.endian
 
     def _cameras(self) -> dict[str, bool | None]:
-        plan = self._server.reloads.now.plan
+        plan = self._server.reloads.current.plan
         return {name: planned.entry.emulated is not None for name, planned in plan.items()}
 
     def _names(self, camera: str) -> Mapping[str, int]:
         host = self._server.hosts.get(camera)
         if host is not None:
             return host.settings.application_names
-        planned = self._server.reloads.now.plan.get(camera)
+        planned = self._server.reloads.current.plan.get(camera)
         return {} if planned is None else planned.entry.application_names
 
     def _columns(self, camera: str, application: int) -> Any:
-        read = self.reading(camera)
-        return self._columns_of(None if read is None else read.interpreter(application))
+        interpretation = self.interpretation(camera)
+        return self._columns_of(
+            None if interpretation is None else interpretation.interpreter(application)
+        )
 
-    async def _command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Carry out a command like any program of the fleet."""
+    async def _command(self, name: str, verb: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Carry out a command for an outlet, as a program of the fleet."""
         if name not in self._server.hosts:
             raise ConfigurationError(f"there is no camera {name!r:.120} here")
-        async with self._opening:
-            camera = self._programs.get(name)
+        async with self._opening_lock:
+            camera = self._command_cameras.get(name)
             if camera is None:
                 options = {"connect_timeout": COMMAND_CONNECT_TIMEOUT, "reconnect": Backoff()}
                 camera = fleet_camera(self._server.address.of(name).url, options, ())
                 await camera.open()
-                self._programs[name] = camera
-        return await self._do(camera, verb, given)
+                self._command_cameras[name] = camera
+        return await self._do_command(camera, verb, arguments)
 
 
 class _OutletObserver(Observer):
@@ -194,15 +195,15 @@ class _OutletObserver(Observer):
     def on_results(self, results: Sequence[Result]) -> None:
         """Pass on results that came together."""
         camera = results[0].camera
-        read, endian = self._owner.reading(camera), self._owner.endian(camera)
+        interpretation, endian = self._owner.interpretation(camera), self._owner.endian(camera)
         for result in results:
-            self._offer(result, read, endian)
+            self._offer(result, interpretation, endian)
 
-    def _offer(self, result: Result, read: Interpretation | None, endian: int) -> None:
+    def _offer(self, result: Result, interpretation: Interpretation | None, endian: int) -> None:
         cells = result.value.cells
 
-        def value() -> tuple[Any, int | None]:
-            if read is None:
+        def read_value() -> tuple[Any, int | None]:
+            if interpretation is None:
                 return None, None
             content: dict[str, Any] = json.loads(cells) if cells else {}
             texts = content.get("cells")
@@ -214,10 +215,12 @@ class _OutletObserver(Observer):
             )
             at = result.received_at
             camera, number = result.camera, result.number
-            made, sequence, _ = read(container, endian, camera=camera, number=number, at=at)
-            return made, sequence
+            value, sequence, _ = interpretation(
+                container, endian, camera=camera, number=number, at=at
+            )
+            return value, sequence
 
-        self._owner.outlets.offer_result(result, value)
+        self._owner.outlets.offer_result(result, read_value)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Pass on the error of a trigger without a result."""

@@ -31,16 +31,15 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-TIMEOUT = 10.0
+CONNECT_TIMEOUT = 10.0
 """Seconds for connecting to the fleet."""
-
 
 MEET_TIMEOUT = 2.0
 """Seconds to wait for a camera's agent before its node is created."""
 
 
-class _SeenCamera(FleetCamera[Any]):
-    """A camera that expects no application, since ROS gets the results of all.
+class _NodeCamera(FleetCamera[Any]):
+    """A camera that expects no application, since ROS gets the results of all applications.
 
     Its calibration applies only to applications whose results are localizations.
     """
@@ -52,25 +51,25 @@ class _SeenCamera(FleetCamera[Any]):
         self, application: int | str, *, timeout: float | None = None
     ) -> None:
         await super().switch_application(application, timeout=timeout)
-        self._expected = None
+        self._expected_application = None
 
 
-class _Cameras(Fleet):
+class _NodeFleet(Fleet):
     """A fleet whose cameras have their own calibrations, and are nodes of ROS."""
 
-    def __init__(self, *given: Any, calibrations: Mapping[str, Calibration]) -> None:
+    def __init__(self, *arguments: Any, calibrations: Mapping[str, Calibration]) -> None:
         self._calibrations = calibrations
-        super().__init__(*given, guest=True)
+        super().__init__(*arguments, guest=True)
 
-    def _make(self, name: str) -> FleetCamera[Any]:
+    def _make_camera(self, name: str) -> FleetCamera[Any]:
         calibration = self._calibrations.get(name)
-        options = {"name": name, "connect_timeout": TIMEOUT, "calibration": calibration}
+        options = {"name": name, "connect_timeout": CONNECT_TIMEOUT, "calibration": calibration}
         settings = CameraSettings.of(self._address_of(name), options)
-        return _SeenCamera(settings, name, self._program, shared=True)
+        return _NodeCamera(settings, name, self._program, shared=True)
 
 
 class RosFleet(Server):
-    """Nodes for the cameras of a fleet, while these are shared.
+    """Runs a node for each camera of a fleet.
 
     Args:
         bus: open end of the fleet's bus; its session carries ROS, too.
@@ -78,15 +77,15 @@ class RosFleet(Server):
         address: address of the fleet.
         section: settings of all cameras' nodes.
         cameras: settings of single cameras' nodes, by name.
-        settings: the agent's settings of the cameras' sessions, by name, if known.
+        settings: the agent's settings of the cameras' sessions, by name; None: unknown.
         frames: sources of the cameras' frames, by name, as parameters of v4l2_camera.
         calibrations: calibrations that convert results of cameras to the robot's frame, by
             name.
-        controls: functions that return the open source of a camera's frames, whose device has
-            controls, by name.
+        controls: functions that return the open source of a camera's frames, by name, for cameras
+            whose device has controls.
         hand_eyes: hand-eye calibrations of the cameras, by name.
         wanted: function that returns whether a camera of an agent gets a node.
-        desks: calibrations that are also on the agent's bus; None if there is no folder for them.
+        desks: calibrations of the agent's cameras; None if there is no folder for them.
 
     Raises:
         ConfigurationError: the domain is not valid, or rclpy is wanted and not installed.
@@ -111,14 +110,14 @@ class RosFleet(Server):
     ) -> None:
         self._desks = desks
         self._section, self._camera_options, self._wanted = section, dict(cameras or {}), wanted
-        self._settings, self._frames = settings or {}, frames or {}  # filled by other methods
+        self._settings, self._frames = settings or {}, frames or {}  # the server adds entries later
         self._hand_eyes, self._controls = hand_eyes or {}, controls or {}
         self.context: RosContext | NativeContext = _context(bus, section)
-        self._fleet = _Cameras(
-            bus, address, fleet, None, TIMEOUT, {}, calibrations=dict(calibrations or {})
+        self._fleet = _NodeFleet(
+            bus, address, fleet, None, CONNECT_TIMEOUT, {}, calibrations=dict(calibrations or {})
         )
         self.nodes: dict[str, CameraNode] = {}
-        self._of: dict[str, FleetCamera[Any]] = {}
+        self._node_cameras: dict[str, FleetCamera[Any]] = {}
         self._task: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
@@ -132,38 +131,38 @@ class RosFleet(Server):
         await self._fleet.open()
         events = self._fleet.events(max_queue=100_000)
         for camera in self._fleet.cameras():
-            await self._show(camera.name)
+            await self._create_node(camera.name)
         self._task = asyncio.get_running_loop().create_task(self._follow(events))
 
     async def _follow(self, events: Any) -> None:
-        """Create a node for each new camera; the node of a lost camera stays, and reports that."""
+        """Create a node for each new camera; the node of a lost camera stays, and reports it."""
         async for event in events:
             if isinstance(event, CameraJoined) and self._wanted(event.agent, event.camera):
-                await self._show(event.camera)
+                await self._create_node(event.camera)
 
-    async def _show(self, name: str) -> None:
-        """Create a camera's node; a node whose camera was given up gets the new camera."""
+    async def _create_node(self, name: str) -> None:
+        """Create a camera's node; if the camera has a new object, this replaces the old node."""
         camera = self._fleet[name]
-        if self._of.get(name) is camera:
+        if self._node_cameras.get(name) is camera:
             return
         agents = self._fleet.agents(name)
         if not any(self._wanted(agent, name) for agent in agents):
             return
-        await self._meet(camera)
+        await self._wait_met(camera)
         old = self.nodes.pop(name, None)
         if old is not None:
             await old.stop()
         try:
             node = self._node(name)
-            made = CameraNode(camera, node, options=self._options(name, camera))
-            await made.start()
+            camera_node = CameraNode(camera, node, options=self._options(name, camera))
+            await camera_node.start()
         except SmartCamError as exc:
             logger.warning("%s ! it is not seen in ROS: %s", name, exc)
             return
-        self._of[name], self.nodes[name] = camera, made
+        self._node_cameras[name], self.nodes[name] = camera, camera_node
 
     @staticmethod
-    async def _meet(camera: FleetCamera[Any]) -> None:
+    async def _wait_met(camera: FleetCamera[Any]) -> None:
         """Wait briefly for the agent's answer, which says whether the camera has frames."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(MEET_TIMEOUT):
@@ -172,14 +171,14 @@ class RosFleet(Server):
 
     def _node(self, name: str) -> Node | NativeNode:
         try:
-            full = node_names([*self._of.keys() - {name}, name])[name]
+            full = node_names([*self._node_cameras.keys() - {name}, name])[name]
         except ValueError as exc:
             raise SmartCamError(str(exc)) from exc
         namespace, _, node_name = full.rpartition("/")
-        above = self._section.namespace.rstrip("/")
+        parent = self._section.namespace.rstrip("/")
         if isinstance(self.context, RosContext):
-            return Node(node_name, namespace=f"{above}/{namespace}", context=self.context)
-        return NativeNode(node_name, namespace=f"{above}/{namespace}", context=self.context)
+            return Node(node_name, namespace=f"{parent}/{namespace}", context=self.context)
+        return NativeNode(node_name, namespace=f"{parent}/{namespace}", context=self.context)
 
     def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
         options = self._camera_options.get(name, RosCamera.model_validate({}))
@@ -210,7 +209,7 @@ class RosFleet(Server):
             await asyncio.wait({task})
         nodes, self.nodes = self.nodes, {}
         await close_all(node.stop for node in nodes.values())
-        self._of.clear()
+        self._node_cameras.clear()
         await self._fleet.close()
 
 
@@ -230,7 +229,7 @@ async def ros_of(address: FleetAddress, section: RosSection) -> AsyncIterator[Ro
         ConnectFailedError: no bus, or no agent with a camera, answers in time.
     """
     bus = ZenohEnd(address.link, SETTINGS)
-    await bus.open(TIMEOUT)
+    await bus.open(CONNECT_TIMEOUT)
     try:
         async with RosFleet(bus, address.fleet, address, section) as ros:
             yield ros

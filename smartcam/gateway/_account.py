@@ -1,4 +1,4 @@
-"""The account of a gateway: the outcomes of requests and parts."""
+"""Count the outcomes of a gateway's requests and parts."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ class GatewayAccount:
 
     Attributes:
         robots: connections that were accepted.
-        refused: connections that were refused, because too many were open.
+        refused: connections that were refused, since too many were open.
         requests: requests that came.
         answered: requests that were answered with a part, or with the state or reason asked for.
         errors: requests that were answered with an error.
         abandoned: requests whose robot had disconnected before the answer.
         open: requests that are not answered yet.
-        parts: parts in all results that robots' requests brought.
+        parts: parts in all results that were made for robots' requests.
         delivered: parts that were sent to a robot.
         forgotten: parts that no robot asked for before a newer result came, the robot left, or they
             became too old.

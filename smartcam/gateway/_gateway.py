@@ -1,4 +1,4 @@
-"""The gateway: a camera, a port, and the robots that connect."""
+"""Run a gateway: a camera, a port, and the robots that connect."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ class Gateway(Server):
             self.settings.clients, within=self.settings.idle, missing="no request", own="a robot"
         )
         self._acceptor: Acceptor[RobotLink] = Acceptor(
-            self._make, places, _log, name="smartcam.gateway"
+            self._make_link, places, _log, name="smartcam.gateway"
         )
         self._socket: socket.socket | None = None
         self._port = self.settings.place[1]
 
-    def _make(self) -> RobotLink:
+    def _make_link(self) -> RobotLink:
         return RobotLink(self._shared, self._writer, self._acceptor)
 
     @property
@@ -83,7 +83,7 @@ class Gateway(Server):
         self._shared.camera = camera
 
     async def start(self) -> None:
-        """Open the port; do nothing if it is open.
+        """Open the port; do nothing if it is already open.
 
         Raises:
             ConfigurationError: the gateway cannot listen there.

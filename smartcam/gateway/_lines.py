@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.gateway._settings import Style
 
 MAX_LINE_BYTES: Final = 256
-"""Largest number of bytes of a request; a longer one ends the connection."""
+"""Largest number of bytes of a request; a longer request ends the connection."""
 
 MAX_BRACKETED_NUMBERS: Final = 30
 """Largest number of numbers that ``socket_read_ascii_float`` reads at once (Script Manual, module
@@ -62,16 +62,16 @@ class RobotRequest(NamedTuple):
     """A request of a robot.
 
     Attributes:
-        word: the word, in capitals; "" if there is no word.
-        application: number after the word, None without one.
+        word: the word, in capitals; "" if the request is not valid.
+        application: number after the word; None without one.
         tag: number before the word, which the answer repeats; None without one.
-        given: text of the request, for errors.
+        text: text of the request, for errors.
     """
 
     word: str
     application: int | None = None
     tag: int | None = None
-    given: str = ""
+    text: str = ""
 
 
 class RobotAnswer(NamedTuple):
@@ -79,7 +79,7 @@ class RobotAnswer(NamedTuple):
 
     Attributes:
         code: outcome of the request.
-        left: parts of the result that are left after this one.
+        left: number of parts of the result that follow this one.
         values: values of the part, or of the camera's state.
         words: the reason, for people.
     """
@@ -91,20 +91,20 @@ class RobotAnswer(NamedTuple):
 
 
 class NotWritableError(ValueError):
-    """An answer has no room for a part, or a controller cannot read one of its numbers."""
+    """An answer is too long, or has a number that a controller cannot read."""
 
 
-def _behind_blanks(data: bytes, at: int) -> int:
-    """Return the place of the first byte, from a place on, that is no blank or line end."""
-    blanks = _BLANK_RUN.match(data, at)
-    return blanks.end() if blanks else at
+def _skip_blanks(data: bytes, start: int) -> int:
+    """Return the index of the first byte from ``start`` on that is no blank or line end."""
+    blanks = _BLANK_RUN.match(data, start)
+    return blanks.end() if blanks else start
 
 
 class RequestReader:
     """Cuts the bytes of a connection into requests.
 
-    A line ends with CR, LF or both; blanks and zeros around it do not count, since some controllers
-    send arrays of a fixed length. XML ends with the closing tag of its first element.
+    A line ends with CR, LF or both. Blanks and zeros around a line are ignored, since some
+    controllers send arrays of a fixed length. XML ends with the closing tag of its first element.
 
     Args:
         form: form of the lines, as :attr:`Style.form`.
@@ -121,44 +121,44 @@ class RequestReader:
             NotWritableError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
         """
         data, requests = self._unread + data, []
-        at = _behind_blanks(data, 0)
-        while (end := self._end(data, at)) > 0 and end - at <= MAX_LINE_BYTES:
-            line = data[at:end].strip(_BLANKS)
+        start = _skip_blanks(data, 0)
+        while (end := self._find_end(data, start)) > 0 and end - start <= MAX_LINE_BYTES:
+            line = data[start:end].strip(_BLANKS)
             if line:
-                requests.append(self._read(line))
-            at = _behind_blanks(data, end)
-        self._unread = data[at:].lstrip(_BLANKS)
+                requests.append(self._parse(line))
+            start = _skip_blanks(data, end)
+        self._unread = data[start:].lstrip(_BLANKS)
         if len(self._unread) > MAX_LINE_BYTES:
             raise NotWritableError(f"a request has more than {MAX_LINE_BYTES} bytes")
         return requests
 
-    def _end(self, data: bytes, at: int) -> int:
-        """Return the place after the request that begins at ``at``; 0 if it is incomplete."""
-        begin = _XML_BEGIN.match(data, at) if self._xml else None
-        if begin is None:  # a line; also instead of XML, a line is one request
-            mark = _LINE_END.search(data, at)
-            return mark.end() if mark else 0
+    def _find_end(self, data: bytes, start: int) -> int:
+        """Return the index after the request that begins at ``start``; 0 if it is incomplete."""
+        begin = _XML_BEGIN.match(data, start) if self._xml else None
+        if begin is None:  # a line, which may also come instead of XML
+            line_end = _LINE_END.search(data, start)
+            return line_end.end() if line_end else 0
         closing = b"</" + begin[1] + b">"
-        end = data.find(closing, at)
+        end = data.find(closing, start)
         return 0 if end < 0 else end + len(closing)
 
-    def _read(self, line: bytes) -> RobotRequest:
-        given = line.decode("ascii", "backslashreplace")[:40]
+    def _parse(self, line: bytes) -> RobotRequest:
+        text = line.decode("ascii", "backslashreplace")[:40]
         if self._xml:
             xml = _XML.fullmatch(line)
             if xml is None:
-                return RobotRequest("", given=given)
+                return RobotRequest("", text=text)
             tag, word, number = xml["id"], xml["word"], xml["number"] or None
         else:
-            text = _REQUEST.fullmatch(line)
-            if text is None:
-                return RobotRequest("", given=given)
-            tag, word, number = text.groups()
+            match = _REQUEST.fullmatch(line)
+            if match is None:
+                return RobotRequest("", text=text)
+            tag, word, number = match.groups()
         return RobotRequest(
             word.decode().upper(),
             None if number is None else int(number),
             None if tag is None else int(tag),
-            given,
+            text,
         )
 
 
@@ -177,7 +177,7 @@ class AnswerWriter:
         """Return the bytes of an answer.
 
         Raises:
-            NotWritableError: the answer has no room for the values.
+            NotWritableError: the answer is too long, or a number cannot be written.
         """
         style = self._style
         values = [self._value(value) for value in answer.values]
@@ -190,7 +190,9 @@ class AnswerWriter:
 
     def _value(self, value: float | str) -> str:
         if isinstance(value, str):
-            return "".join(" " if char == self._style.separator else char for char in plain(value))
+            return "".join(
+                " " if char == self._style.separator else char for char in to_one_line(value)
+            )
         if not abs(value) < MAX_NUMBER:
             raise NotWritableError(f"{value} is no number that a controller reads")
         if isinstance(value, int):
@@ -210,21 +212,21 @@ class AnswerWriter:
 
     def _brackets(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
         if answer.words and not answer.code.is_error:
-            return plain(answer.words)[: self._style.longest]  # the reason that WHY asked for
-        filled = values + ["0"] * (len(self.names) - len(values))
+            return to_one_line(answer.words)[: self._style.longest]  # the answer to WHY
+        padded = values + ["0"] * (len(self.names) - len(values))
         head = [str(item) for item in (tag, int(answer.code), answer.left) if item is not None]
-        if len(head) + len(filled) > MAX_BRACKETED_NUMBERS:
+        if len(head) + len(padded) > MAX_BRACKETED_NUMBERS:
             raise NotWritableError(
-                f"a part has {len(head) + len(filled)} numbers, {MAX_BRACKETED_NUMBERS} are read"
+                f"a part has {len(head) + len(padded)} numbers, {MAX_BRACKETED_NUMBERS} are read"
             )
-        return f"({','.join([*head, *filled])})"
+        return f"({','.join([*head, *padded])})"
 
     def _xml(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
-        # all elements each time: EthernetKRL has a queue for each, which would get out of step
-        filled = values + ["0"] * (len(self.names) - len(values))
+        # always all elements: EthernetKRL has a queue for each, and the queues must stay in step
+        padded = values + ["0"] * (len(self.names) - len(values))
         part = " ".join(
             f"{name.upper()}={quoteattr(value)}"
-            for name, value in zip(self.names, filled, strict=False)
+            for name, value in zip(self.names, padded, strict=False)
         )
         words = escape(self._words(answer)[:80]) if answer.words else ""
         return (
@@ -235,9 +237,9 @@ class AnswerWriter:
     @staticmethod
     def _words(answer: RobotAnswer) -> str:
         name = f"{answer.code.name} " if answer.code.is_error else ""
-        return name + plain(answer.words)
+        return name + to_one_line(answer.words)
 
 
-def plain(words: str) -> str:
+def to_one_line(words: str) -> str:
     """Return a text on one line, of printable characters."""
     return " ".join("".join(char if char.isprintable() else " " for char in words).split())

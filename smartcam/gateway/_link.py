@@ -1,4 +1,4 @@
-"""A robot's connection, on which one request is answered after the other."""
+"""Serve a robot's connection, on which one request is answered after the other."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
 from smartcam.gateway._lines import AnswerCode, NotWritableError, RequestReader, RobotAnswer
-from smartcam.gateway._requests import ASKING_FOR_PARTS, RobotRequests
+from smartcam.gateway._requests import PART_WORDS, RobotRequests
 
 if TYPE_CHECKING:
     from smartcam._accepting import Acceptor
@@ -24,7 +24,8 @@ MAX_UNSENT_BYTES: Final = 1 << 16
 """Largest number of unsent bytes for a robot that does not read."""
 
 _KEEPALIVE_PERIOD = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
-"""Seconds without a byte until the system checks the connection, and the repetitions."""
+"""Options of TCP: seconds without a byte until a check, seconds between checks, number of
+checks."""
 
 _log = logging.getLogger("smartcam.gateway")
 
@@ -35,11 +36,11 @@ class RobotLink(asyncio.Protocol):
     Args:
         shared: the camera and other objects that all robots share.
         writer: writer of answers.
-        acceptor: acceptor that gives the connection its place.
+        acceptor: acceptor, which bounds the number of connections.
 
     Attributes:
-        settled: whether the robot has asked for a part. Then it keeps its place; otherwise it may
-            lose the place to a newcomer.
+        settled: whether the robot has requested a part. Then its connection stays; otherwise it may
+            be closed in favour of a new connection.
     """
 
     _transport: asyncio.Transport
@@ -50,18 +51,18 @@ class RobotLink(asyncio.Protocol):
         self.settled: bool = False
         self._shared, self._writer, self._acceptor = shared, writer, acceptor
         self._account = shared.account
-        self._robot = RobotRequests(shared)
-        self._requests = RequestReader(shared.settings.style.form)
-        self._waiting: deque[tuple[RobotRequest, float]] = deque()
+        self._robot_requests = RobotRequests(shared)
+        self._reader = RequestReader(shared.settings.style.form)
+        self._queue: deque[tuple[RobotRequest, float]] = deque()
         self._task: asyncio.Task[None] | None = None
-        self._idle: asyncio.TimerHandle | None = None
+        self._idle_timer: asyncio.TimerHandle | None = None
         self._peer = "?"
         self._closed = True
 
     # ------------------------------------------------------------------ from the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take a place, or report that all are taken."""
+        """Begin to serve the robot, or refuse it if there are too many connections."""
         self._transport = cast("asyncio.Transport", transport)
         address = transport.get_extra_info("peername")
         self._peer = f"{address[0]}:{address[1]}" if address else "?"
@@ -76,35 +77,35 @@ class RobotLink(asyncio.Protocol):
         self._account.robots += 1
         _keep_alive(transport.get_extra_info("socket"))
         self._acceptor.expect(self, self._shared.settings.idle, "no request")
-        self._set_idle()
+        self._restart_idle_timer()
 
     def data_received(self, data: bytes) -> None:
-        """Read requests."""
+        """Read requests, and answer them."""
         if self._closed:
             return
-        self._set_idle()
+        self._restart_idle_timer()
         try:
-            requests = self._requests.feed(data)
+            requests = self._reader.feed(data)
         except NotWritableError as exc:
-            self._count_error(RobotAnswer(AnswerCode.TOO_LONG, words=str(exc)), None)
+            self._report_error(RobotAnswer(AnswerCode.TOO_LONG, words=str(exc)), None)
             self._close("a request is too long")
             return
         for request in requests:
             if not self._closed:
-                self._take(request)
+                self._accept_request(request)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End the open requests, and forget parts that were not requested."""
         self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
 
     def turn_away(self, why: str) -> None:
-        """End the link at once, to make room for another connection."""
+        """Close the connection at once, in favour of another one."""
         self._close(why, abort=True)
 
     # ------------------------------------------------------------------ requests
 
-    def _take(self, request: RobotRequest) -> None:
-        self.settled = self.settled or request.word in ASKING_FOR_PARTS
+    def _accept_request(self, request: RobotRequest) -> None:
+        self.settled = self.settled or request.word in PART_WORDS
         self._account.requests += 1
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self._shared.settings.timeout
@@ -112,21 +113,21 @@ class RobotLink(asyncio.Protocol):
             self._account.open += 1
             self._task = loop.create_task(self._serve(request, deadline), name="smartcam.gateway")
         elif request.tag is None:
-            # the robot no longer waits for the earlier answer, and would take it for this request's
+            # the robot would take the earlier answer for the answer to this request
             self._account.abandoned += 1
             self._close("a request without a number came before the answer to the one before")
-        elif len(self._waiting) >= MAX_WAITING_REQUESTS:
+        elif len(self._queue) >= MAX_WAITING_REQUESTS:
             self._account.errors += 1
             words = f"{MAX_WAITING_REQUESTS} requests are waiting already"
             self._write(RobotAnswer(AnswerCode.BUSY, words=words), request.tag)
         else:
             self._account.open += 1
-            self._waiting.append((request, deadline))
+            self._queue.append((request, deadline))
 
     async def _serve(self, request: RobotRequest, deadline: float) -> None:
-        """Answer a request, and the requests that arrive while it is answered."""
+        """Answer a request, and then the requests that have arrived meanwhile."""
         while True:
-            answer = await self._robot.answer(request, deadline)
+            answer = await self._robot_requests.answer(request, deadline)
             self._account.open -= 1
             if self._write(answer, request.tag):
                 self._account.errors += 1
@@ -135,28 +136,28 @@ class RobotLink(asyncio.Protocol):
             if self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
                 self._close("the robot reads nothing", abort=True)
                 return
-            if not self._waiting:
+            if not self._queue:
                 break
-            request, deadline = self._waiting.popleft()
+            request, deadline = self._queue.popleft()
         self._task = None
 
     def _write(self, answer: RobotAnswer, tag: int | None) -> bool:
-        """Write an answer, or an error if that is impossible; return whether it is an error."""
+        """Write an answer, or an error if it cannot be written; return True for an error."""
         try:
             data = self._writer.write(answer, tag)
         except NotWritableError as exc:
-            answer = self._robot.failed(str(exc))
+            answer = self._robot_requests.replace_answer(str(exc))
             data = self._writer.write(answer, tag)
         self._transport.write(data)
-        self._robot.sent()
+        self._robot_requests.on_sent()
         if answer.code.is_error:
             _log.warning("%s: %s: %s", self._peer, answer.code.name, answer.words)
         return answer.code.is_error
 
-    def _count_error(self, answer: RobotAnswer, tag: int | None) -> None:
+    def _report_error(self, answer: RobotAnswer, tag: int | None) -> None:
         self._account.requests += 1
         if self._task is not None:
-            # an answer now would be taken for the answer to another request
+            # the robot would take an answer now for the answer to another request
             self._account.abandoned += 1
             return
         self._account.errors += 1
@@ -164,37 +165,37 @@ class RobotLink(asyncio.Protocol):
 
     # ------------------------------------------------------------------ the end
 
-    def _set_idle(self) -> None:
-        if self._idle is not None:
-            self._idle.cancel()
+    def _restart_idle_timer(self) -> None:
+        if self._idle_timer is not None:
+            self._idle_timer.cancel()
         idle = self._shared.settings.idle
         why = f"no request within {idle:g} s"
-        self._idle = asyncio.get_running_loop().call_later(idle, self._close, why)
+        self._idle_timer = asyncio.get_running_loop().call_later(idle, self._close, why)
 
     def _close(self, why: str, abort: bool = False) -> None:
         if self._closed:
             return
         self._closed = True
         _log.info("%s: closed: %s", self._peer, why)
-        if self._idle is not None:
-            self._idle.cancel()
+        if self._idle_timer is not None:
+            self._idle_timer.cancel()
         self._acceptor.leave(self)
-        abandoned = len(self._waiting)
-        self._waiting.clear()
+        abandoned = len(self._queue)
+        self._queue.clear()
         task, self._task = self._task, None
         if task is not None and task is not asyncio.current_task():
             task.cancel()
             abandoned += 1
         self._account.open -= abandoned
         self._account.abandoned += abandoned
-        self._robot.forget()
+        self._robot_requests.forget_result()
         if abort:
             self._transport.abort()
         else:
             self._transport.close()
 
     async def finish(self) -> None:
-        """Close the link, and wait until its requests have ended."""
+        """Close the connection, and wait until its request has ended."""
         task = self._task
         self._close("the gateway is closed")
         if task is not None:

@@ -1,4 +1,4 @@
-"""Make rows of a result for a robot: the values of each part."""
+"""Make rows of values for a robot: one row for each part of a result."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ class Parts:
 
     Args:
         settings: the convention, the units, and the values that follow a pose.
-        spec: ``interpret_as`` of the camera: its layout shows which values are lengths.
+        spec: ``interpret_as`` of the camera, whose layout shows which values are lengths.
     """
 
     def __init__(self, settings: GatewaySettings, spec: object) -> None:
         self._settings, self._style = settings, settings.style
         self._convention = ROBOTS[self._style.pose]
         self._layouts = _layouts(spec)
-        self._lengths = {"m": 1.0, "mm": 1000.0}[self._style.length]
-        self._angles = {"rad": 1.0, "deg": 180.0 / math.pi}[self._style.angle]
+        self._length_factor = {"m": 1.0, "mm": 1000.0}[self._style.length]
+        self._angle_factor_of_style = {"rad": 1.0, "deg": 180.0 / math.pi}[self._style.angle]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the values of a part; for records, their fields' if the layout is known."""
+        """Names of a part's values: those of a pose, or those of a layout without a pose."""
         layout = next(iter(self._layouts.values()), None)
         if layout is None or {"x", "y"} <= {field.name for field in layout.fields}:
             return (*self._convention.numbers, *self._settings.also)
@@ -69,7 +69,7 @@ class Parts:
 
     def _row(self, item: object, fields: Mapping[str, Field]) -> Row:
         if isinstance(item, Localization):
-            return self._pose(item)
+            return self._pose_row(item)
         if hasattr(item, "_asdict"):
             item = cast("Any", item)._asdict()
         if not isinstance(item, Mapping):
@@ -77,9 +77,9 @@ class Parts:
                 f"a part is {type(item).__name__}: expected a localization or a record"
             )
         record = cast("Mapping[str, object]", item)
-        return [self._scaled(value, fields.get(name)) for name, value in record.items()]
+        return [self._convert_unit(value, fields.get(name)) for name, value in record.items()]
 
-    def _pose(self, part: Localization) -> Row:
+    def _pose_row(self, part: Localization) -> Row:
         x, y, z, w = part.pose.orientation
         if self._settings.tool_flip:
             x, y, z, w = w, z, -y, -x  # multiplied by (1, 0, 0, 0): half a turn about x
@@ -90,41 +90,41 @@ class Parts:
             np.array(part.pose.position, dtype=np.float64),
         )
         numbers = pose_to(self._style.pose, pose)
-        position = [self._lengths * number / self._convention.metre for number in numbers[:3]]
-        turned = [number * self._angle_factor for number in numbers[3:]]
-        return [*position, *turned, *(getattr(part, name) for name in self._settings.also)]
+        position = [self._length_factor * number / self._convention.metre for number in numbers[:3]]
+        orientation = [number * self._angle_factor for number in numbers[3:]]
+        return [*position, *orientation, *(getattr(part, name) for name in self._settings.also)]
 
     @property
     def _angle_factor(self) -> float:
-        """Factor for the convention's own angles; 1 for quaternions."""
+        """Factor from the convention's angles to those of the style; 1 for quaternions."""
         if "q1" in self._convention.numbers:
             return 1.0
         per_radian = 1.0 if self._style.pose == "ur" else 180.0 / math.pi
-        return self._angles / per_radian
+        return self._angle_factor_of_style / per_radian
 
-    def _scaled(self, value: object, field: Field | None) -> float | str:
+    def _convert_unit(self, value: object, field: Field | None) -> float | str:
         quantity = UNITS[field.unit].quantity if field is not None and field.unit else ""
-        factor = {"length": self._lengths, "angle": self._angles}.get(quantity)
+        factor = {"length": self._length_factor, "angle": self._angle_factor_of_style}.get(quantity)
         if isinstance(value, (bool, int, float)):
             return value * factor if factor is not None else value
         return str(value)
 
 
 def _layouts(spec: object) -> dict[int | None, Layout]:
-    """Return the layouts in ``interpret_as``, by application; None: for any application."""
+    """Return the layouts in ``interpret_as``, by application; key None: for all applications."""
     if spec is None:
         return {}
     by_application = spec if isinstance(spec, Mapping) else {None: spec}
     layouts: dict[int | None, Layout] = {}
-    for application, each in cast("Mapping[int | None, Any]", by_application).items():
-        interpreter = resolve(each)
+    for application, one_spec in cast("Mapping[int | None, Any]", by_application).items():
+        interpreter = resolve(one_spec)
         if isinstance(interpreter, Interpreter) and interpreter.layout is not None:
             layouts[application] = interpreter.layout
     return layouts
 
 
 def _records_of(table: Any) -> object:
-    """Return the rows of a numpy table as mappings; anything else as it is."""
+    """Return the rows of a numpy table as mappings; return other arrays unchanged."""
     names = getattr(table.dtype, "names", None)
     if not names:
         return cast("object", table)

@@ -1,4 +1,4 @@
-"""Answer the requests of one robot at a gateway, and keep the parts that it may still get."""
+"""Answer the requests of one robot at a gateway, and keep the parts that it may request."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from smartcam.models import Result
 
 CANCEL_GRACE: Final = 0.2
-"""Seconds after the deadline after which a call that has not ended by itself is cancelled."""
+"""Seconds after a request's deadline at which a call that still runs is cancelled."""
 
-ASKING_FOR_PARTS = ("TRIGGER", "NEXT", "WAIT")
-"""Words of requests for a part."""
+PART_WORDS = ("TRIGGER", "NEXT", "WAIT")
+"""The words of requests for a part."""
 
-WORDS = (*ASKING_FOR_PARTS, "STATUS", "WHY")
+WORDS = (*PART_WORDS, "STATUS", "WHY")
 """The words that a request may begin with."""
 
 _log = logging.getLogger("smartcam.gateway")
@@ -58,7 +58,7 @@ CODES: tuple[tuple[type[BaseException], AnswerCode], ...] = (
     (ConfigurationError, AnswerCode.REFUSED),
     (SmartCamError, AnswerCode.FAULT),
 )
-"""The code of an error; the first class that matches counts."""
+"""The code of each class of errors; the first class that matches decides."""
 
 
 class GatewayCamera:
@@ -71,7 +71,7 @@ class GatewayCamera:
 
     Attributes:
         camera: the camera; another object may replace it.
-        turn: lock of the robot that triggers.
+        trigger_lock: lock that the robot has which triggers.
     """
 
     def __init__(
@@ -81,11 +81,11 @@ class GatewayCamera:
         self.settings: GatewaySettings = settings
         self.parts: Parts = parts
         self.account: GatewayAccount = account
-        self.turn = asyncio.Lock()
+        self.trigger_lock = asyncio.Lock()
 
 
 class RobotRequests:
-    """The requests of one robot, one after the other.
+    """Answers the requests of one robot, one after the other.
 
     Args:
         shared: the camera that the robot shares with other robots.
@@ -94,9 +94,9 @@ class RobotRequests:
     def __init__(self, shared: GatewayCamera) -> None:
         self._shared = shared
         self._rows: list[Row] | None = None  # rows of the last result; None without one
-        self._until = 0.0  # loop time until which the rows may be asked for
-        self._last = RobotAnswer(AnswerCode.NONE, words="no request has failed")
-        self._gives_row = False  # the answer being written has the first row
+        self._rows_expire_at = 0.0  # loop time after which the rows are no longer given
+        self._last_error = RobotAnswer(AnswerCode.NONE, words="no request has failed")
+        self._answer_has_row = False  # the answer that is written now has the first row
 
     # ------------------------------------------------------------------ a request
 
@@ -108,11 +108,11 @@ class RobotRequests:
         except (SmartCamError, TimeoutError) as exc:
             code = next((code for kind, code in CODES if isinstance(exc, kind)), AnswerCode.FAULT)
             answer = RobotAnswer(code, words=str(exc) or "no answer of the camera in time")
-        except Exception as exc:  # noqa: BLE001 - a robot waits, and is told whatever it was
+        except Exception as exc:  # noqa: BLE001 - a robot waits for an answer in any case
             _log.exception("a request failed")
             answer = RobotAnswer(AnswerCode.FAULT, words=f"unexpected {exc!r:.100}")
         if answer.code.is_error:
-            self._last = answer
+            self._last_error = answer
         return answer
 
     async def _answer(self, request: RobotRequest, deadline: float) -> RobotAnswer:
@@ -120,23 +120,27 @@ class RobotRequests:
             request.word == "TRIGGER"
         ):
             words = f"expected {', '.join(WORDS)} (TRIGGER n: with application n)"
-            return RobotAnswer(AnswerCode.BAD_REQUEST, words=f"{words}, got {request.given!r}")
+            return RobotAnswer(AnswerCode.BAD_REQUEST, words=f"{words}, got {request.text!r}")
         if request.word == "STATUS":
             return self._status()
         if request.word == "WHY":
-            return RobotAnswer(AnswerCode.PART, words=f"{self._last.code.name} {self._last.words}")
+            return RobotAnswer(
+                AnswerCode.PART, words=f"{self._last_error.code.name} {self._last_error.words}"
+            )
         if request.word != "NEXT":
-            self.forget()
-            self._keep(await self._result(request, deadline))
-        return self._next()
+            self.forget_result()
+            self._keep_parts(await self._get_result(request, deadline))
+        return self._next_part()
 
-    async def _result(self, request: RobotRequest, deadline: float) -> Result:
+    async def _get_result(self, request: RobotRequest, deadline: float) -> Result:
         camera = self._shared.camera
         if request.word == "WAIT":
-            return await camera.next_result(timeout=_left(deadline))
-        # half of the time is left for the camera
-        async with _turn(self._shared.turn, deadline - 0.5 * self._shared.settings.timeout):
-            return await camera.trigger(request.application, timeout=_left(deadline))
+            return await camera.next_result(timeout=_time_left(deadline))
+        # the camera gets at least half of the timeout
+        async with _hold_lock(
+            self._shared.trigger_lock, deadline - 0.5 * self._shared.settings.timeout
+        ):
+            return await camera.trigger(request.application, timeout=_time_left(deadline))
 
     def _status(self) -> RobotAnswer:
         camera = self._shared.camera
@@ -146,55 +150,55 @@ class RobotRequests:
 
     # ------------------------------------------------------------------ parts
 
-    def _keep(self, result: Result) -> None:
+    def _keep_parts(self, result: Result) -> None:
         rows = self._shared.parts.rows(result.value, result.application)
         self._rows = rows
-        self._until = asyncio.get_running_loop().time() + self._shared.settings.max_age
+        self._rows_expire_at = asyncio.get_running_loop().time() + self._shared.settings.max_age
         self._shared.account.parts += len(rows)
         self._shared.account.waiting += len(rows)
 
-    def _next(self) -> RobotAnswer:
+    def _next_part(self) -> RobotAnswer:
         if self._rows is None:
             return RobotAnswer(
                 AnswerCode.NO_RESULT, words="there is no result: TRIGGER or WAIT comes first"
             )
-        if self._rows and asyncio.get_running_loop().time() > self._until:
-            self.forget()
+        if self._rows and asyncio.get_running_loop().time() > self._rows_expire_at:
+            self.forget_result()
             age = self._shared.settings.max_age
             return RobotAnswer(AnswerCode.NO_RESULT, words=f"the result is older than {age:g} s")
         if not self._rows:
             return RobotAnswer(AnswerCode.NONE)
-        self._gives_row = True
+        self._answer_has_row = True
         return RobotAnswer(AnswerCode.PART, len(self._rows) - 1, self._rows[0])
 
-    def sent(self) -> None:
-        """Count the part of the last answer as delivered; called when it was written."""
-        if self._gives_row and self._rows:
+    def on_sent(self) -> None:
+        """Count the part in the last answer as delivered, since the answer was written."""
+        if self._answer_has_row and self._rows:
             del self._rows[0]
             self._shared.account.waiting -= 1
             self._shared.account.delivered += 1
-        self._gives_row = False
+        self._answer_has_row = False
 
-    def failed(self, words: str) -> RobotAnswer:
-        """Return the answer instead of one that cannot be written; the result is forgotten."""
-        self.forget()
-        self._last = RobotAnswer(AnswerCode.UNREADABLE, words=words)
-        return self._last
+    def replace_answer(self, words: str) -> RobotAnswer:
+        """Forget the result, and return an error instead of an answer that cannot be written."""
+        self.forget_result()
+        self._last_error = RobotAnswer(AnswerCode.UNREADABLE, words=words)
+        return self._last_error
 
-    def forget(self) -> None:
-        """Forget the last result: a newer one is asked for, or the robot has disconnected."""
-        rows, self._rows, self._gives_row = self._rows or [], None, False
+    def forget_result(self) -> None:
+        """Forget the last result: the robot requests a newer one, or has disconnected."""
+        rows, self._rows, self._answer_has_row = self._rows or [], None, False
         self._shared.account.waiting -= len(rows)
         self._shared.account.forgotten += len(rows)
 
 
-def _left(deadline: float) -> float:
+def _time_left(deadline: float) -> float:
     """Return the seconds until a deadline, at least a millisecond."""
     return max(0.001, deadline - asyncio.get_running_loop().time())
 
 
 @contextlib.asynccontextmanager
-async def _turn(lock: asyncio.Lock, deadline: float) -> AsyncIterator[None]:
+async def _hold_lock(lock: asyncio.Lock, deadline: float) -> AsyncIterator[None]:
     """Hold the lock while the block runs; raise CameraBusyError if it is not free in time."""
     try:
         async with asyncio.timeout_at(deadline):

@@ -1,4 +1,4 @@
-"""Settings of a gateway: by name of a make, as single options, or from YAML."""
+"""Define the settings of a gateway, and the styles of answers for makes of robots."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 DEFAULT_LISTEN = "tcp/127.0.0.1:7001"
 
 DEFAULT_TIMEOUT = 5.0
-"""Seconds within which a request is answered."""
+"""Largest number of seconds until a request is answered."""
 
 MAX_SECONDS = 86_400.0
-"""Largest number of seconds of a deadline, an age or a pause."""
+"""Largest value of each setting in seconds."""
 
 MAX_CLIENTS = 100
 """Largest number of robots that may be connected at a time."""
@@ -29,7 +29,7 @@ MAX_CLIENTS = 100
 _LISTEN = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 
 LINE_ENDS: Mapping[str, str] = {"lf": "\n", "crlf": "\r\n", "cr": "\r", "none": ""}
-"""Ends of an answer, by name."""
+"""Bytes at the end of an answer, by name."""
 
 Also = Literal["quality", "photo_index", "feature_id"]
 
@@ -45,7 +45,7 @@ class Style(NamedTuple):
         decimals: digits after the decimal point.
         separator: text between two values.
         line_end: text after an answer.
-        width: bytes of each answer, filled with blanks; 0: as many as it needs.
+        width: number of bytes of each answer, filled with blanks; 0: as many as the answer needs.
         longest: largest number of bytes of an answer; words are cut, numbers never.
     """
 
@@ -67,17 +67,17 @@ STYLES: Mapping[str, Style] = {
     "fanuc": Style(pose="fanuc", line_end="\r", longest=120),
     "siemens": Style(width=96, longest=96),
 }
-"""Styles that each make of controller reads; the page on robots has the source of each."""
+"""Style of answers that each make of controller reads; the page on robots has the sources."""
 
 
-def _listen(text: str) -> str:
+def _check_listen(text: str) -> str:
     match = _LISTEN.fullmatch(text)
     if match is None or int(match[2]) > 0xFFFF:
         raise ValueError(f"expected tcp/HOST:PORT such as {DEFAULT_LISTEN}, got {text!r:.80}")
     return text
 
 
-def _separator(text: str) -> str:
+def _check_separator(text: str) -> str:
     if len(text) != 1 or text.isalnum() or text in "+-.\r\n" or not " " <= text < "\x7f":
         raise ValueError(
             f"expected one character that stands in no number, such as ',' or ';', got {text!r}"
@@ -93,7 +93,7 @@ class GatewaySettings(BaseModel):
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True)
 
-    listen: Annotated[str, AfterValidator(_listen)] = Field(
+    listen: Annotated[str, AfterValidator(_check_listen)] = Field(
         default=DEFAULT_LISTEN,
         description="address that robots connect to, tcp/HOST:PORT; port 0 takes a free one",
     )
@@ -113,7 +113,7 @@ class GatewaySettings(BaseModel):
     decimals: Annotated[int, Field(ge=0, le=9)] | None = Field(
         default=None, description="digits after the decimal point"
     )
-    separator: Annotated[str, AfterValidator(_separator)] | None = Field(
+    separator: Annotated[str, AfterValidator(_check_separator)] | None = Field(
         default=None, description="text between two values"
     )
     line_end: Literal["lf", "crlf", "cr", "none"] | None = Field(
@@ -147,22 +147,22 @@ class GatewaySettings(BaseModel):
 
     @property
     def style(self) -> Style:
-        """Style of the answers: the make's, changed by the given options."""
+        """Style of the answers: that of the make, changed by the options that are set."""
         names = ("form", "pose", "length", "angle", "decimals", "separator", "width")
-        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        options = {name: value for name in names if (value := getattr(self, name)) is not None}
         if self.pose is not None:
             metre = ROBOTS[self.pose].metre
             defaults = {"length": "m" if metre == 1.0 else "mm", "angle": "rad"}
             defaults["angle"] = "rad" if self.pose == "ur" else "deg"
-            given = {**defaults, **given}
+            options = {**defaults, **options}
         if self.line_end is not None:
-            given["line_end"] = LINE_ENDS[self.line_end]
+            options["line_end"] = LINE_ENDS[self.line_end]
         if self.width:
-            given["longest"] = self.width
-        return STYLES[self.robot]._replace(**given)
+            options["longest"] = self.width
+        return STYLES[self.robot]._replace(**options)
 
     @model_validator(mode="after")
-    def _can_be_read(self) -> Self:
+    def _check_readable(self) -> Self:
         style = self.style
         if style.form == "brackets" and "feature_id" in self.also:
             raise ValueError("also: feature_id is a text, which brackets have no room for")
@@ -200,7 +200,7 @@ class GatewayFile(GatewaySettings):
                 and field.
             MissingExtraError: the extra ``yaml`` is not installed.
         """
-        file = read_model(path, "gateway", cls, "listen", _mistake)
+        file = read_model(path, "gateway", cls, "listen", _find_mistake)
         if file.calibration is None:
             return file
         return file.model_copy(update={"calibration": str(Path(path).parent / file.calibration)})
@@ -208,11 +208,11 @@ class GatewayFile(GatewaySettings):
     def settings(self, **changes: Any) -> GatewaySettings:
         """Return the settings of the gateway alone, with changes."""
         names = GatewaySettings.model_fields
-        chosen = {name: getattr(self, name) for name in names if name in self.model_fields_set}
-        return GatewaySettings.model_validate({**chosen, **changes})
+        fields = {name: getattr(self, name) for name in names if name in self.model_fields_set}
+        return GatewaySettings.model_validate({**fields, **changes})
 
 
-def _mistake(file: GatewayFile) -> tuple[Sequence[int | str], str] | None:
+def _find_mistake(file: GatewayFile) -> tuple[Sequence[int | str], str] | None:
     if (file.url is None) == (not file.emulated):
         return ("url",), "expected a camera's URL, or emulated: true"
     return None

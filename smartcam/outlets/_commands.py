@@ -1,4 +1,4 @@
-"""Commands to a camera that come through outlets."""
+"""Carry out commands to a camera that come through outlets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from smartcam.camera import Camera
 
 MAX_TIMEOUT = 300.0
-"""Seconds of the longest timeout of a command."""
+"""Largest timeout of a command, seconds."""
 
 _FIELDS = {
     "trigger": ("timeout",),
@@ -22,29 +22,31 @@ _FIELDS = {
     "start": ("timeout",),
     "stop": ("timeout",),
 }
-_TIMEOUTS = {"trigger": 5.0, "switch": 10.0, "start": 10.0, "stop": 10.0}
+_DEFAULT_TIMEOUTS = {"trigger": 5.0, "switch": 10.0, "start": 10.0, "stop": 10.0}
 
 
-async def do_command(camera: Camera[Any], verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+async def do_command(
+    camera: Camera[Any], verb: str, arguments: Mapping[str, Any]
+) -> dict[str, Any]:
     """Carry out a command and return the fields of the answer.
 
     Args:
         camera: camera that is open.
         verb: ``trigger``, ``switch``, ``start`` or ``stop``.
-        given: fields of the command: ``timeout`` in seconds; for a switch ``application``.
+        arguments: fields of the command: ``timeout`` in seconds; for a switch ``application``.
 
     Raises:
         ConfigurationError: a field is wrong or unknown.
         SmartCamError: the outcome of the command.
     """
     known = _FIELDS[verb]
-    for name in given:
+    for name in arguments:
         if name not in known:
             raise ConfigurationError(
                 f"{verb}: there is no field {name!r:.60}; known are {', '.join(known)}"
                 f"{did_you_mean(name, known)}"
             )
-    timeout = check_seconds(given.get("timeout", _TIMEOUTS[verb]), "timeout", verb)
+    timeout = check_seconds(arguments.get("timeout", _DEFAULT_TIMEOUTS[verb]), "timeout", verb)
     if timeout > MAX_TIMEOUT:
         raise ConfigurationError(f"{verb}: timeout: expected {MAX_TIMEOUT:g} s at most")
     if verb == "trigger":
@@ -55,6 +57,6 @@ async def do_command(camera: Camera[Any], verb: str, given: Mapping[str, Any]) -
     if verb in ("start", "stop"):
         await (camera.start if verb == "start" else camera.stop)(timeout=timeout)
         return {}
-    application = check_application(given.get("application"), "application", verb)
+    application = check_application(arguments.get("application"), "application", verb)
     await camera.switch_application(application, timeout=timeout)
     return {"application": application}

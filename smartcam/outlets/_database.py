@@ -11,39 +11,39 @@ if TYPE_CHECKING:
 
 
 class _Database(sqlite3.Connection):
-    """A connection whose errors are all of the class ``sqlite3.Error``.
+    """A connection that raises no UnicodeDecodeError, but ``sqlite3.DatabaseError``.
 
-    SQLite's errors name the damaged table. Python's module decodes the name, and raises
-    UnicodeDecodeError if the name itself is damaged.
+    An error of SQLite names the damaged table. Python's module decodes this name, which fails with
+    UnicodeDecodeError if the name is damaged, too.
     """
 
     def execute(self, sql: str, parameters: Any = (), /) -> sqlite3.Cursor:
         try:
             return super().execute(sql, parameters)
         except UnicodeDecodeError as exc:
-            raise _damage(exc) from exc
+            raise _damage_error(exc) from exc
 
     def executemany(self, sql: str, parameters: Iterable[Any], /) -> sqlite3.Cursor:
         try:
             return super().executemany(sql, parameters)
         except UnicodeDecodeError as exc:
-            raise _damage(exc) from exc
+            raise _damage_error(exc) from exc
 
     def executescript(self, sql_script: str, /) -> sqlite3.Cursor:
         try:
             return super().executescript(sql_script)
         except UnicodeDecodeError as exc:
-            raise _damage(exc) from exc
+            raise _damage_error(exc) from exc
 
 
-def _damage(error: UnicodeDecodeError) -> sqlite3.DatabaseError:
+def _damage_error(error: UnicodeDecodeError) -> sqlite3.DatabaseError:
     return sqlite3.DatabaseError(f"malformed: {error.object.decode(errors='replace')}")
 
 
 def open_database(path: Path, *, timeout: float) -> sqlite3.Connection:
-    """Return a connection for reading and writing, which any thread may use, one at a time.
+    """Return a connection for reading and writing, which any one thread at a time may use.
 
-    Each statement outside of a transaction takes effect at once.
+    A statement outside of a transaction is a transaction of its own.
 
     Args:
         path: file of the database; created if it does not exist.
@@ -67,5 +67,5 @@ def open_for_reading(path: Path, *, timeout: float) -> sqlite3.Connection:
     Raises:
         sqlite3.Error: the file does not exist, or cannot be opened.
     """
-    place = f"{path.absolute().as_uri()}?mode=ro"
-    return sqlite3.connect(place, uri=True, timeout=timeout, factory=_Database)
+    uri = f"{path.absolute().as_uri()}?mode=ro"
+    return sqlite3.connect(uri, uri=True, timeout=timeout, factory=_Database)

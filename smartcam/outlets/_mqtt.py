@@ -1,4 +1,4 @@
-"""Results, states and commands over MQTT 5."""
+"""Publish results and states over MQTT 5, and carry out commands from it."""
 
 from __future__ import annotations
 
@@ -33,14 +33,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_HEADER_BYTES = 12
-"""Bytes of a packet besides topic and text: its kind, three lengths, number and properties."""
+"""Number of bytes of a packet without topic and text: kind, three lengths, number and
+properties."""
 
 MAX_COMMANDS = 1_000
-"""Largest number of commands under way at a time, such as a trigger of each camera; more are
-answered with an error. The same number may wait before they are counted."""
+"""Largest number of commands under way at the same time, such as a trigger of each camera. Further
+ones are answered with an error. The same number of messages may wait before that."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes of the commands that wait; further ones are not answered."""
+"""Largest number of bytes of waiting commands; further ones are not answered."""
 
 MAX_COMMAND_BYTES = 1 << 16
 """Largest number of bytes of a command's message."""
@@ -50,13 +51,13 @@ MAX_STATES = 10_000
 
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 _VERBS = ("trigger", "switch")
-_ENTRIES = ("result/", "error/", "gap/")
-"""Beginnings of the topics of entries."""
+_ENTRY_TOPICS = ("result/", "error/", "gap/")
+"""Topics of entries begin with one of these, after the first part of every topic."""
 
-_NO_TOPIC = dict.fromkeys(map(ord, "+#\0"), "_")
+_REPLACED_CHARACTERS = dict.fromkeys(map(ord, "+#\0"), "_")
 
 
-def _broker(text: str) -> str:
+def _check_broker(text: str) -> str:
     try:
         parts = urlsplit(text)
         fits = parts.scheme in _PORTS and parts.hostname and not (parts.path or parts.query)
@@ -70,7 +71,7 @@ def _broker(text: str) -> str:
     return text
 
 
-def _prefix(text: str) -> str:
+def _check_topic(text: str) -> str:
     if set("+#\0") & set(text) or text.startswith(("/", "$")) or text.endswith("/"):
         raise ValueError("expected a topic without + and #, such as plant1/smartcam")
     return text
@@ -79,7 +80,7 @@ def _prefix(text: str) -> str:
 class MqttSettings(OutletSettings):
     """The settings of an outlet over MQTT."""
 
-    broker: Annotated[str, AfterValidator(_broker)] = Field(
+    broker: Annotated[str, AfterValidator(_check_broker)] = Field(
         description="mqtt://HOST[:1883], or mqtts://HOST[:8883] for TLS"
     )
     user: str | None = Field(None, description="name to log in with")
@@ -89,7 +90,7 @@ class MqttSettings(OutletSettings):
     ca: str | None = Field(
         None, min_length=1, description="file of the broker's authority, relative to this file"
     )
-    topic: Annotated[str, AfterValidator(_prefix)] = Field(
+    topic: Annotated[str, AfterValidator(_check_topic)] = Field(
         "smartcam", min_length=1, max_length=200, description="first part of every topic"
     )
     client_id: str | None = Field(
@@ -109,12 +110,12 @@ class MqttSettings(OutletSettings):
 
 
 class _CommandQueue(asyncio.Queue[Any]):
-    """Messages that wait, with a bound on their bytes, too."""
+    """A queue of messages that also has a bound on their bytes."""
 
     _bytes = 0
 
     def full(self) -> bool:
-        """Return True if no more may wait."""
+        """Return True if no further message may be added."""
         return super().full() or self._bytes >= MAX_WAITING_BYTES
 
     def _put(self, item: Any) -> None:
@@ -127,8 +128,8 @@ class _CommandQueue(asyncio.Queue[Any]):
         return item
 
 
-class _ShakenSocket(ssl.SSLSocket):
-    """A socket that closes itself if its handshake fails; paho would leave it open."""
+class _TlsSocket(ssl.SSLSocket):
+    """A socket that closes itself if its handshake fails, since paho would leave it open."""
 
     def do_handshake(self, block: bool = False) -> None:
         """Do the handshake."""
@@ -151,11 +152,11 @@ class MqttOutlet(Outlet[MqttSettings]):
         super().__init__(name, settings, folder, context)
         self._stack = contextlib.AsyncExitStack()
         self._client: Any = None
-        self._hearing: asyncio.Task[None] | None = None
-        self._refusal = ""
-        self._largest = settings.largest
+        self._connection_task: asyncio.Task[None] | None = None
+        self._refusal_reason = ""
+        self._max_message_bytes = settings.largest
         self._states: dict[str, Mapping[str, Any]] = {}
-        self._fresh: set[str] = set()
+        self._unsent_states: set[str] = set()
         self._changed = asyncio.Event()
         self._commands: set[asyncio.Task[None]] = set()
 
@@ -181,14 +182,14 @@ class MqttOutlet(Outlet[MqttSettings]):
             will=aiomqtt.Will(online, '{"online":false}', qos=1, retain=True),
             timeout=settings.timeout,
             keepalive=10,
-            clean_start=True,  # a command from before the session would be carried out too late
+            clean_start=True,  # earlier commands would be carried out too late
             queue_type=_CommandQueue,
             max_queued_incoming_messages=MAX_COMMANDS,
             tls_context=self._tls() if parts.scheme == "mqtts" else None,
         )
         client.pending_calls_threshold = 2 * self.max_batch + 2 * MAX_COMMANDS
         self._watch_refusals(client)
-        self._refusal, self._largest = "", settings.largest
+        self._refusal_reason, self._max_message_bytes = "", settings.largest
         stack = contextlib.AsyncExitStack()
         self._stack = stack
         await stack.enter_async_context(client)
@@ -196,113 +197,125 @@ class MqttOutlet(Outlet[MqttSettings]):
             for verb in _VERBS:
                 await client.subscribe(f"{settings.topic}/command/{verb}/#", qos=1)
         await client.publish(online, '{"online":true}', qos=1, retain=True)
-        self._fresh.update(self._states)
+        self._unsent_states.update(self._states)
         self._changed.set()
-        self._hearing = asyncio.get_running_loop().create_task(self._hear(client))
+        self._connection_task = asyncio.get_running_loop().create_task(
+            self._serve_connection(client)
+        )
 
     def _tls(self) -> ssl.SSLContext:
         ca = self.settings.ca
         try:
-            made = ssl.create_default_context(cafile=None if ca is None else self.folder / ca)
+            context = ssl.create_default_context(cafile=None if ca is None else self.folder / ca)
         except OSError as exc:
             raise ConfigurationError(f"outlet {self.name}: ca: {ca}: {exc}") from exc
-        made.sslsocket_class = _ShakenSocket
-        return made
+        context.sslsocket_class = _TlsSocket
+        return context
 
     def _watch_refusals(self, client: Any) -> None:
-        """Note which messages the broker refuses, which aiomqtt does not report."""
-        inner = client._client  # noqa: SLF001
-        send, was_published, was_connected = inner.publish, inner.on_publish, inner.on_connect
+        """Make the client note refused messages, which aiomqtt does not report."""
+        paho = client._client  # noqa: SLF001
+        publish_inner, on_publish_inner = paho.publish, paho.on_publish
+        on_connect_inner = paho.on_connect
         topics: dict[int, str] = {}  # topics of messages that are not acknowledged yet
 
-        def publish(topic: str, *given: Any, **named: Any) -> Any:
-            sent = send(topic, *given, **named)
-            topics[sent.mid] = topic
-            return sent
+        def publish(topic: str, *arguments: Any, **options: Any) -> Any:
+            info = publish_inner(topic, *arguments, **options)
+            topics[info.mid] = topic
+            return info
 
-        def on_publish(of: Any, data: Any, number: int, reason: Any, properties: Any) -> None:
+        def on_publish(sender: Any, data: Any, number: int, reason: Any, properties: Any) -> None:
             topic = topics.pop(number, "")
             if reason is not None and reason.is_failure:
-                if topic.removeprefix(f"{self.settings.topic}/").startswith(_ENTRIES):
-                    self._refusal = str(reason)
+                if topic.removeprefix(f"{self.settings.topic}/").startswith(_ENTRY_TOPICS):
+                    self._refusal_reason = str(reason)
                 else:  # a state, or an answer to a command
                     logger.warning(
                         "outlet %s: the broker refused a message to %.120s: %s",
                         *(self.name, topic, reason),
                     )
-            was_published(of, data, number, reason, properties)
+            on_publish_inner(sender, data, number, reason, properties)
 
-        def on_connect(of: Any, data: Any, flags: Any, reason: Any, properties: Any = None) -> None:
-            largest = getattr(properties, "MaximumPacketSize", None)  # size of the whole packet
-            if largest is not None:
-                self._largest = min(self._largest, largest - MAX_HEADER_BYTES)
-            was_connected(of, data, flags, reason, properties)
+        def on_connect(
+            sender: Any, data: Any, flags: Any, reason: Any, properties: Any = None
+        ) -> None:
+            packet_bytes = getattr(properties, "MaximumPacketSize", None)
+            if packet_bytes is not None:
+                limit = packet_bytes - MAX_HEADER_BYTES
+                self._max_message_bytes = min(self._max_message_bytes, limit)
+            on_connect_inner(sender, data, flags, reason, properties)
 
-        inner.publish, inner.on_publish, inner.on_connect = publish, on_publish, on_connect
+        paho.publish, paho.on_publish, paho.on_connect = publish, on_publish, on_connect
 
     def _topic(self, kind: str, camera: str) -> str:
         """Return the topic of a camera, with _ for characters that topics may not have."""
-        return f"{self.settings.topic}/{kind}/{camera.translate(_NO_TOPIC)}"
+        return f"{self.settings.topic}/{kind}/{camera.translate(_REPLACED_CHARACTERS)}"
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries to TOPIC/KIND/CAMERA; return when the broker has acknowledged all."""
-        messages = [_message(entry) for entry in entries]
+        messages = [_entry_message(entry) for entry in entries]
         topics = [self._topic(entry.kind, entry.camera or "all") for entry in entries]
         sizes = [
             len(topic.encode()) + len(message)
             for topic, message in zip(topics, messages, strict=True)
         ]
-        count, largest = len(messages), self._largest
-        bad = next((place for place, size in enumerate(sizes) if size > largest), None)
-        if bad is not None:
-            count = bad
-        await self._while_here(
+        count, limit = len(messages), self._max_message_bytes
+        too_large = next((index for index, size in enumerate(sizes) if size > limit), None)
+        if too_large is not None:
+            count = too_large
+        await self._publish_while_connected(
             [
                 self._client.publish(topic, message, qos=1)
                 for topic, message in zip(topics[:count], messages[:count], strict=True)
             ]
         )
-        if bad is not None:
-            text = f"{sizes[bad]} bytes, {largest} are allowed"
-            raise EntryRefusedError(text, place=bad)
+        if too_large is not None:
+            text = f"{sizes[too_large]} bytes, {limit} are allowed"
+            raise EntryRefusedError(text, place=too_large)
 
-    async def _while_here(self, calls: list[Any]) -> None:
-        """Publish messages concurrently, in order, while the broker is connected."""
-        hearing = self._hearing
-        if hearing is None:
+    async def _publish_while_connected(self, calls: list[Any]) -> None:
+        """Await calls that publish; raise if the connection to the broker is lost before.
+
+        The messages are sent in order, without waiting for the acknowledgement of each.
+        """
+        connection_task = self._connection_task
+        if connection_task is None:
             for call in calls:
                 call.close()
             raise OutletError("not connected to the broker")
         publishing: asyncio.Future[Any] = asyncio.gather(*calls)
         try:
-            ends: set[asyncio.Future[Any]] = {publishing, hearing}
+            ends: set[asyncio.Future[Any]] = {publishing, connection_task}
             await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-            if hearing.done():
-                hearing.result()
+            if connection_task.done():
+                connection_task.result()
             await publishing
         finally:
             publishing.cancel()
             with contextlib.suppress(asyncio.CancelledError, Exception):
                 await publishing
-        if self._refusal:
-            raise OutletError(f"the broker refused a message: {self._refusal}")
+        if self._refusal_reason:
+            raise OutletError(f"the broker refused a message: {self._refusal_reason}")
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
         """Schedule the camera's state to be published, retained."""
         if camera in self._states or len(self._states) < MAX_STATES:
             self._states[camera] = state
-            self._fresh.add(camera)
+            self._unsent_states.add(camera)
             self._changed.set()
 
     async def watch(self) -> None:
         """Wait until the connection to the broker is lost."""
-        if self._hearing is not None:
-            await asyncio.shield(self._hearing)
+        if self._connection_task is not None:
+            await asyncio.shield(self._connection_task)
 
     async def close(self) -> None:
         """Disconnect from the broker."""
-        tasks = [*self._commands, *([self._hearing] if self._hearing is not None else [])]
-        self._hearing = None
+        tasks = [
+            *self._commands,
+            *([self._connection_task] if self._connection_task is not None else []),
+        ]
+        self._connection_task = None
         for task in tasks:
             task.cancel()
         if tasks:
@@ -317,80 +330,80 @@ class MqttOutlet(Outlet[MqttSettings]):
 
     # ------------------------------------------------------------------ states and commands
 
-    async def _hear(self, client: Any) -> None:
-        """Publish states and receive commands until the broker's connection is lost."""
+    async def _serve_connection(self, client: Any) -> None:
+        """Publish states and receive commands until the connection to the broker is lost."""
         loop = asyncio.get_running_loop()
-        telling = loop.create_task(self._send_states(client))
-        commands = loop.create_task(self._take_commands(client))
+        state_task = loop.create_task(self._send_states(client))
+        command_task = loop.create_task(self._receive_commands(client))
         try:
-            await asyncio.wait({telling, commands}, return_when=asyncio.FIRST_COMPLETED)
-            for task in (telling, commands):
+            await asyncio.wait({state_task, command_task}, return_when=asyncio.FIRST_COMPLETED)
+            for task in (state_task, command_task):
                 if task.done():
                     task.result()
             raise OutletError("the broker is gone")
         finally:
-            for task in (telling, commands):
+            for task in (state_task, command_task):
                 task.cancel()
-            await asyncio.wait({telling, commands})
+            await asyncio.wait({state_task, command_task})
 
     async def _send_states(self, client: Any) -> None:
         while True:
             await self._changed.wait()
             self._changed.clear()
-            while self._fresh:
-                camera = self._fresh.pop()
+            while self._unsent_states:
+                camera = self._unsent_states.pop()
                 try:
                     text = object_text({"camera": camera, **self._states[camera]})
                     topic = self._topic("state", camera)
                     await client.publish(topic, text, qos=1, retain=True)
                 except BaseException:
-                    self._fresh.add(camera)
+                    self._unsent_states.add(camera)
                     raise
 
-    async def _take_commands(self, client: Any) -> None:
+    async def _receive_commands(self, client: Any) -> None:
         async for message in client.messages:
             if message.retain:
                 continue  # a retained command would be carried out again in each session
-            task = asyncio.get_running_loop().create_task(self._command(client, message))
+            task = asyncio.get_running_loop().create_task(self._answer_command(client, message))
             self._commands.add(task)
             task.add_done_callback(self._commands.discard)
 
-    async def _command(self, client: Any, message: Any) -> None:
+    async def _answer_command(self, client: Any, message: Any) -> None:
         verb, _, camera = (
             str(message.topic).removeprefix(f"{self.settings.topic}/command/").partition("/")
         )
-        reply = await self._do(verb, camera, message.payload)
-        requested = message.properties
-        topic = getattr(requested, "ResponseTopic", None)
+        reply = await self._carry_out(verb, camera, message.payload)
+        request_properties = message.properties
+        topic = getattr(request_properties, "ResponseTopic", None)
         properties = None
         if not topic or "+" in topic or "#" in topic:
             topic = f"{self.settings.topic}/reply/{verb}/{camera}"
-        correlation = getattr(requested, "CorrelationData", None)
+        correlation = getattr(request_properties, "CorrelationData", None)
         if correlation is not None:
             properties = load("paho.mqtt.properties").Properties(
                 load("paho.mqtt.packettypes").PacketTypes.PUBLISH
             )
             properties.CorrelationData = correlation
-        with contextlib.suppress(load("aiomqtt").MqttError):  # the client gets no answer then
+        with contextlib.suppress(load("aiomqtt").MqttError):  # then the client gets no answer
             await client.publish(topic, object_text(reply), qos=1, properties=properties)
 
-    async def _do(self, verb: str, camera: str, payload: object) -> dict[str, Any]:
+    async def _carry_out(self, verb: str, camera: str, payload: object) -> dict[str, Any]:
         fields: dict[str, Any] = {"camera": camera}
         try:
-            given = _command_fields(payload)
-            if "id" in given:
-                fields["id"] = given.pop("id")
+            arguments = _command_fields(payload)
+            if "id" in arguments:
+                fields["id"] = arguments.pop("id")
             if len(self._commands) > MAX_COMMANDS:
                 raise OutletError(f"{MAX_COMMANDS} commands are under way already")
             if self.context.command is None or not self.settings.chooses(camera):
                 raise ConfigurationError(f"there is no camera {camera!r:.120} here")
-            done = await self.context.command(camera, verb, given)
+            outcome = await self.context.command(camera, verb, arguments)
         except SmartCamError as exc:
             return {**fields, "ok": False, "error": str(exc), "kind": type(exc).__name__}
-        return {**fields, "ok": True, **done}
+        return {**fields, "ok": True, **outcome}
 
 
-def _message(entry: OutletEntry) -> bytes:
+def _entry_message(entry: OutletEntry) -> bytes:
     """Return an entry's JSON, with its id as the first field."""
     head = (
         {"id": entry.id, "camera": entry.camera}
@@ -412,9 +425,9 @@ def _command_fields(payload: object) -> dict[str, Any]:
     if not data.strip():
         return {}
     try:
-        given: object = json.loads(data)
+        fields: object = json.loads(data)
     except (ValueError, RecursionError):
-        given = None
-    if not isinstance(given, dict):
+        fields = None
+    if not isinstance(fields, dict):
         raise ConfigurationError("expected a JSON object, or nothing")
-    return cast("dict[str, Any]", given)
+    return cast("dict[str, Any]", fields)

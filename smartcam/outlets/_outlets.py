@@ -1,4 +1,4 @@
-"""All outlets of a process, which get the results, errors and states of cameras."""
+"""Run all outlets of a process, which get the results, errors and states of cameras."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from smartcam.outlets._settings import OutletSettings, Section
     from smartcam.outlets._stored import StoredResults
 
-MAX_TURN_SECONDS = 0.0005
-"""Seconds of the interpreter's switch interval while outlets run. With the usual 5 ms a trigger
-would wait that long if its result comes while a spool is written."""
+SWITCH_INTERVAL = 0.0005
+"""Switch interval of the interpreter's threads while outlets run, seconds. With the usual 5 ms, a
+result that comes while a spool is written could wait that long."""
 
 RESULT_BYTES = 600
-"""Approximate number of bytes that a result takes in memory besides its container."""
+"""Approximate number of bytes of a result in memory, without its container."""
 
 
 class OutletState(NamedTuple):
@@ -90,21 +90,21 @@ class Outlets(Server):
         check_callable(names, "names", "Outlets")
         if command is not None:
             check_callable(command, "command", "Outlets")
-        for place, text in mistakes_of(section):
-            raise ConfigurationError(f"{'.'.join(map(str, place))}: {text}")
+        for keys, text in mistakes_of(section):
+            raise ConfigurationError(f"{'.'.join(map(str, keys))}: {text}")
         context = OutletContext(columns, command, cameras, names)
         self._pumps: dict[str, Pump] = {}
-        for name, given in section.items():
-            kind = outlet_class(name, given)
-            settings: OutletSettings = kind.settings_class.model_validate(given)
+        for name, fields in section.items():
+            class_ = outlet_class(name, fields)
+            settings: OutletSettings = class_.settings_class.model_validate(fields)
             spool = Spool(
                 spool_path(folder, settings, name),
                 int(settings.size),
                 settings.full,
                 durable=settings.durable,
             )
-            self._pumps[name] = Pump(kind(name, settings, folder, context), spool, on_trouble)
-        self._chosen: dict[str, list[Pump]] = {}
+            self._pumps[name] = Pump(class_(name, settings, folder, context), spool, on_trouble)
+        self._pumps_by_camera: dict[str, list[Pump]] = {}
         self._started: list[Pump] = []
 
     async def start(self) -> None:
@@ -117,7 +117,7 @@ class Outlets(Server):
         """
         if self._started:
             return
-        shorten_turns(self, MAX_TURN_SECONDS)
+        shorten_turns(self, SWITCH_INTERVAL)
         try:
             for pump in self._pumps.values():
                 try:
@@ -156,7 +156,7 @@ class Outlets(Server):
         answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}
         return {name: answer for name, answer in answers.items() if answer is not None}
 
-    # ------------------------------------------------------------------ what cameras bring
+    # ------------------------------------------------------------------ from cameras
 
     def offer_result(
         self, result: Result[Any], read: Callable[[], tuple[Any, int | None]] | None = None
@@ -165,19 +165,19 @@ class Outlets(Server):
 
         Args:
             result: the result.
-            read: function that returns value and sequence number; called in a thread. None: those
-                of the result.
+            read: function that returns value and sequence number; called in a thread. None: the
+                result has them.
         """
-        made: list[tuple[Any, int | None, str]] = []
+        contents: list[tuple[Any, int | None, str]] = []
 
-        def make() -> tuple[Any, int | None, str]:
-            if not made:  # the first outlet makes the body for all
-                made.append(_result(result, read))
-            return made[0]
+        def make_content() -> tuple[Any, int | None, str]:
+            if not contents:  # made once for all outlets
+                contents.append(_entry_content(result, read))
+            return contents[0]
 
         size = len(result.raw) + RESULT_BYTES
-        for pump in self._of(result.camera):
-            pump.offer(result.camera, result.received_at.timestamp(), size, make)
+        for pump in self._pumps_for(result.camera):
+            pump.offer(result.camera, result.received_at.timestamp(), size, make_content)
 
     def offer_error(
         self, camera: str, at: datetime, error: str, kind: str, triggered_at: datetime | None = None
@@ -185,26 +185,27 @@ class Outlets(Server):
         """Pass an error to the outlets; return at once."""
         fields = {"camera": camera, "error": error, "kind": kind, "triggered_at": triggered_at}
         text = object_text(fields)
-        for pump in self._of(camera):
+        for pump in self._pumps_for(camera):
             pump.offer(camera, at.timestamp(), len(text), lambda: ("error", None, text))
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
         """Pass a camera's state to the outlets; return at once."""
-        for pump in self._of(camera):
+        for pump in self._pumps_for(camera):
             pump.outlet.state_changed(camera, state)
 
-    def _of(self, camera: str) -> list[Pump]:
-        chosen = self._chosen.get(camera)
-        if chosen is None:
-            pumps = self._pumps.values()
-            chosen = [pump for pump in pumps if pump.outlet.settings.chooses(camera)]
-            self._chosen[camera] = chosen
-        return chosen
+    def _pumps_for(self, camera: str) -> list[Pump]:
+        pumps = self._pumps_by_camera.get(camera)
+        if pumps is None:
+            all_pumps = self._pumps.values()
+            pumps = [pump for pump in all_pumps if pump.outlet.settings.chooses(camera)]
+            self._pumps_by_camera[camera] = pumps
+        return pumps
 
 
-def _result(
+def _entry_content(
     result: Result[Any], read: Callable[[], tuple[Any, int | None]] | None
 ) -> tuple[Any, int | None, str]:
+    """Return kind, application and body of a result's entry."""
     application = result.application
     try:
         if read is not None:
@@ -229,15 +230,15 @@ def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:
 def stored_accounts(section: Section, folder: Path) -> dict[str, OutletAccount | None]:
     """Return the accounts of a section's spools, by the outlet's name; None without a spool."""
     accounts: dict[str, OutletAccount | None] = {}
-    for name, given in section.items():
-        settings = outlet_class(name, given).settings_class.model_validate(given)
+    for name, fields in section.items():
+        settings = outlet_class(name, fields).settings_class.model_validate(fields)
         accounts[name] = None
         with contextlib.suppress(FileNotFoundError):
             accounts[name] = read_account(spool_path(folder, settings, name))
     return accounts
 
 
-LOCALIZATION: Sequence[Column] = (
+LOCALIZATION_COLUMNS: Sequence[Column] = (
     ("feature_id", "string", ""),
     ("quality", "real64", ""),
     ("photo_index", "int32", ""),
@@ -251,13 +252,13 @@ LOCALIZATION: Sequence[Column] = (
 )
 """Values of a localization: its pose as a position and a quaternion."""
 
-_SI = {"deg": "rad", "rad": "rad", "px": "px"}
+_SI_UNITS = {"deg": "rad", "rad": "rad", "px": "px"}
 
 
 def columns_of(interpreter: Interpreter | None) -> Sequence[Column]:
     """Return names, types and SI units of an interpreter's values; empty if it has no layout."""
     if isinstance(interpreter, LocalizationsInterpreter):
-        return LOCALIZATION
+        return LOCALIZATION_COLUMNS
     layout = None if interpreter is None else interpreter.layout
     if layout is None:
         return ()
@@ -265,7 +266,7 @@ def columns_of(interpreter: Interpreter | None) -> Sequence[Column]:
         (
             part.name,
             "real64" if part.unit else part.type,
-            _SI.get(part.unit, "m") if part.unit else "",
+            _SI_UNITS.get(part.unit, "m") if part.unit else "",
         )
         for part in (*layout.head, *layout.fields)
     ]

@@ -33,11 +33,11 @@ MAX_WAITING = 20_000
 MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes of the entries that wait in memory."""
 
-MAX_WRITTEN_TOGETHER = 500
-"""Largest number of entries of one write to the spool."""
+MAX_WRITE_BATCH = 500
+"""Largest number of entries that are written to the spool in one transaction."""
 
-GATHER_SECONDS = 0.002
-"""Seconds for which entries are collected in memory before they are written together: so a write
+GATHER_TIME = 0.002
+"""Seconds for which entries are collected in memory before they are written together. So a write
 does not delay the trigger, and many results need a single write."""
 
 DISK_RETRY_SECONDS = 1.0
@@ -46,7 +46,7 @@ DISK_RETRY_SECONDS = 1.0
 STOP_TIMEOUT = 10.0
 """Seconds for writing the waiting entries at the end."""
 
-LINGER = 1.0
+FINAL_DELIVERY_TIMEOUT = 1.0
 """Seconds for delivering spooled entries at the end, if the server accepts them."""
 
 CLOSE_TIMEOUT = 5.0
@@ -54,36 +54,36 @@ CLOSE_TIMEOUT = 5.0
 
 
 class Arrival(NamedTuple):
-    """A result or an error before an entry is made of it.
+    """A result or an error that was received, and is not an entry yet.
 
     Attributes:
         camera: name of the camera.
         number: number of the entry.
         at: time of arrival, seconds since 1970, UTC.
         size: size in memory, bytes.
-        make: function that returns kind, application and body of the entry; called in the spool's
-            thread.
+        make_content: function that returns kind, application and body of the entry; called in the
+            spool's thread.
     """
 
     camera: str
     number: int
     at: float
     size: int
-    make: Callable[[], tuple[Any, int | None, str]]
+    make_content: Callable[[], tuple[Any, int | None, str]]
 
 
 class Pump:
-    """One outlet with its spool.
+    """Writes one outlet's entries to its spool, and delivers them from there.
 
     Args:
         outlet: the outlet.
         spool: spool of the outlet.
-        report: function that is called with the reason why the server or the disk fails, and with
-            "" when it works again.
+        report: callback for the outlet's name and the reason why the server or the disk fails; ""
+            when it works again.
 
     Attributes:
-        trouble: reason why entries are not delivered now; "" without one.
-        disk_trouble: reason why entries are not spooled now; "" without one.
+        trouble: reason why entries are not delivered now; "" if they are.
+        disk_trouble: reason why entries are not written to the spool now; "" if they are.
     """
 
     def __init__(
@@ -96,16 +96,18 @@ class Pump:
         self.trouble = self.disk_trouble = ""
         self._waiting: collections.deque[Arrival] = collections.deque()
         self._waiting_bytes = 0
-        # dropped entries that no gap stands for yet
-        self._lost: dict[str, tuple[Arrival, int]] = {}
-        self._numbers: dict[str, int] = {}
+        # the last dropped entry of each camera, and their number, until a gap is written for them
+        self._dropped: dict[str, tuple[Arrival, int]] = {}
+        self._last_numbers: dict[str, int] = {}
         self._arrived, self._spooled = asyncio.Event(), asyncio.Event()
         self._account = OutletAccount()
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
         self._open = False
-        self._together = outlet.max_batch  # largest number of entries of the next batch
-        self._gathering: asyncio.TimerHandle | None = None  # timer of the next write
+        self._batch_size = outlet.max_batch  # largest number of entries in the next batch
+        self._gather_timer: asyncio.TimerHandle | None = (
+            None  # started by the first entry after a write
+        )
 
     async def start(self) -> None:
         """Open the spool, and start writing and delivering.
@@ -115,9 +117,9 @@ class Pump:
             sqlite3.Error: its file cannot be created.
         """
         try:
-            await self._run(lambda: None)  # opens the spool
+            await self._run_in_thread(lambda: None)  # opens the spool
         except BaseException:
-            await self._end_thread()
+            await self._stop_thread()
             raise
         self._account = self.spool.account
         self._open = True
@@ -130,77 +132,84 @@ class Pump:
 
         Cancellation: the spool's thread still finishes its work.
         """
-        if self._gathering is not None:
-            self._gathering.cancel()
-            self._gathering = None
+        if self._gather_timer is not None:
+            self._gather_timer.cancel()
+            self._gather_timer = None
         try:
-            await self._end(self._tasks[:1])
+            await self._cancel_tasks(self._tasks[:1])
             if self._open:
                 with contextlib.suppress(Exception):  # the next start adds a gap for the rest
                     async with asyncio.timeout(STOP_TIMEOUT):
-                        while self._waiting or self._lost:
+                        while self._waiting or self._dropped:
                             await self._store_waiting()
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(LINGER):
+                    async with asyncio.timeout(FINAL_DELIVERY_TIMEOUT):
                         while (  # noqa: ASYNC110 - for a second at most
                             self._account.spooled and not (self.trouble or self.disk_trouble)
                         ):
                             await asyncio.sleep(0.01)
         finally:
             self._open = False
-            await self._end(self._tasks)
+            await self._cancel_tasks(self._tasks)
             self._tasks = []
-            await self._end_thread()
+            await self._stop_thread()
 
-    async def _end(self, tasks: list[asyncio.Task[None]]) -> None:
+    async def _cancel_tasks(self, tasks: list[asyncio.Task[None]]) -> None:
         for task in tasks:
             task.cancel()
         if tasks:
             await asyncio.wait(tasks)
 
-    async def _end_thread(self) -> None:
-        ended = not (self._waiting or self._lost)
+    async def _stop_thread(self) -> None:
+        all_written = not (self._waiting or self._dropped)
         with contextlib.suppress(RuntimeError, TimeoutError):
             closing = asyncio.wrap_future(
-                self._thread.submit(lambda: self.spool.close(ended=ended))
+                self._thread.submit(lambda: self.spool.close(all_written=all_written))
             )
             async with asyncio.timeout(STOP_TIMEOUT):
                 await asyncio.shield(closing)
         self._thread.shutdown(wait=False)
 
     def offer(
-        self, camera: str, at: float, size: int, make: Callable[[], tuple[Any, int | None, str]]
+        self,
+        camera: str,
+        at: float,
+        size: int,
+        make_content: Callable[[], tuple[Any, int | None, str]],
     ) -> None:
         """Accept a result or an error; never wait."""
-        number = self._numbers[camera] = self._numbers.get(camera, 0) + 1
-        arrival = Arrival(camera, number, at, size, make)
+        number = self._last_numbers[camera] = self._last_numbers.get(camera, 0) + 1
+        arrival = Arrival(camera, number, at, size, make_content)
         if (
             len(self._waiting) >= MAX_WAITING
             or self._waiting_bytes + size > MAX_WAITING_BYTES
-            or self._lost  # later entries must not overtake the gap
+            or self._dropped  # entries may not come before the gap of earlier ones
         ):
-            self._lost[camera] = arrival, self._lost.get(camera, (arrival, 0))[1] + 1
+            self._dropped[camera] = arrival, self._dropped.get(camera, (arrival, 0))[1] + 1
         else:
             self._waiting.append(arrival)
             self._waiting_bytes += size
-        if self._gathering is None:
+        if self._gather_timer is None:
             loop = asyncio.get_running_loop()
-            self._gathering = loop.call_later(GATHER_SECONDS, self._gathered)
+            self._gather_timer = loop.call_later(GATHER_TIME, self._on_gathered)
 
-    def _gathered(self) -> None:
-        self._gathering = None
+    def _on_gathered(self) -> None:
+        self._gather_timer = None
         self._arrived.set()
 
     @property
     def account(self) -> OutletAccount:
-        """The account of all entries, including the ones in memory."""
+        """The account of all entries, also of those in memory."""
         counts, waiting = self._account, len(self._waiting)
-        lost = sum(count for _, count in self._lost.values())
+        memory_count = sum(count for _, count in self._dropped.values())
         dropped = dict(counts.dropped)
-        if lost:
-            dropped["memory"] = dropped.get("memory", 0) + lost
+        if memory_count:
+            dropped["memory"] = dropped.get("memory", 0) + memory_count
         return OutletAccount(
-            counts.results + waiting + lost, counts.delivered, counts.spooled + waiting, dropped
+            counts.results + waiting + memory_count,
+            counts.delivered,
+            counts.spooled + waiting,
+            dropped,
         )
 
     # ------------------------------------------------------------------ into the spool
@@ -209,7 +218,7 @@ class Pump:
         while True:
             await self._arrived.wait()
             self._arrived.clear()
-            while self._waiting or self._lost:
+            while self._waiting or self._dropped:
                 try:
                     await self._store_waiting()
                 except Exception as exc:  # noqa: BLE001 - after any error entries are kept
@@ -220,20 +229,20 @@ class Pump:
                     self._report_disk("")
 
     async def _store_waiting(self) -> None:
-        """Write the first waiting entries; if none wait, the gaps of dropped ones."""
-        batch = [*itertools.islice(self._waiting, MAX_WRITTEN_TOGETHER)]
-        lost = {} if batch else dict(self._lost)
-        await self._store_arrivals(batch, lost)
+        """Write the first waiting entries; if none wait, gaps for the dropped entries."""
+        batch = [*itertools.islice(self._waiting, MAX_WRITE_BATCH)]
+        dropped = {} if batch else dict(self._dropped)
+        await self._store_arrivals(batch, dropped)
 
     async def _store_arrivals(
-        self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]]
+        self, batch: list[Arrival], dropped: dict[str, tuple[Arrival, int]]
     ) -> None:
         epoch = self.spool.epoch
 
         def work() -> OutletAccount:
             entries = list[OutletEntry]()
             for arrival in batch:
-                kind, application, body = arrival.make()
+                kind, application, body = arrival.make_content()
                 entry = OutletEntry(
                     arrival.camera, epoch, arrival.number, kind, application, arrival.at, body
                 )
@@ -242,50 +251,54 @@ class Pump:
                 (
                     OutletEntry(arrival.camera, epoch, arrival.number, "gap", None, arrival.at, ""),
                     count,
-                    _MEMORY,
+                    _MEMORY_REASON,
                 )
-                for arrival, count in lost.values()
+                for arrival, count in dropped.values()
             ]
             self.spool.add(entries, gaps)
             return self.spool.account
 
-        await self._run(work, lambda account: self._remove_stored(batch, lost, account))
+        await self._run_in_thread(
+            work, lambda account: self._remove_stored(batch, dropped, account)
+        )
         self._spooled.set()
 
     def _remove_stored(
-        self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]], account: OutletAccount
+        self, batch: list[Arrival], dropped: dict[str, tuple[Arrival, int]], account: OutletAccount
     ) -> None:
         for arrival in batch:
             self._waiting.popleft()
             self._waiting_bytes -= arrival.size
-        for camera, (_, count) in lost.items():
-            last, now = self._lost.pop(camera)
-            if now > count:
-                self._lost[camera] = last, now - count
+        for camera, (_, count) in dropped.items():
+            last, new_count = self._dropped.pop(camera)
+            if new_count > count:
+                self._dropped[camera] = last, new_count - count
         self._account = account
 
-    async def _run(self, work: Callable[[], T], then: Callable[[T], None] = lambda _: None) -> T:
-        """Run work in the spool's thread, then ``then``, also if the caller is cancelled."""
+    async def _run_in_thread(
+        self, work: Callable[[], T], on_done: Callable[[T], None] = lambda _: None
+    ) -> T:
+        """Run work in the spool's thread, then ``on_done``, even if the caller is cancelled."""
 
-        def guarded() -> T:
+        def run_with_spool() -> T:
             if self.spool.closed:
                 self.spool.open()
             try:
                 return work()
             except sqlite3.Error as exc:
                 if is_damage(exc):
-                    self.spool.renew(text_of(exc))
+                    self.spool.replace_damaged(text_of(exc))
                 raise
 
-        running = asyncio.wrap_future(self._thread.submit(guarded))
+        running = asyncio.wrap_future(self._thread.submit(run_with_spool))
         try:
             outcome = await asyncio.shield(running)
         except asyncio.CancelledError:
             await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # a disk may hang forever
             if running.done() and running.exception() is None:
-                then(running.result())
+                on_done(running.result())
             raise
-        then(outcome)
+        on_done(outcome)
         return outcome
 
     def _report_disk(self, why: str) -> None:
@@ -295,7 +308,7 @@ class Pump:
             log("outlet %s: %s", self.outlet.name, why or "the spool is written again")
             self._report(self.outlet.name, why)
 
-    # ------------------------------------------------------------------ to the far end
+    # ------------------------------------------------------------------ to the server
 
     async def _deliver(self) -> None:
         delays = Backoff().delays()
@@ -305,12 +318,12 @@ class Pump:
                     async with asyncio.timeout(self.outlet.settings.timeout):
                         await self.outlet.open()
                     while True:
-                        if await self._deliver_some():
+                        if await self._deliver_batch():
                             delays = Backoff().delays()
                 finally:
                     await self._close_outlet()
             except asyncio.CancelledError:
-                if _cancelled():
+                if _is_task_cancelled():
                     raise
                 self._report_delivery("the outlet cancelled its own work")
             except ENDS_PROGRAM:
@@ -330,49 +343,49 @@ class Pump:
         except BaseException as exc:  # noqa: BLE001 - a plug-in may raise anything
             logger.debug("outlet %s: closing: %s", self.outlet.name, text_of(exc))
 
-    async def _deliver_some(self) -> bool:
-        """Deliver a batch, or wait for one; return True if one was delivered.
+    async def _deliver_batch(self) -> bool:
+        """Deliver a batch, or wait for entries; return True if a batch was delivered.
 
-        After a failed batch, entries are delivered singly at first: if the server fails at one,
-        earlier entries are not delivered again.
+        After a failed batch, the next batch has one entry. So if the server fails at one entry,
+        earlier entries are not delivered again and again.
         """
         self._spooled.clear()
-        together, self._together = self._together, 1
-        waiting = await self._run(lambda: self.spool.head(together))
-        if not waiting.places:
-            self._together = together
+        batch_size, self._batch_size = self._batch_size, 1
+        head = await self._run_in_thread(lambda: self.spool.head(batch_size))
+        if not head.places:
+            self._batch_size = batch_size
             if self.trouble:
                 self._report_delivery("")
-            await self._idle()
+            await self._wait_for_entries()
             return False
         try:
             async with asyncio.timeout(self.outlet.settings.timeout):
-                await self.outlet.deliver(waiting.entries)
+                await self.outlet.deliver(head.entries)
         except EntryRefusedError as exc:
-            place = min(max(exc.place, 0), len(waiting.places) - 1)
+            index = min(max(exc.place, 0), len(head.places) - 1)
             logger.error(  # noqa: TRY400 - the text says it
                 "outlet %s: %s is refused for good: %s",
                 self.outlet.name,
-                waiting.entries[place].id,
+                head.entries[index].id,
                 exc,
             )
-            await self._forget(waiting, place, str(exc) or "refused")
+            await self._remove_delivered(head, index, str(exc) or "refused")
         else:
-            await self._forget(waiting, None, "")
-        self._together = min(2 * together, self.outlet.max_batch)
+            await self._remove_delivered(head, None, "")
+        self._batch_size = min(2 * batch_size, self.outlet.max_batch)
         self._report_delivery("")
         return True
 
-    async def _forget(self, waiting: SpoolHead, count: int | None, refused: str) -> None:
-        """Remove delivered entries; wait while the disk is full, so that none is sent twice."""
+    async def _remove_delivered(self, head: SpoolHead, count: int | None, refused: str) -> None:
+        """Remove delivered entries, so that none is sent twice; wait while the disk is full."""
 
         def work() -> OutletAccount:
-            self.spool.done(waiting, count, refused)
+            self.spool.remove_delivered(head, count, refused)
             return self.spool.account
 
         while True:
             try:
-                await self._run(work, self._set_account)
+                await self._run_in_thread(work, self._set_account)
             except sqlite3.Error as exc:
                 self._report_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                 await asyncio.sleep(DISK_RETRY_SECONDS)
@@ -382,23 +395,23 @@ class Pump:
     def _set_account(self, account: OutletAccount) -> None:
         self._account = account
 
-    async def _idle(self) -> None:
-        """Wait until something is spooled.
+    async def _wait_for_entries(self) -> None:
+        """Wait until an entry is written to the spool.
 
         Raises:
             Exception: the server is lost.
         """
         loop = asyncio.get_running_loop()
-        spooled = loop.create_task(self._spooled.wait())
-        watching = loop.create_task(self.outlet.watch())
+        spooled_task = loop.create_task(self._spooled.wait())
+        lost_task = loop.create_task(self.outlet.watch())
         try:
-            await asyncio.wait({spooled, watching}, return_when=asyncio.FIRST_COMPLETED)
-            if watching.done():
-                watching.result()
+            await asyncio.wait({spooled_task, lost_task}, return_when=asyncio.FIRST_COMPLETED)
+            if lost_task.done():
+                lost_task.result()
         finally:
-            for task in (spooled, watching):
+            for task in (spooled_task, lost_task):
                 task.cancel()
-            await asyncio.wait({spooled, watching})
+            await asyncio.wait({spooled_task, lost_task})
 
     def _report_delivery(self, why: str) -> None:
         if why != self.trouble:
@@ -408,10 +421,10 @@ class Pump:
             self._report(self.outlet.name, why)
 
 
-_MEMORY = "the spool's disk was full, away or too slow"
+_MEMORY_REASON = "the spool's disk was full, away or too slow"
 
 
-def _cancelled() -> bool:
+def _is_task_cancelled() -> bool:
     """Return True if this task has been cancelled."""
     task = asyncio.current_task()
     return task is None or task.cancelling() > 0

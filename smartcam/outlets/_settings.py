@@ -1,4 +1,4 @@
-"""Settings of outlets, from a section of a fleet file or a file of their own."""
+"""Define the settings of outlets, from a section of a fleet file or from an own file."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class Secret(_OutletFields):
 
     @model_validator(mode="before")
     @classmethod
-    def _not_itself(cls, given: Any) -> Any:
-        if not isinstance(given, dict):
+    def _refuse_literal(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
             raise ValueError(  # noqa: TRY004 - pydantic tells the place of a ValueError
                 "a secret never stands in the file: expected {file: PATH} or {variable: NAME}"
             )
-        if len(given) != 1:
+        if len(value) != 1:
             raise ValueError("expected either file or variable")
-        return given
+        return value
 
     def read(self, folder: Path) -> str:
         """Return the secret.
@@ -130,13 +130,13 @@ class OutletsFile(_OutletFields):
         )
 
 
-def outlet_class(name: str, given: Mapping[str, Any]) -> type[Outlet[Any]]:
+def outlet_class(name: str, fields: Mapping[str, Any]) -> type[Outlet[Any]]:
     """Return the class of an outlet.
 
     Raises:
         PluginError: its kind is unknown or cannot be loaded.
     """
-    kind = given.get("kind") or name
+    kind = fields.get("kind") or name
     class_ = OUTLETS.load(str(kind))
     if not (isinstance(class_, type) and issubclass(class_, Outlet)):
         raise PluginError(f"smartcam.outlets: {kind} is no class of Outlet", name=str(kind))
@@ -144,18 +144,18 @@ def outlet_class(name: str, given: Mapping[str, Any]) -> type[Outlet[Any]]:
 
 
 def mistakes_of(section: Section) -> Iterator[tuple[Sequence[int | str], str]]:
-    """Yield the mistakes in a section ``outlets:``, and their places."""
+    """Yield the mistakes in a section ``outlets:``: the keys of the field, and a text."""
     if len(section) > MAX_OUTLETS:
         yield ("outlets",), f"{len(section)} outlets, expected {MAX_OUTLETS} at most"
         return
-    for name, given in section.items():
+    for name, fields in section.items():
         if not name.replace("-", "").replace("_", "").isalnum() or not name.isascii():
             yield ("outlets", name), "expected a name of letters, digits, - and _"
             continue
         try:
-            outlet_class(name, given).settings_class.model_validate(given)
+            outlet_class(name, fields).settings_class.model_validate(fields)
         except PluginError as exc:
-            if "kind" in given:
+            if "kind" in fields:
                 yield ("outlets", name, "kind"), str(exc)
             else:
                 yield ("outlets", name), f"{exc}; an outlet with another name needs a `kind:`"

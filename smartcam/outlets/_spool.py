@@ -1,4 +1,4 @@
-"""A spool: entries that wait for a far end, in a file that survives a crash of its process."""
+"""Keep entries that wait for a server in a spool: a file that survives a crash of the process."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 Policy: TypeAlias = Literal["drop_oldest", "drop_newest"]
 
 ROW_BYTES = 200
-"""Bytes that an entry takes in the file besides its text, about."""
+"""Approximate number of bytes of an entry in the file, without its text."""
 
 MAX_PLACE = (1 << 63) - 1
-"""The last place that an entry may have."""
+"""Largest place (row number) of an entry."""
 
-MAX_PLACES_AT_ONCE = 1 << 32
-"""Places that must be free after the last one; otherwise the record of it is damaged."""
+MIN_FREE_PLACES = 1 << 32
+"""Least number of free places after the last one. If there are fewer, the file is damaged."""
 
 MAX_REASON_CHARACTERS = 500
-"""Largest number of characters of the reasons of a gap, which may be several gaps in one."""
+"""Largest number of characters of a gap's reasons; several gaps may become one."""
 
 MAX_DAMAGED_FILES = 3
-"""Largest number of damaged spools that are kept beside the new one."""
+"""Largest number of damaged files that are kept in the folder of the spool."""
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS entries(
@@ -70,7 +70,7 @@ def is_damage(error: sqlite3.Error) -> bool:
 
 
 class SpoolHead(NamedTuple):
-    """Entries at the head of the spool, their places, and the spool's epoch."""
+    """The oldest entries of the spool, their places (row numbers), and the spool's epoch."""
 
     places: list[int]
     entries: list[OutletEntry]
@@ -81,11 +81,11 @@ class Spool:
     """A spool in one file; every method blocks, and belongs to one thread at a time.
 
     Args:
-        path: the file; created if it does not exist. A damaged one is put aside, its readable
-            entries are kept, and a gap replaces the others.
+        path: the file; created if it does not exist. A damaged file is renamed; its readable
+            entries are kept in a new file, and a gap replaces the others.
         max_bytes: largest number of bytes of the waiting entries.
-        policy: entries to drop beyond ``max_bytes``: the oldest or the newest; both are counted,
-            and a gap replaces them.
+        policy: entries to drop beyond ``max_bytes``: the oldest or the newest. Dropped entries are
+            counted, and a gap replaces them.
         durable: whether each write is synced, so that entries survive a power failure; otherwise
             they survive only a crash of the process.
 
@@ -94,7 +94,8 @@ class Spool:
         sqlite3.Error: the file cannot be created or written.
 
     Attributes:
-        epoch: number of this start, larger than all earlier ones, also if the clock was set back.
+        epoch: number of this start, larger than those of earlier starts even if the clock was set
+            back.
     """
 
     def __init__(
@@ -106,11 +107,11 @@ class Spool:
         self.epoch: int = 0
         self._counts: dict[str, int] = {}
         self._bytes = self._spooled = 0
-        self._in_flight = 0  # the last place that is being delivered, and so not dropped
+        self._in_flight = 0  # last place that is being delivered; it is not dropped
         self._lock: int | None = None
 
     def open(self) -> None:
-        """Open the file, also after an error."""
+        """Open the file; also after an error closed it."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self._lock is None:
             self._lock = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
@@ -123,23 +124,23 @@ class Spool:
         except sqlite3.Error as exc:
             if not is_damage(exc):
                 raise
-            self._start_anew(str(exc))
-        self._keep_epoch(self.epoch)
+            self._replace_file(str(exc))
+        self._write_epoch(self.epoch)
 
-    def renew(self, why: str) -> None:
-        """Put the damaged file aside, and go on with its readable entries."""
+    def replace_damaged(self, why: str) -> None:
+        """Rename the damaged file, and go on with a new one that has its readable entries."""
         database, self._database = self._database, None
         if database is not None:
             database.close()
-        self._start_anew(why)
+        self._replace_file(why)
 
     @property
     def closed(self) -> bool:
-        """True if the file is not open, also after an error of :meth:`renew`."""
+        """True if the file is not open, as after an error of :meth:`replace_damaged`."""
         return self._database is None
 
     def _connect(self) -> None:
-        database = _connected(self.path)
+        database = _open_connection(self.path)
         try:
             database.execute("PRAGMA journal_mode = WAL")
             database.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'NORMAL'}")
@@ -157,29 +158,31 @@ class Spool:
         self._database = database
 
     def _load(self, database: sqlite3.Connection) -> None:
-        counts = _counts_of(database)
+        counts = _read_counts(database)
         self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
         if not _account(counts, self._spooled).balanced:
             raise sqlite3.DatabaseError("its account does not balance")
-        ((used,),) = database.execute("SELECT COALESCE(MAX(place), 0) FROM entries").fetchall()
-        if not used < _next_place(database):
-            raise sqlite3.DatabaseError(f"place {used} is behind the last one")
-        before, last = counts.get("epoch", 0), self._last_epoch()
-        self.epoch = max(before + 1, last + 1, time.time_ns() // 1000)
+        ((last_place,),) = database.execute(
+            "SELECT COALESCE(MAX(place), 0) FROM entries"
+        ).fetchall()
+        if not last_place < _next_place(database):
+            raise sqlite3.DatabaseError(f"place {last_place} is behind the last one")
+        file_epoch, lock_epoch = counts.get("epoch", 0), self._read_epoch()
+        self.epoch = max(file_epoch + 1, lock_epoch + 1, time.time_ns() // 1000)
         with _transaction(database):
-            if counts.get("running"):  # no end was written: results that waited in memory are lost
+            if counts.get("running"):  # no regular end: results that waited in memory are lost
                 why = "the process ended at once; what came behind the last entry may be missing"
                 for camera, epoch, number in _last_numbers(database):
-                    _add_gap(database, _gap(camera, epoch, number + 1), 0, why, 0)
+                    _add_gap(database, _make_gap(camera, epoch, number + 1), 0, why, 0)
             database.execute("DELETE FROM cameras")
             database.execute("INSERT INTO cameras VALUES ('', ?, 0)", (self.epoch,))
-            if last > before:
+            if lock_epoch > file_epoch:
                 why = "the spool is gone, or older than its last start; what it had is missing"
                 self._add_common_gap(database, 0, why)
-            _set(database, {"epoch": self.epoch, "running": 1})
+            _write_counts(database, {"epoch": self.epoch, "running": 1})
         self._counts = {**counts, "epoch": self.epoch, "running": 1}
 
-    def _last_epoch(self) -> int:
+    def _read_epoch(self) -> int:
         """Return the epoch in the lock file, which remains if the spool is deleted."""
         if self._lock is None:
             return 0
@@ -187,44 +190,44 @@ class Spool:
         text = os.read(self._lock, 20).strip()
         return int(text) if text.isdigit() else 0
 
-    def _keep_epoch(self, epoch: int) -> None:
+    def _write_epoch(self, epoch: int) -> None:
         if self._lock is not None:
             os.lseek(self._lock, 0, os.SEEK_SET)
             os.write(self._lock, b"%20d" % epoch)
 
     def _add_common_gap(self, database: sqlite3.Connection, lost: int, why: str) -> None:
-        """Add a gap of all cameras."""
+        """Add a gap that concerns all cameras."""
         ((_, epoch, number),) = _last_numbers(database, "WHERE camera = ''")
-        gap = _gap("", epoch, number + 1)
-        _add_gap(database, gap, lost, why, self._in_flight, unknown=True)
+        gap = _make_gap("", epoch, number + 1)
+        _add_gap(database, gap, lost, why, self._in_flight, at_least=True)
         database.execute("UPDATE cameras SET number = number + 1 WHERE camera = ''")
 
-    def _start_anew(self, why: str) -> None:
-        """Put a damaged file aside, and keep its readable entries."""
-        saved, counts = _salvaged(self.path)
+    def _replace_file(self, why: str) -> None:
+        """Rename the damaged file, and write its readable entries to a new one."""
+        saved, counts = _salvage(self.path)
         stamp = time.time_ns()
         for suffix in ("", "-wal", "-shm"):
-            part = self.path.with_name(self.path.name + suffix)
-            if part.exists():
-                part.replace(self.path.with_name(f"{self.path.name}.damaged-{stamp}{suffix}"))
-        self._forget_damaged()
-        database = _connected(self.path)
+            file = self.path.with_name(self.path.name + suffix)
+            if file.exists():
+                file.replace(self.path.with_name(f"{self.path.name}.damaged-{stamp}{suffix}"))
+        self._delete_old_damaged()
+        database = _open_connection(self.path)
         with contextlib.closing(database):
             database.execute("PRAGMA journal_mode = WAL")
             database.executescript(_SCHEMA)
             with _transaction(database):
                 self._write(database, saved)
-                lost = _settle(database, counts)
+                lost = _balance(database, counts)
                 epoch = max([counts.get("epoch", 0), *(entry.epoch for entry in saved)])
-                epoch = 1 + max(epoch, self._last_epoch(), time.time_ns() // 1000)
-                _set(database, {**counts, "epoch": epoch, "running": 0})
+                epoch = 1 + max(epoch, self._read_epoch(), time.time_ns() // 1000)
+                _write_counts(database, {**counts, "epoch": epoch, "running": 0})
                 text = f"the spool was damaged ({why}); the file is kept beside it"
-                _add_gap(database, _gap("", epoch, 0), lost, text, 0, unknown=True)
-        self._keep_epoch(epoch)
+                _add_gap(database, _make_gap("", epoch, 0), lost, text, 0, at_least=True)
+        self._write_epoch(epoch)
         self._in_flight = 0
         self._connect()
 
-    def _forget_damaged(self) -> None:
+    def _delete_old_damaged(self) -> None:
         pattern = f"{self.path.name}.damaged-*"
         found = self.path.parent.glob(pattern)
         paths = sorted(path for path in found if path.name[-4:] not in ("-wal", "-shm"))
@@ -246,51 +249,55 @@ class Spool:
         """Write entries, all or none, and gaps before them.
 
         Args:
-            entries: results and errors, and gaps from a source.
-            lost: entries that were dropped from memory: the last one, their number, the reason.
+            entries: results and errors, and gaps that a source reported.
+            lost: entries that were dropped from memory: the last one, their number, and the reason.
 
         Raises:
             sqlite3.Error: the disk is full or unavailable; no entry was written or counted.
         """
         database = self._open_database
-        new = dict(self._counts)
+        counts = dict(self._counts)
         with _transaction(database):
             for last, count, why in lost:
                 _add_gap(database, last, count, why, self._in_flight)
-                new["results"] = new.get("results", 0) + count
-                new["dropped.memory"] = new.get("dropped.memory", 0) + count
+                counts["results"] = counts.get("results", 0) + count
+                counts["dropped.memory"] = counts.get("dropped.memory", 0) + count
             results = sum(entry.kind != "gap" for entry in entries)
-            new["results"] = new.get("results", 0) + results
-            taken = self._room_for(entries) if self._policy == "drop_newest" else len(entries)
-            accepted = entries[:taken]
-            refused = [entry for entry in entries[taken:] if entry.kind != "gap"]
+            counts["results"] = counts.get("results", 0) + results
+            fitting = len(entries)
+            if self._policy == "drop_newest":
+                fitting = self._count_fitting(entries)
+            accepted = entries[:fitting]
+            refused = [entry for entry in entries[fitting:] if entry.kind != "gap"]
             size = self._write(database, accepted)
-            for last, count in _by_camera(refused):
+            for last, count in _last_by_camera(refused):
                 _add_gap(database, last, count, "the spool was full", self._in_flight)
             if refused:
-                new["dropped.full"] = new.get("dropped.full", 0) + len(refused)
-            _remember(database, [*(last for last, _, _ in lost), *entries])
-            gone, freed = self._make_room(database, self._bytes + size, new)
-            _set(database, new)
-        self._counts = new
+                counts["dropped.full"] = counts.get("dropped.full", 0) + len(refused)
+            _write_last_numbers(database, [*(last for last, _, _ in lost), *entries])
+            dropped, freed = self._drop_oldest(database, self._bytes + size, counts)
+            _write_counts(database, counts)
+        self._counts = counts
         self._bytes += size - freed
-        self._spooled += sum(entry.kind != "gap" for entry in accepted) - gone
+        self._spooled += sum(entry.kind != "gap" for entry in accepted) - dropped
 
     def _write(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> int:
-        rows = [_row(entry, place) for place, entry in enumerate(entries, _next_place(database))]
+        rows = [
+            _make_row(entry, place) for place, entry in enumerate(entries, _next_place(database))
+        ]
         database.executemany(_INSERT, rows)
         return sum(row[-2] for row in rows)
 
-    def _room_for(self, entries: Sequence[OutletEntry]) -> int:
+    def _count_fitting(self, entries: Sequence[OutletEntry]) -> int:
         """Return the number of entries for which there is room."""
         room = self._max_bytes - self._bytes
-        for taken, entry in enumerate(entries):
+        for count, entry in enumerate(entries):
             room -= len(entry.body) + ROW_BYTES
             if room < 0:
-                return taken
+                return count
         return len(entries)
 
-    def _make_room(
+    def _drop_oldest(
         self, database: sqlite3.Connection, size: int, counts: dict[str, int]
     ) -> tuple[int, int]:
         """Drop the oldest entries beyond the bound; return their number and their bytes."""
@@ -309,7 +316,7 @@ class Spool:
             freed += size_of
         database.executemany("DELETE FROM entries WHERE place = ?", [(place,) for place in places])
         last_places = {entry.camera: place for entry, place in zip(dropped, places, strict=True)}
-        for last, count in _by_camera(dropped):
+        for last, count in _last_by_camera(dropped):
             place = last_places[last.camera]
             _add_gap(database, last, count, "the spool was full", self._in_flight, place)
         counts["dropped.full"] = counts.get("dropped.full", 0) + len(dropped)
@@ -317,69 +324,71 @@ class Spool:
 
     # ------------------------------------------------------------------ delivering
 
-    def head(self, most: int) -> SpoolHead:
-        """Return the oldest entries, ``most`` at most, which stay in flight until :meth:`done`."""
+    def head(self, max_count: int) -> SpoolHead:
+        """Return the oldest entries, up to ``max_count``; none is dropped before the next call."""
         while True:
-            places, entries, bad = list[int](), list[OutletEntry](), list[int]()
+            places, entries, damaged = list[int](), list[OutletEntry](), list[int]()
             for place, checksum, *fields in self._open_database.execute(
                 f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY place LIMIT ?",  # noqa: S608
-                (most,),
+                (max_count,),
             ):
                 entry = OutletEntry(*fields)
                 if _checksum(entry, place) != checksum:
-                    bad.append(place)
+                    damaged.append(place)
                 else:
                     places.append(place)
                     entries.append(entry)
-            if not bad:
+            if not damaged:
                 self._in_flight = places[-1] if places else 0
                 return SpoolHead(places, entries, self.epoch)
-            self._discard(bad)
+            self._drop_damaged(damaged)
 
-    def _discard(self, places: Sequence[int]) -> None:
-        """Drop damaged entries, and add a gap for them."""
+    def _drop_damaged(self, places: Sequence[int]) -> None:
+        """Drop damaged entries, and add a gap in their place."""
         database, counts = self._open_database, dict(self._counts)
         with _transaction(database):
             database.executemany(
                 "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
             )
-            lost = _settle(database, counts)
+            lost = _balance(database, counts)
             self._add_common_gap(database, lost, "entries of the spool were damaged")
-            _set(database, counts)
+            _write_counts(database, counts)
         self._counts = counts
         self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
 
-    def done(self, waiting: SpoolHead, count: int | None = None, refused: str = "") -> None:
-        """Remove the first ``count`` entries, which the far end accepted; None: all.
+    def remove_delivered(
+        self, head: SpoolHead, count: int | None = None, refused: str = ""
+    ) -> None:
+        """Remove the first ``count`` entries of a head, which the server accepted; None: all.
 
         Args:
-            waiting: entries of :meth:`head`.
+            head: entries from :meth:`head`.
             count: number of accepted entries.
-            refused: reason why the far end refused the next one; "" if it did not.
+            refused: reason why the server refused the next entry; "" if it did not.
         """
         database = self._open_database
-        if waiting.epoch != self.epoch:
-            return  # the spool was renewed meanwhile: they come again, with the same ids
-        taken = len(waiting.places) if count is None else count
-        places, entries = waiting.places[:taken], waiting.entries[:taken]
+        if head.epoch != self.epoch:
+            return  # the file was replaced meanwhile: the entries are delivered again
+        accepted = len(head.places) if count is None else count
+        places, entries = head.places[:accepted], head.entries[:accepted]
         delivered = sum(entry.kind != "gap" for entry in entries)
         counts = {"delivered": self._counts.get("delivered", 0) + delivered}
-        gone = delivered
+        removed = delivered
         with _transaction(database):
             if refused:
-                place, entry = waiting.places[taken], waiting.entries[taken]
+                place, entry = head.places[accepted], head.entries[accepted]
                 places, entries = [*places, place], [*entries, entry]
                 if entry.kind != "gap":
                     counts["dropped.refused"] = self._counts.get("dropped.refused", 0) + 1
-                    gone += 1
+                    removed += 1
             database.executemany(
                 "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
             )
-            _set(database, counts)
+            _write_counts(database, counts)
         self._counts |= counts
         freed = sum(len(entry.body) + ROW_BYTES for entry in entries if entry.kind != "gap")
         self._bytes -= freed
-        self._spooled -= gone
+        self._spooled -= removed
         self._in_flight = 0
 
     # ------------------------------------------------------------------ the account
@@ -391,20 +400,21 @@ class Spool:
 
     @property
     def bytes(self) -> int:
-        """The bytes of entries that wait."""
+        """Number of bytes of the waiting entries."""
         return self._bytes
 
-    def close(self, *, ended: bool = True) -> None:
+    def close(self, *, all_written: bool = True) -> None:
         """Close the file.
 
         Args:
-            ended: whether all waiting entries were written; if not, the next start adds a gap.
+            all_written: whether all waiting entries were written; if not, the next start adds a
+                gap.
         """
         database, self._database = self._database, None
         if database is not None:
-            if ended:
+            if all_written:
                 with contextlib.suppress(sqlite3.Error), _transaction(database):
-                    _set(database, {"running": 0})
+                    _write_counts(database, {"running": 0})
             database.close()
         lock, self._lock = self._lock, None
         if lock is not None:
@@ -412,7 +422,7 @@ class Spool:
 
 
 def read_account(path: Path) -> OutletAccount | None:
-    """Return the account in a spool's file, which a process may be using; None without a file.
+    """Return the account in a spool's file; None without a file. A process may be using the file.
 
     Raises:
         sqlite3.Error: the file cannot be read now.
@@ -421,19 +431,19 @@ def read_account(path: Path) -> OutletAccount | None:
         return None
     with contextlib.closing(open_for_reading(path, timeout=1.0)) as database:
         database.execute("BEGIN")
-        counts = _counts_of(database)
+        counts = _read_counts(database)
         spooled, _ = database.execute(_TOTALS).fetchone()
     return _account(counts, spooled)
 
 
-def _connected(path: Path) -> sqlite3.Connection:
+def _open_connection(path: Path) -> sqlite3.Connection:
     database = open_database(path, timeout=0.5)
-    database.text_factory = _text  # checksums detect damaged texts
+    database.text_factory = _decode_text  # checksums detect damaged texts
     return database
 
 
 def _check_versions(path: Path) -> None:
-    """Check the versions in the file's header: SQLite opens a file with a damaged one read-only.
+    """Check the versions in the file's header, since SQLite opens a wrong version read-only.
 
     Raises:
         sqlite3.DatabaseError: the entries are damaged.
@@ -444,12 +454,12 @@ def _check_versions(path: Path) -> None:
         raise sqlite3.DatabaseError(f"expected the versions 1 or 2, got {versions.hex(' ')}")
 
 
-def _text(data: bytes) -> str:
+def _decode_text(data: bytes) -> str:
     return data.decode(errors="replace")
 
 
-def _counts_of(database: sqlite3.Connection) -> dict[str, int]:
-    """Return the counts.
+def _read_counts(database: sqlite3.Connection) -> dict[str, int]:
+    """Return the counts in the file.
 
     Raises:
         sqlite3.DatabaseError: the entries are damaged.
@@ -469,13 +479,13 @@ def _account(counts: Mapping[str, int], spooled: int) -> OutletAccount:
     return OutletAccount(counts.get("results", 0), counts.get("delivered", 0), spooled, dropped)
 
 
-def _settle(database: sqlite3.Connection, counts: dict[str, int]) -> int:
-    """Make counts balance with the entries in the file; return the number of lost entries."""
+def _balance(database: sqlite3.Connection, counts: dict[str, int]) -> int:
+    """Correct counts so that they fit the entries in the file; return how many entries are lost."""
     spooled, _ = database.execute(_TOTALS).fetchone()
     account = _account(counts, int(spooled))
-    known = account.delivered + account.spooled + sum(account.dropped.values())
-    lost = max(0, account.results - known)  # the counts may be from an older page than the entries
-    counts["results"] = max(account.results, known)
+    accounted = account.delivered + account.spooled + sum(account.dropped.values())
+    lost = max(0, account.results - accounted)  # the counts may be older than the entries
+    counts["results"] = max(account.results, accounted)
     counts["dropped.damaged"] = counts.get("dropped.damaged", 0) + lost
     return lost
 
@@ -492,12 +502,12 @@ def _transaction(database: sqlite3.Connection) -> Iterator[None]:
         raise
 
 
-def _set(database: sqlite3.Connection, new: Mapping[str, int]) -> None:
+def _write_counts(database: sqlite3.Connection, new: Mapping[str, int]) -> None:
     database.executemany("INSERT OR REPLACE INTO counts VALUES (?, ?)", new.items())
 
 
-def _remember(database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> None:
-    """Write the last number of each camera, after which a crash's gap is added."""
+def _write_last_numbers(database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> None:
+    """Write the last number of each camera; after a crash, a gap is added behind it."""
     last = {entry.camera: (entry.camera, entry.epoch, entry.number) for entry in entries}
     database.executemany("INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)", last.values())
 
@@ -507,35 +517,35 @@ def _last_numbers(database: sqlite3.Connection, which: str = "") -> list[tuple[s
 
 
 def _checksum(entry: OutletEntry, place: int) -> int:
-    """Return the checksum of an entry and of its place, which has to be right for the order."""
+    """Return the checksum of an entry and of its place, which decides its order."""
     return zlib.crc32(repr((place, *entry)).encode(errors="backslashreplace"))
 
 
 def _next_place(database: sqlite3.Connection) -> int:
-    """Return the place after all earlier entries' places.
+    """Return the place for the next entry, after the places of all earlier entries.
 
     Raises:
         sqlite3.DatabaseError: the file's record of the last place is damaged.
     """
     row = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
     last = 0 if row is None else row[0]
-    if not isinstance(last, int) or not 0 <= last < MAX_PLACE - MAX_PLACES_AT_ONCE:
+    if not isinstance(last, int) or not 0 <= last < MAX_PLACE - MIN_FREE_PLACES:
         raise sqlite3.DatabaseError(f"expected the last place of an entry, got {last!r:.40}")
     return last + 1
 
 
-def _row(entry: OutletEntry, place: int) -> tuple[Any, ...]:
-    """Return a row of the table."""
+def _make_row(entry: OutletEntry, place: int) -> tuple[Any, ...]:
+    """Return the row of an entry for the table."""
     entry = entry._replace(at=float(entry.at))
     size = 0 if entry.kind == "gap" else len(entry.body) + ROW_BYTES
     return place, *entry, size, _checksum(entry, place)
 
 
-def _gap(camera: str, epoch: int, number: int) -> OutletEntry:
+def _make_gap(camera: str, epoch: int, number: int) -> OutletEntry:
     return OutletEntry(camera, epoch, number, "gap", None, time.time(), "")
 
 
-def _by_camera(entries: Iterable[OutletEntry]) -> list[tuple[OutletEntry, int]]:
+def _last_by_camera(entries: Iterable[OutletEntry]) -> list[tuple[OutletEntry, int]]:
     """Return the last entry of each camera, and the number of the camera's entries."""
     counted: dict[str, tuple[OutletEntry, int]] = {}
     for entry in entries:
@@ -551,20 +561,20 @@ def _add_gap(
     in_flight: int,
     place: int | None = None,
     *,
-    unknown: bool = False,
+    at_least: bool = False,
 ) -> None:
-    """Add a gap, at a free place or at the end; consecutive gaps become one.
+    """Add a gap, at a free place or at the end; join it with the gaps before it.
 
     Args:
         database: the spool.
         last: the last entry that the gap replaces.
-        count: number of entries; 0 if it is unknown.
+        count: number of replaced entries; 0 if it is unknown.
         why: reason.
         in_flight: place up to which entries are being delivered, and must not change.
         place: place of the gap; None: the end.
-        unknown: whether more may be missing than the count.
+        at_least: whether more entries may be missing than ``count``.
     """
-    unknown, gone, reasons = unknown or count == 0, list[tuple[int]](), [why]
+    at_least, joined_places, reasons = at_least or count == 0, list[tuple[int]](), [why]
     for older_place, checksum, *fields in database.execute(
         f"SELECT place, checksum, {_FIELDS} FROM entries "  # noqa: S608
         "WHERE camera = ? AND place > ? AND place <= ? ORDER BY place DESC",
@@ -575,24 +585,26 @@ def _add_gap(
             break
         older = json.loads(entry.body)
         count += older["lost"]
-        unknown = unknown or older["at_least"]
+        at_least = at_least or older["at_least"]
         reasons.append(older["error"])
-        gone.append((older_place,))
-    database.executemany("DELETE FROM entries WHERE place = ?", gone)
-    each = dict.fromkeys(reason for text in reversed(reasons) for reason in text.split("; "))
-    error = "; ".join(each)[:MAX_REASON_CHARACTERS]
-    body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": unknown})
+        joined_places.append((older_place,))
+    database.executemany("DELETE FROM entries WHERE place = ?", joined_places)
+    unique_reasons = dict.fromkeys(
+        reason for text in reversed(reasons) for reason in text.split("; ")
+    )
+    error = "; ".join(unique_reasons)[:MAX_REASON_CHARACTERS]
+    body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": at_least})
     gap = OutletEntry(last.camera, last.epoch, last.number, "gap", None, last.at, body)
-    database.execute(_INSERT, _row(gap, _next_place(database) if place is None else place))
+    database.execute(_INSERT, _make_row(gap, _next_place(database) if place is None else place))
 
 
-def _salvaged(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
+def _salvage(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
     """Return the readable entries and counts of a damaged file."""
     entries, counts = dict[int, OutletEntry](), dict[str, int]()
-    with contextlib.suppress(sqlite3.Error), contextlib.closing(_connected(path)) as database:
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(_open_connection(path)) as database:
         with contextlib.suppress(sqlite3.Error):
-            counts = _counts_of(database)
-        for order in ("place", "place DESC"):  # around a page that cannot be read
+            counts = _read_counts(database)
+        for order in ("place", "place DESC"):  # a page in between may be unreadable
             with contextlib.suppress(sqlite3.Error):
                 for place, checksum, *fields in database.execute(
                     f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY {order}"  # noqa: S608

@@ -1,4 +1,4 @@
-"""A store of results: an SQLite file with a table for each application."""
+"""Store results in an SQLite file, with a table for each application."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MAX_COLUMNS = 500
 
 MAX_COLUMN_CHARACTERS = 100
 
-EXPIRE_SECONDS = 60.0
+EXPIRE_INTERVAL = 60.0
 """Seconds between two searches for results to delete."""
 
 _TABLES = """
@@ -60,9 +60,9 @@ _TYPES = {
     "string": "TEXT",
     "real32": "REAL",
     "real64": "REAL",
-    "uint64": "BLOB",  # keeps values as they are; INTEGER makes a REAL of too many digits
+    "uint64": "BLOB",  # stores values unchanged; INTEGER would make a REAL of a large one
 }
-_OWN = frozenset({"id", "record", "rowid"})
+_OWN_COLUMNS = frozenset({"id", "record", "rowid"})
 
 
 class StoreSettings(OutletSettings):
@@ -82,10 +82,11 @@ class StoreSettings(OutletSettings):
 
 
 class ResultStore(Outlet[StoreSettings]):
-    """Writes results, errors and gaps to an SQLite file; a repeated one is not written twice.
+    """Writes results, errors and gaps to an SQLite file; a repeated entry is not written twice.
 
-    The table ``results`` has a row for everything, ``app_7`` a row for each record of the results
-    of application 7, ``fields`` the types and units of its columns.
+    The table ``results`` has a row for each entry. ``app_7`` has a row for each record of the
+    results of application 7. ``fields`` has the types and units of the columns of all ``app_``
+    tables.
     """
 
     settings_class = StoreSettings
@@ -96,10 +97,10 @@ class ResultStore(Outlet[StoreSettings]):
         super().__init__(name, settings, folder, context)
         self.path = folder / settings.file
         self._file: _StoreFile | None = None
-        self._closing: Future[None] | None = None  # closing of the earlier file
+        self._closing: Future[None] | None = None  # future of the previous file's closing
 
     async def open(self) -> None:
-        """Wait until the earlier file is closed, then open it, and migrate its tables.
+        """Wait until the previous connection is closed, then open the file, and migrate its tables.
 
         Raises:
             ConfigurationError: a newer version of smartcam made the file.
@@ -108,14 +109,14 @@ class ResultStore(Outlet[StoreSettings]):
         if self._closing is not None:  # a slow disk may still be closing it
             await asyncio.wait({asyncio.wrap_future(self._closing)})
         self._file = _StoreFile(self.name, self.path, self.settings, self.context)
-        await _done(self._file.submit(self._file.open))
+        await _wait_for_thread(self._file.submit(self._file.open))
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Write entries, all or none; before an unfit entry, write the preceding ones."""
+        """Write all entries or none; if one is refused, write only the entries before it."""
         file = self._file
         if file is None:
             raise sqlite3.OperationalError("the store is closed")
-        await _done(file.submit(lambda: file.write(entries)))
+        await _wait_for_thread(file.submit(lambda: file.write(entries)))
 
     def stored(self, question: StoreQuestion) -> StoredResults | None:
         """Return the results in the file.
@@ -130,16 +131,16 @@ class ResultStore(Outlet[StoreSettings]):
         file, self._file = self._file, None
         if file is not None:
             self._closing = file.submit(file.close, last=True)
-            await _done(self._closing)
+            await _wait_for_thread(self._closing)
 
 
-async def _done(running: Future[None]) -> None:
-    """Wait for work of a thread, which is finished also if the caller is cancelled."""
+async def _wait_for_thread(running: Future[None]) -> None:
+    """Wait for work of a thread; the thread finishes it even if the caller is cancelled."""
     await asyncio.shield(asyncio.wrap_future(running))
 
 
 class _StoreFile:
-    """An open file: a connection, and the only thread that uses it.
+    """A connection to the store's file, and the only thread that uses the connection.
 
     A disk may block the thread for longer than the outlet waits. The store is opened again only
     when the thread has closed this connection.
@@ -157,12 +158,14 @@ class _StoreFile:
         self.path, self.settings, self.context = path, settings, context
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{name}.store")
         self._database: sqlite3.Connection | None = None
-        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # columns of one batch
-        self._expired = 0.0
-        self._identity: object = None  # identity of the open file
+        self._columns: dict[
+            tuple[str, int], dict[str, str]
+        ] = {}  # columns that are known in one batch
+        self._expired_at = 0.0
+        self._identity: object = None  # device and number of the opened file
 
     def submit(self, work: Callable[[], None], *, last: bool = False) -> Future[None]:
-        """Run work in the thread; with ``last`` the thread ends afterwards."""
+        """Run work in the thread; ``last``: the thread ends afterwards."""
         running = self._thread.submit(work)
         if last:
             self._thread.shutdown(wait=False)
@@ -190,17 +193,17 @@ class _StoreFile:
         if not version:
             database.execute("PRAGMA auto_vacuum = INCREMENTAL")
         database.execute("PRAGMA journal_mode = WAL")
-        database.execute("PRAGMA synchronous = FULL")  # the spool forgets what is written here
+        database.execute("PRAGMA synchronous = FULL")  # the spool deletes what was written here
         with _transaction(database):
             for statement in filter(str.strip, _TABLES.split(";")):
                 database.execute(statement)
             if version == 1:
                 database.execute("ALTER TABLE results ADD COLUMN at_least INTEGER")
             database.execute(f"PRAGMA user_version = {VERSION}")
-        self._identity = self._identity_there()
-        self._expired = 0.0
+        self._identity = self._identity_at_path()
+        self._expired_at = 0.0
 
-    def _identity_there(self) -> object:
+    def _identity_at_path(self) -> object:
         """Return the device and the number of the file at the path; None without one."""
         try:
             status = self.path.stat()
@@ -224,37 +227,37 @@ class _StoreFile:
         except EntryRefusedError as exc:
             self._write_all(database, entries[: exc.place])
             raise
-        if time.monotonic() - self._expired > EXPIRE_SECONDS or not self._expired:
+        if time.monotonic() - self._expired_at > EXPIRE_INTERVAL or not self._expired_at:
             self._expire(database)
-            self._expired = time.monotonic()
+            self._expired_at = time.monotonic()
 
     def _write_all(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> None:
         """Write entries in one transaction.
 
         Raises:
-            EntryRefusedError: an entry fits no table; none is written.
-            OutletError: the file was moved or deleted meanwhile, with these entries.
+            EntryRefusedError: an entry cannot be written; then none is written.
+            OutletError: the file was moved or deleted meanwhile, so these entries are lost.
         """
-        self._columns.clear()  # a layout may have changed, and a transaction been undone
+        self._columns.clear()  # a layout may have changed, or a transaction been rolled back
         with _transaction(database):
-            for place, entry in enumerate(entries):
+            for index, entry in enumerate(entries):
                 try:
                     self._write_one(database, entry)
-                except _UNFIT as exc:
-                    raise EntryRefusedError(text_of(exc), place=place) from exc
-        if self._identity_there() != self._identity:
+                except _REFUSING_ERRORS as exc:
+                    raise EntryRefusedError(text_of(exc), place=index) from exc
+        if self._identity_at_path() != self._identity:
             raise OutletError(f"the store {self.path} was moved or deleted: a new one is begun")
 
     def _write_one(self, database: sqlite3.Connection, entry: OutletEntry) -> None:
-        fields: dict[str, Any] = _readable(json.loads(entry.body))
+        fields: dict[str, Any] = _encodable(json.loads(entry.body))
         value = fields.get("value")
         records = records_of(value)
         row = (
             entry.id,
             *entry[:4],
-            fields.get("received_at") or _time(entry.at),
+            fields.get("received_at") or _time_text(entry.at),
             fields.get("application"),
-            _cell(fields.get("sequence")),
+            _sqlite_value(fields.get("sequence")),
             fields.get("triggered_at"),
             fields.get("latency"),
             fields.get("error"),
@@ -262,14 +265,14 @@ class _StoreFile:
             fields.get("lost"),
             None if value is None else json.dumps(value, separators=(",", ":")),
             None if records is None else len(records),
-            self._picture(entry, fields),
+            self._picture_path(entry, fields),
             fields.get("at_least"),
         )
         marks = ", ".join("?" * len(row))
         written = database.execute(f"INSERT OR IGNORE INTO results VALUES ({marks})", row).rowcount  # noqa: S608
         if not written or entry.application is None or records is None:
             return
-        columns = self._table(database, entry.camera, entry.application, records)
+        columns = self._get_columns(database, entry.camera, entry.application, records)
         names = [*columns]
         cells = ", ".join(f'"{columns[name]}"' for name in names)
         marks = ", ".join("?" * (len(names) + 2))
@@ -277,22 +280,22 @@ class _StoreFile:
             f"INSERT OR IGNORE INTO app_{entry.application}"  # noqa: S608
             f"(id, record{', ' if names else ''}{cells}) VALUES ({marks})",
             [
-                (entry.id, place, *(_cell(record.get(name)) for name in names))
-                for place, record in enumerate(records)
+                (entry.id, number, *(_sqlite_value(record.get(name)) for name in names))
+                for number, record in enumerate(records)
             ],
         )
 
-    def _table(
+    def _get_columns(
         self,
         database: sqlite3.Connection,
         camera: str,
         application: int,
         records: Sequence[Mapping[str, Any]],
     ) -> dict[str, str]:
-        """Return an application's columns by the values' names; make new ones.
+        """Return an application's columns, by the values' names; add missing columns.
 
-        Columns stay if the layout no longer has their value. A value whose type or unit has changed
-        gets a new column, and so does one of a camera with another layout.
+        A column stays if the layout no longer has its value. A value gets a new column if its type
+        or unit has changed, or differs in another camera's layout.
         """
         known = self._columns.get((camera, application))
         if known is None:
@@ -302,32 +305,32 @@ class _StoreFile:
             )
             known = self._columns[camera, application] = {}
             for name, kind, unit in self.context.columns(camera, application):
-                self._column(database, application, known, (name, kind, unit))
+                self._add_column(database, application, known, (name, kind, unit))
         for record in records:
             for name, value in record.items():
                 if name not in known and value is not None:
-                    self._column(database, application, known, (name, _kind(value), ""))
+                    self._add_column(database, application, known, (name, _type_of(value), ""))
         return known
 
-    def _column(
+    def _add_column(
         self,
         database: sqlite3.Connection,
         application: int,
         known: dict[str, str],
-        wanted: Column,
+        value_column: Column,
     ) -> None:
-        """Add the column of a value to the known columns, created if needed."""
-        name, kind, unit = wanted
+        """Find the column of a value, or create it, and add it to the known columns."""
+        name, kind, unit = value_column
         rows = database.execute(
             "SELECT name, column_name, type, unit FROM fields WHERE application = ?", (application,)
         ).fetchall()
-        for of, column, its_kind, its_unit in rows:
-            if (of, _affinity(its_kind), its_unit) == (name, _affinity(kind), unit):
+        for row_name, column, row_kind, row_unit in rows:
+            if (row_name, _affinity(row_kind), row_unit) == (name, _affinity(kind), unit):
                 known[name] = column
                 return
         if len(rows) >= MAX_COLUMNS:
             return
-        taken = {column.lower() for _, column, _, _ in rows} | _OWN
+        taken = {column.lower() for _, column, _, _ in rows} | _OWN_COLUMNS
         column = base = re.sub(r"\W", "_", name)[:MAX_COLUMN_CHARACTERS] or "value"
         if column.lower() in taken:
             column = base = f"{base}_{unit or kind}"
@@ -337,11 +340,11 @@ class _StoreFile:
         database.execute(f'ALTER TABLE app_{application} ADD COLUMN "{column}" {_affinity(kind)}')
         database.execute(
             "INSERT INTO fields VALUES (?, ?, ?, ?, ?, ?)",
-            (application, name, column, kind, unit, _time(time.time())),
+            (application, name, column, kind, unit, _time_text(time.time())),
         )
         known[name] = column
 
-    def _picture(self, entry: OutletEntry, fields: Mapping[str, Any]) -> str | None:
+    def _picture_path(self, entry: OutletEntry, fields: Mapping[str, Any]) -> str | None:
         pattern, folder = self.settings.pictures, self.path.parent
         if pattern is None or entry.kind == "gap":
             return None
@@ -349,9 +352,9 @@ class _StoreFile:
         return None if picture is None else str(picture.relative_to(folder))
 
     def _expire(self, database: sqlite3.Connection) -> None:
-        """Delete results beyond the bounds of age and size, a part at a time."""
+        """Delete the oldest results beyond the bounds of age and size, in small parts."""
         if self.settings.keep is not None:
-            limit = _time(time.time() - self.settings.keep)
+            limit = _time_text(time.time() - self.settings.keep)
             while self._delete(database, "WHERE at < ?", (limit,)):
                 pass
         size = self.settings.keep_size
@@ -360,9 +363,9 @@ class _StoreFile:
                 break
         database.execute("PRAGMA incremental_vacuum").fetchall()
 
-    def _delete(self, database: sqlite3.Connection, which: str, values: Iterable[Any]) -> int:
-        chosen = f"SELECT id FROM results {which} ORDER BY at LIMIT 100"  # noqa: S608
-        ids = database.execute(chosen, (*values,)).fetchall()
+    def _delete(self, database: sqlite3.Connection, condition: str, values: Iterable[Any]) -> int:
+        query = f"SELECT id FROM results {condition} ORDER BY at LIMIT 100"  # noqa: S608
+        ids = database.execute(query, (*values,)).fetchall()
         with _transaction(database):
             for (application,) in database.execute(
                 "SELECT DISTINCT application FROM fields"
@@ -372,18 +375,25 @@ class _StoreFile:
         return len(ids)
 
 
-_UNFIT = (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, sqlite3.DataError)
-"""Errors that an entry causes each time it is written."""
+_REFUSING_ERRORS = (
+    ArithmeticError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    sqlite3.DataError,
+)
+"""Errors that the same entry would cause at each repetition, so that it is refused."""
 
 
-def _readable(value: Any) -> Any:
+def _encodable(value: Any) -> Any:
     """Return a JSON value whose texts can be encoded as UTF-8, with ? for other characters."""
     if isinstance(value, str):
         return value if value.isascii() else value.encode(errors="replace").decode()
     if isinstance(value, dict):
         fields = cast("dict[str, Any]", value)
-        return {_readable(name): _readable(field) for name, field in fields.items()}
-    return [*map(_readable, value)] if isinstance(value, list) else value
+        return {_encodable(name): _encodable(field) for name, field in fields.items()}
+    return [*map(_encodable, value)] if isinstance(value, list) else value
 
 
 def _used_bytes(database: sqlite3.Connection) -> int:
@@ -394,7 +404,7 @@ def _used_bytes(database: sqlite3.Connection) -> int:
     return int((pages - free) * size)
 
 
-def _kind(value: Any) -> str:
+def _type_of(value: Any) -> str:
     if isinstance(value, bool):
         return "bool"
     if isinstance(value, int):
@@ -406,15 +416,15 @@ def _affinity(kind: str) -> str:
     return _TYPES.get(kind, "INTEGER")
 
 
-def _cell(value: Any) -> Any:
+def _sqlite_value(value: Any) -> Any:
     if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
-        return str(value)  # a uint64 that SQLite has no integer for
+        return str(value)  # too large for an integer of SQLite
     if value is None or isinstance(value, (int, float, str)):
         return value
     return json.dumps(value, separators=(",", ":"))
 
 
-def _time(at: float) -> str:
+def _time_text(at: float) -> str:
     from datetime import UTC, datetime
 
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="microseconds")

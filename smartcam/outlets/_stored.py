@@ -1,4 +1,4 @@
-"""Queries to a store of results: failures of a shift, and missing results."""
+"""Query a store of results: failures since a time, and missing results."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ READ_TIMEOUT = 20.0
 """Seconds of the timeout of a query."""
 
 STEPS_BETWEEN_CHECKS = 10_000
-"""Steps of SQLite's machine between two checks of the time."""
+"""Number of steps of SQLite's virtual machine between two checks of the time."""
 
 COLUMNS = (
     *("id", "camera", "kind", "at", "application", "sequence", "latency"),
     *("error", "lost", "at_least", "value", "picture"),
 )
-"""Columns of a row that is shown."""
+"""Columns of a returned row."""
 
 
 class StoreQuestion(NamedTuple):
@@ -34,7 +34,7 @@ class StoreQuestion(NamedTuple):
 
     Attributes:
         since: earliest time; None for all rows.
-        failed: whether only errors, gaps and results that did not pass are shown.
+        failed: whether only errors, gaps and results that did not pass are returned.
         camera: name or pattern of the cameras; ``**`` for all.
         most: largest number of rows; the newest rows are returned.
     """
@@ -52,12 +52,13 @@ class StoredResults(NamedTuple):
         rows: rows, the oldest first: ``id``, ``camera``, ``kind``, ``at``,
             ``application``, ``sequence``, ``latency``, ``error``, ``lost``, ``at_least``,
             ``value``, ``picture``.
-        total: results, errors and gaps of the time and the cameras, shown or not.
-        failed: number of them that are errors, gaps, or did not pass.
+        total: number of results, errors and gaps that match time and cameras, also of those that
+            are not in ``rows``.
+        failed: number of errors, gaps, and results that did not pass.
         errors: number of errors.
         gaps: number of gaps.
         lost: number of results that the gaps replace.
-        at_least: whether more may be lost than the gaps count.
+        at_least: whether more results may be lost than ``lost``.
     """
 
     rows: list[dict[str, Any]]
@@ -84,38 +85,38 @@ def read_store(path: Path, question: StoreQuestion) -> StoredResults:
     """
     if not path.is_file():
         raise ConfigurationError(f"results {path}: there is no such file")
-    end = time.monotonic() + READ_TIMEOUT
+    deadline = time.monotonic() + READ_TIMEOUT
     try:
         with contextlib.closing(open_for_reading(path, timeout=5.0)) as database:
-            database.set_progress_handler(lambda: time.monotonic() > end, STEPS_BETWEEN_CHECKS)
-            return _read(database, question)
+            database.set_progress_handler(lambda: time.monotonic() > deadline, STEPS_BETWEEN_CHECKS)
+            return _query(database, question)
     except sqlite3.Error as exc:
         raise ConfigurationError(f"results {path}: expected a store of results: {exc}") from exc
 
 
-def _read(database: sqlite3.Connection, question: StoreQuestion) -> StoredResults:
+def _query(database: sqlite3.Connection, question: StoreQuestion) -> StoredResults:
     database.create_function(
         "chosen", 1, lambda name: name == "" or chosen((question.camera,), name)
     )
-    bad = _failure_condition(database)
-    which, values = ["1"], list[Any]()
+    failed_condition = _failure_condition(database)
+    conditions, values = ["1"], list[Any]()
     if question.since is not None:
-        which.append("at >= ?")
+        conditions.append("at >= ?")
         values.append(question.since.astimezone(UTC).isoformat(timespec="microseconds"))
     if question.camera != "**":
-        which.append("chosen(camera)")  # a gap of all cameras belongs to each one
-    of = " AND ".join(which)
-    shown = f"{of} AND {bad}" if question.failed else of
+        conditions.append("chosen(camera)")  # a gap of all cameras belongs to each one
+    condition = " AND ".join(conditions)
+    row_condition = f"{condition} AND {failed_condition}" if question.failed else condition
     columns = ", ".join(COLUMNS)
     rows = database.execute(
-        f"SELECT * FROM (SELECT rowid, {columns} FROM results WHERE {shown} "  # noqa: S608
+        f"SELECT * FROM (SELECT rowid, {columns} FROM results WHERE {row_condition} "  # noqa: S608
         "ORDER BY at DESC, rowid DESC LIMIT ?) ORDER BY at, rowid",
         (*values, question.most),
     ).fetchall()
     total, failed, errors, gaps, lost, at_least = database.execute(
-        f"SELECT COUNT(*), COUNT(*) FILTER (WHERE {bad}), "  # noqa: S608
+        f"SELECT COUNT(*), COUNT(*) FILTER (WHERE {failed_condition}), "  # noqa: S608
         "COUNT(*) FILTER (WHERE kind = 'error'), COUNT(*) FILTER (WHERE kind = 'gap'), "
-        f"COALESCE(SUM(lost), 0), COALESCE(MAX(at_least), 0) FROM results WHERE {of}",
+        f"COALESCE(SUM(lost), 0), COALESCE(MAX(at_least), 0) FROM results WHERE {condition}",
         values,
     ).fetchone()
     records = [dict(zip(COLUMNS, row[1:], strict=True)) for row in rows]
@@ -128,13 +129,13 @@ def _failure_condition(database: sqlite3.Connection) -> str:
     for application, name, column in database.execute(
         "SELECT application, name, column_name FROM fields WHERE type = 'bool'"
     ):
-        good = meaning(name)
-        if good is not None:
+        good_value = meaning(name)
+        if good_value is not None:
             quoted = column.replace('"', '""')
-            conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good)}')
+            conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good_value)}')
     clauses = [
-        f"id IN (SELECT id FROM app_{int(application)} WHERE {' OR '.join(each)})"  # noqa: S608
-        for application, each in conditions.items()
+        f"id IN (SELECT id FROM app_{int(application)} WHERE {' OR '.join(tests)})"  # noqa: S608
+        for application, tests in conditions.items()
     ]
-    either = " OR ".join(["kind != 'result'", *clauses])
-    return f"({either})"
+    condition = " OR ".join(["kind != 'result'", *clauses])
+    return f"({condition})"

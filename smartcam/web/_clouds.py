@@ -1,8 +1,8 @@
-"""The site that shows the newest cloud to its viewers.
+"""Show the newest cloud of points to the viewers of a site.
 
-Each viewer has a WebSocket, with one cloud on the way at a time: when the page reports that it has
-shown the last cloud, the newest one is sent. A cloud is sent as it lies in memory, in parts, so
-that the event loop runs meanwhile. A large cloud is thinned for the page, with a note.
+Each viewer has a WebSocket, which transfers one cloud at a time: when the page reports that it has
+shown the last cloud, the newest one is sent. The bytes of a cloud are sent in parts, so that the
+event loop can do other work between them. The page gets fewer points of a large cloud, and says so.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_CLOUD_POINTS: Final = 1_000_000
-"""Largest number of points of a cloud that are sent to a page; a cloud of more is thinned."""
+"""Largest number of points of a cloud that are sent to a page; a larger cloud is thinned."""
 
 MAX_VIEWERS: Final = 8
-"""Largest number of pages open at a time; each may have a cloud of 15 MB on the way."""
+"""Largest number of pages open at a time. A cloud of 15 MB may be in transfer to each."""
 
 PROTOCOL: Final = "smartcam.cloud"
 """Subprotocol of the WebSockets that send clouds."""
@@ -44,11 +44,13 @@ SHOW_TIMEOUT: Final = 60.0
 Up: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
-class _Packed(NamedTuple):
+class _PackedCloud(NamedTuple):
     """A cloud in the form in which it is sent."""
 
-    about: dict[str, Any]
-    body: bytes  # float32 x, y, z of all points, then uint8 red, green, blue of all, if there are
+    fields: dict[str, Any]
+    body: (
+        bytes  # float32 x, y, z of all points, then uint8 red, green, blue of all if it has colours
+    )
 
 
 class CloudSite(ThreadedSite):
@@ -88,16 +90,16 @@ class CloudSite(ThreadedSite):
         self._up = up
         self._cloud: Cloud = Cloud(np.empty((0, 3)))
         self._number = 0  # number of the cloud; 0: none yet
-        self._newer = asyncio.Event()
-        self._packing: tuple[int, asyncio.Future[_Packed]] | None = None
+        self._cloud_shown = asyncio.Event()
+        self._packing_job: tuple[int, asyncio.Future[_PackedCloud]] | None = None
         if cloud is not None:
             self.show(cloud)
 
     def show(self, cloud: Cloud) -> None:
-        """Show a cloud in place of the last one, from the event loop's thread.
+        """Show a cloud instead of the last one; call it in the event loop's thread.
 
-        A viewer gets it as soon as it has shown the last one; a cloud that is replaced before that
-        is skipped. It is thinned and packed in a thread.
+        A viewer gets the cloud as soon as its page has shown the last one. A cloud that is replaced
+        before that is skipped. Clouds are thinned and packed in a thread.
 
         Raises:
             ConfigurationError: the value is no cloud.
@@ -106,8 +108,8 @@ class CloudSite(ThreadedSite):
             raise ConfigurationError(f"show: expected a Cloud, got {type(cloud).__name__}")
         self._cloud = cloud
         self._number += 1
-        self._newer.set()
-        self._newer = asyncio.Event()
+        self._cloud_shown.set()
+        self._cloud_shown = asyncio.Event()
 
     async def stop(self) -> None:
         """Close the port, and end the viewers."""
@@ -116,22 +118,22 @@ class CloudSite(ThreadedSite):
         try:
             await super().stop()
         finally:
-            self._packing = None
+            self._packing_job = None
 
-    async def newer(self, number: int) -> tuple[int, _Packed]:
-        """Return the newest cloud after a number, packed once for all viewers, and its number.
+    async def newer(self, number: int) -> tuple[int, _PackedCloud]:
+        """Wait for a cloud after a number; return its number, and the cloud packed for all viewers.
 
-        Cancellation: safe; other callers that wait for the cloud get it.
+        Cancellation: safe; other callers that wait for the cloud still get it.
         """
         while self._number <= number:
-            await self._newer.wait()
-        if self._packing is None or self._packing[0] != self._number:
+            await self._cloud_shown.wait()
+        if self._packing_job is None or self._packing_job[0] != self._number:
             loop = asyncio.get_running_loop()
-            made = loop.run_in_executor(self._threads, packed, self._cloud)
-            made.add_done_callback(_mark_handled)
-            self._packing = (self._number, made)
-        packed_number, job = self._packing
-        return packed_number, await asyncio.shield(job)
+            future = loop.run_in_executor(self._threads, pack_cloud, self._cloud)
+            future.add_done_callback(_mark_retrieved)
+            self._packing_job = (self._number, future)
+        packed_number, future = self._packing_job
+        return packed_number, await asyncio.shield(future)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the cloud and the number of viewers, as values for JSON."""
@@ -144,24 +146,24 @@ class CloudSite(ThreadedSite):
         }
 
 
-def _mark_handled(made: asyncio.Future[_Packed]) -> None:
-    if not made.cancelled():
-        made.exception()  # the callers may be gone
+def _mark_retrieved(future: asyncio.Future[_PackedCloud]) -> None:
+    if not future.cancelled():
+        future.exception()  # asyncio would log an error that no caller retrieves
 
 
-def packed(cloud: Cloud) -> _Packed:
-    """Return a cloud in its form for sending, thinned if it is large; call it in a thread.
+def pack_cloud(cloud: Cloud) -> _PackedCloud:
+    """Return a cloud as it is sent, thinned if it is large; call it in a thread.
 
-    If that fails, the reason is sent instead.
+    If that fails, return the reason as what is sent.
     """
     try:
-        return _packed(cloud)
+        return _pack_points(cloud)
     except (MemoryError, ConfigurationError) as exc:
-        return _Packed({"failure": str(exc) or type(exc).__name__, "bytes": 0}, b"")
+        return _PackedCloud({"failure": str(exc) or type(exc).__name__, "bytes": 0}, b"")
 
 
-def _packed(cloud: Cloud) -> _Packed:
-    thin, size = thinned(cloud, MAX_CLOUD_POINTS)
+def _pack_points(cloud: Cloud) -> _PackedCloud:
+    thin, size = thin_cloud(cloud, MAX_CLOUD_POINTS)
     columns = [thin.points.astype("<f4", copy=False).tobytes()]
     if thin.colours is not None:
         columns.append(thin.colours.tobytes())
@@ -171,7 +173,7 @@ def _packed(cloud: Cloud) -> _Packed:
         if len(thin)
         else ([0.0] * 3, [0.0] * 3)
     )
-    about = {
+    fields = {
         "points": len(thin),
         "of": len(cloud),
         "voxel": size,
@@ -180,49 +182,49 @@ def _packed(cloud: Cloud) -> _Packed:
         "high": high,
         "bytes": len(body),
     }
-    return _Packed(about, body)
+    return _PackedCloud(fields, body)
 
 
-def thinned(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
+def thin_cloud(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
     """Return a cloud of at most ``most`` points, and the voxels' size in metres if thinned."""
     if len(cloud) <= most:
         return cloud, None
-    reach = float(np.ptp(cloud.points.astype(np.float64), axis=0).max())
+    extent = float(np.ptp(cloud.points.astype(np.float64), axis=0).max())
     # not below the precision of float32 at this distance from the origin
-    size = max(reach / 1024, 1e-6 * float(np.abs(cloud.points).max()), 1e-9)
+    size = max(extent / 1024, 1e-6 * float(np.abs(cloud.points).max()), 1e-9)
     while len(thin := voxel_grid(cloud, size)) > most:
         size *= max(1.05, (len(thin) / most) ** 0.5)  # a surface has about 1 / size**2 voxels
     return thin, size
 
 
 class CloudViewer(PageSocket):
-    """The WebSocket of a page that shows the cloud."""
+    """The WebSocket that sends clouds to a page."""
 
     def __init__(self, site: CloudSite, request: web.Request) -> None:
-        # the heartbeat frees the place of a page that vanished
+        # the heartbeat ends the connection of a page that vanished
         super().__init__(request, PROTOCOL, "cloud", heartbeat=SHOW_TIMEOUT)
         self._site = site
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show clouds until the page goes."""
+        """Send clouds until the page is closed."""
         self._site.viewers.add(self)
         try:
             return await super().serve()
         finally:
             self._site.viewers.discard(self)
 
-    async def _show(self) -> None:
-        """Send the newest cloud, and wait until the page shows it; TimeoutError: too late."""
+    async def _send_messages(self) -> None:
+        """Send each new cloud when the page has shown the last one; TimeoutError: too slow."""
         number = 0
         while True:
             number, cloud = await self._site.newer(number)
-            self._shown.clear()
+            self._was_shown.clear()
             async with asyncio.timeout(SHOW_TIMEOUT):
-                await self._socket.send_str(json.dumps({"number": number, **cloud.about}))
+                await self._socket.send_str(json.dumps({"number": number, **cloud.fields}))
                 for start in range(0, len(cloud.body), PART_BYTES):
                     await self._socket.send_bytes(cloud.body[start : start + PART_BYTES])
                     await asyncio.sleep(0)
-                await self._shown.wait()
+                await self._was_shown.wait()
 
 
 # ---------------------------------------------------------------------- calls

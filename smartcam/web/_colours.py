@@ -1,8 +1,9 @@
-"""The site on which a colour is picked: the picture of a camera beside the mask of a range.
+"""Serve the site on which a range of colours is picked in a camera's picture.
 
-A page asks for each picture when it has shown the last one, so one is on its way at a time, and a
-slow page skips pictures. The pictures that a page shows are kept for it: a click is about such a
-picture, not about the newest one, and another range is shown at once without a new picture.
+Next to the picture, the page shows the mask: which pixels are in the range. A page asks for the
+next picture when it has shown the last one, so a slow page skips pictures. The last pictures of
+each page are kept: a click on a pixel is about such a picture, not about the newest one, and the
+mask of another range is shown without a new picture.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from smartcam._extras import load
 from smartcam.depth import ColourRange, find_regions
 from smartcam.depth._inside import hsv
 from smartcam.exceptions import ConfigurationError, FrameSourceError, LocalProtocolError
-from smartcam.web._errors import RefusedError, shown
+from smartcam.web._errors import RefusedError, short_repr
 from smartcam.web._jpeg import jpeg, require_encoder
 from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API
@@ -32,17 +33,17 @@ if TYPE_CHECKING:
 
     from smartcam.frames import Frame, FrameSource
 
-MAX_LOOKS: Final = 16
-"""Largest number of pictures that are asked for at a time: two for each of eight viewers."""
+MAX_WAITING_REQUESTS: Final = 16
+"""Largest number of requests that wait for a frame at a time: two of each of eight viewers."""
 
 MAX_VIEWERS_KEPT: Final = 8
 """Largest number of viewers whose pictures are kept."""
 
 PICTURES_PER_VIEWER: Final = 2
-"""Pictures kept for each viewer: the shown one, and the one on its way."""
+"""Number of pictures kept for each viewer: the shown one, and the one in transfer."""
 
 THREADS: Final = 2
-"""Threads that make pictures and masks."""
+"""Number of threads that make pictures and masks."""
 
 MIN_REGION_SHARE: Final = 2e-3
 """Least share of the picture that a region must fill to be reported."""
@@ -104,7 +105,7 @@ class ColourSite(ThreadedSite):
         self.source: FrameSource = source
         self.colours: ColourRange = ColourRange() if colours is None else colours
         self._quality = quality
-        self._looks = 0
+        self._waiting_count = 0
         self._pictures: OrderedDict[str, deque[Frame]] = OrderedDict()
 
     async def stop(self) -> None:
@@ -118,11 +119,11 @@ class ColourSite(ThreadedSite):
         """Return the next frame of the source, and keep it for a viewer.
 
         Raises:
-            RefusedError: there is no frame, or too many wait for one.
+            RefusedError: there is no frame, or too many requests wait for one.
         """
         name = self.source.name
         try:
-            with self._one_more():
+            with self._count_waiting():
                 async with self.source.reader() as reader:
                     frame = await anext(reader)
         except LocalProtocolError as exc:
@@ -131,15 +132,15 @@ class ColourSite(ThreadedSite):
             raise RefusedError(409, str(exc), "a source that gives frames") from exc
         except StopAsyncIteration:
             raise RefusedError(410, f"{name} has ended", "one that goes on") from None
-        queue = self._pictures.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
-        queue.append(frame)
+        frames = self._pictures.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
+        frames.append(frame)
         self._pictures.move_to_end(viewer)
         while len(self._pictures) > MAX_VIEWERS_KEPT:
             self._pictures.popitem(last=False)
         return frame
 
     def kept_frame(self, viewer: str, sequence: int | None = None) -> Frame:
-        """Return the last frame that a viewer got, or the one with a number.
+        """Return the last frame that a viewer got, or its frame with a sequence number.
 
         Raises:
             RefusedError: the frame is no longer kept.
@@ -164,16 +165,16 @@ class ColourSite(ThreadedSite):
             raise RefusedError(409, str(exc), "a frame that can be read") from exc
 
     def segmented(self, frame: Frame, colours: ColourRange) -> bytes:
-        """Return a frame in the page's form; call it in a thread, since it takes milliseconds.
+        """Return a frame and its mask as the page reads them; call it in a thread: it is slow.
 
         Returns:
-            The length of the JSON in four bytes, the lowest first, the JSON, a JPEG of the frame
-            and a PNG of the mask; ``jpeg`` in the JSON is the length of the JPEG.
+            The length of the JSON as four bytes (little-endian), the JSON, a JPEG of the frame, and
+            a PNG of the mask. ``jpeg`` in the JSON is the length of the JPEG.
 
         Raises:
             FrameFormatError: the frame's bytes are wrong.
         """
-        picture = jpeg(frame, self._quality)
+        jpeg_data = jpeg(frame, self._quality)
         mask = colours.mask_hsv(hsv(frame))
         _, png = load("cv2").imencode(".png", mask.view(np.uint8) * 255)
         regions = find_regions(mask, area=(MIN_REGION_SHARE * mask.size, np.inf), most=MAX_REGIONS)
@@ -197,21 +198,23 @@ class ColourSite(ThreadedSite):
                 }
                 for region in regions
             ],
-            "jpeg": len(picture),
+            "jpeg": len(jpeg_data),
         }
         head = json.dumps(values).encode()
-        return b"".join((len(head).to_bytes(4, "little"), head, picture, png.tobytes()))
+        return b"".join((len(head).to_bytes(4, "little"), head, jpeg_data, png.tobytes()))
 
     @contextlib.contextmanager
-    def _one_more(self) -> Iterator[None]:
-        """Count a viewer that waits for a frame."""
-        if self._looks >= MAX_LOOKS:
-            raise RefusedError(503, f"picture {MAX_LOOKS + 1}", f"{MAX_LOOKS} at one time")
-        self._looks += 1
+    def _count_waiting(self) -> Iterator[None]:
+        """Count a request that waits for a frame in the block; refuse it if there are too many."""
+        if self._waiting_count >= MAX_WAITING_REQUESTS:
+            raise RefusedError(
+                503, f"picture {MAX_WAITING_REQUESTS + 1}", f"{MAX_WAITING_REQUESTS} at one time"
+            )
+        self._waiting_count += 1
         try:
             yield
         finally:
-            self._looks -= 1
+            self._waiting_count -= 1
 
 
 # ---------------------------------------------------------------------- calls
@@ -298,6 +301,6 @@ async def _around(site: ColourSite, call: CallRequest) -> object:
     frame = site.kept_frame(body.viewer, body.sequence)
     if not (0 <= body.x < frame.width and 0 <= body.y < frame.height):
         size = f"{frame.width}x{frame.height}"
-        raise RefusedError(422, f"pixel {shown((body.x, body.y))}", f"one within {size}")
+        raise RefusedError(422, f"pixel {short_repr((body.x, body.y))}", f"one within {size}")
     colours = await site.work(ColourRange.around, frame, body.x, body.y)
     return {"range": asdict(colours)}

@@ -1,4 +1,4 @@
-"""The emulator's site: its page, and an HTTP call for every action of the page."""
+"""Define the emulator's site: its page, and an HTTP call for every action of the page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from smartcam.emulator.faults import Fault
 from smartcam.exceptions import ConfigurationError
 from smartcam.web import _serialize as serialize
 from smartcam.web._errors import RefusedError
-from smartcam.web._feed import Watcher
+from smartcam.web._feed import EmulatorWatcher
 from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API, Site
 from smartcam.web._streams import is_open
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from smartcam.emulator import TableScene, WireCamera
 
 MAX_ENTRIES = 1000
-"""Largest number of log entries in one answer; ``next`` is where to continue."""
+"""Largest number of log entries in one answer; its ``next`` is the serial to continue with."""
 
 MAX_WAIT = 30.0
 """Seconds that a call may wait for a log entry."""
 
 MAX_WAITING_CHANGES = 16
-"""Largest number of calls that may wait for a log entry at a time: together with the event streams,
-half of the places."""
+"""Largest number of calls that may wait for a log entry at the same time. Together with the event
+streams they take half of the connections."""
 
 LOG_POLL_INTERVAL = 0.02
-"""Seconds between two looks for a log entry."""
+"""Seconds between two checks for a new log entry."""
 
 MAX_PARTS = 100
 """Largest number of parts on a table; a result container has room for about 900 localizations."""
@@ -49,7 +49,7 @@ class EmulatorSite(Site):
     """A page and HTTP calls that show and control emulated cameras.
 
     The site runs in the emulators' own event loop. Emulators may be started and stopped at any
-    time; each call looks into the mapping anew.
+    time: each call looks up the camera in the mapping.
 
     ::
 
@@ -80,29 +80,29 @@ class EmulatorSite(Site):
                 raise ConfigurationError(f"web: {name!r} cannot stand in a path: name the camera")
         super().__init__(CALLS, "emulator", host=host, port=port, token=token)
         self.cameras: Mapping[str, WireCamera] = cameras
-        self._waiting = 0
+        self._waiting_count = 0
 
     async def wait_for(
         self, request: web.Request, condition: Callable[[], bool], seconds: float
     ) -> None:
-        """Wait until a condition holds, at most so long, and while site and client are there.
+        """Wait until a condition is true, the time is over, or the site or the client is gone.
 
         Raises:
             RefusedError: 503, :data:`MAX_WAITING_CHANGES` calls wait already.
         """
-        if self._waiting >= MAX_WAITING_CHANGES:
+        if self._waiting_count >= MAX_WAITING_CHANGES:
             raise RefusedError(
                 503, f"waiting call {MAX_WAITING_CHANGES + 1}", f"{MAX_WAITING_CHANGES} at one time"
             )
-        self._waiting += 1
+        self._waiting_count += 1
         try:
             loop = asyncio.get_running_loop()
             deadline = loop.time() + seconds
             while loop.time() < deadline and is_open(request) and not condition():
-                if await self.streams.pause(LOG_POLL_INTERVAL):
+                if await self.streams.wait_closing(LOG_POLL_INTERVAL):
                     break
         finally:
-            self._waiting -= 1
+            self._waiting_count -= 1
 
 
 # ---------------------------------------------------------------------- arguments of calls
@@ -141,16 +141,16 @@ class _PartPose(CallBody):
     theta: float = Field(default=0.0, ge=-1000, le=1000, allow_inf_nan=False)
 
 
-class _Place(BaseModel):
-    """Place in the log at which a query begins."""
+class _LogStart(BaseModel):
+    """The serial of the log entry at which an answer begins."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
     since: int | None = Field(default=None, ge=0, le=2**63 - 1)
 
 
-class _Part(_Place):
-    """The part of the log that a query wants."""
+class _LogQuery(_LogStart):
+    """A query for a part of the log."""
 
     limit: int = Field(default=MAX_ENTRIES, ge=1, le=MAX_ENTRIES)
     wait: float = Field(default=0.0, ge=0, le=MAX_WAIT, allow_inf_nan=False)
@@ -171,7 +171,7 @@ CALLS: Calls[EmulatorSite] = Calls()
 _CAMERA = f"{API}/cameras/{{camera}}"
 
 
-def _name(site: EmulatorSite, call: CallRequest) -> str:
+def _camera_name(site: EmulatorSite, call: CallRequest) -> str:
     name = call.path["camera"]
     if name not in site.cameras:
         known = list(site.cameras)
@@ -183,15 +183,15 @@ def _name(site: EmulatorSite, call: CallRequest) -> str:
 
 
 def _emulator(site: EmulatorSite, call: CallRequest) -> WireCamera:
-    return site.cameras[_name(site, call)]
+    return site.cameras[_camera_name(site, call)]
 
 
-def _operator(site: EmulatorSite, call: CallRequest, action: str) -> Any:
-    """Return a method of the camera's operator; RefusedError: the camera does not have it."""
+def _device_method(site: EmulatorSite, call: CallRequest, action: str) -> Any:
+    """Return a method of an operator at the camera; RefusedError: the camera does not have it."""
     emulator = _emulator(site, call)
     if not hasattr(emulator.device, action):
-        able = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
-        raise RefusedError(409, f"{action} of a camera that speaks {emulator.dialect}", able)
+        abilities = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
+        raise RefusedError(409, f"{action} of a camera that speaks {emulator.dialect}", abilities)
     return getattr(emulator.device, action)
 
 
@@ -220,7 +220,7 @@ def _cameras(site: EmulatorSite, _ask: CallRequest) -> object:
 @CALLS.add("GET", _CAMERA)
 def _state(site: EmulatorSite, call: CallRequest) -> object:
     """The whole state of one camera."""
-    name = _name(site, call)
+    name = _camera_name(site, call)
     emulator = site.cameras[name]
     return {
         **serialize.camera_state(name, emulator),
@@ -232,21 +232,21 @@ def _state(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("POST", f"{_CAMERA}/trigger")
 def _trigger(site: EmulatorSite, call: CallRequest) -> object:
     """Trigger by the digital input; `taken`: whether an inspection began."""
-    taken = _operator(site, call, "trigger")()
+    taken = _device_method(site, call, "trigger")()
     return {"taken": taken, "camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/start")
 def _start(site: EmulatorSite, call: CallRequest) -> object:
     """Enter run mode."""
-    _operator(site, call, "start")()
+    _device_method(site, call, "start")()
     return {"camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/stop")
 def _stop(site: EmulatorSite, call: CallRequest) -> object:
     """Leave run mode."""
-    _operator(site, call, "stop")()
+    _device_method(site, call, "stop")()
     return {"camera": _state(site, call)}
 
 
@@ -255,13 +255,13 @@ def _stop(site: EmulatorSite, call: CallRequest) -> object:
 )
 def _application(site: EmulatorSite, call: CallRequest) -> object:
     """Load another application, like an operator; 409 while another is being loaded."""
-    switch, emulator = _operator(site, call, "switch_application"), _emulator(site, call)
-    wanted: _ApplicationBody = call.body
-    if wanted.id not in emulator.application_ids:
+    switch, emulator = _device_method(site, call, "switch_application"), _emulator(site, call)
+    body: _ApplicationBody = call.body
+    if body.id not in emulator.application_ids:
         known = ", ".join(str(ident) for ident in emulator.application_ids)
-        field = {"field": "id", "came": str(wanted.id), "expected": f"one of {known}"}
-        raise RefusedError(422, f"application {wanted.id}", f"one of {known}", (field,))
-    if not switch(wanted.id, running=wanted.running):
+        field = {"field": "id", "came": str(body.id), "expected": f"one of {known}"}
+        raise RefusedError(422, f"application {body.id}", f"one of {known}", (field,))
+    if not switch(body.id, running=body.running):
         mode = emulator.device.mode
         state = getattr(mode, "value", mode)
         raise RefusedError(409, f"the camera is {state}", "it to be stopped or running")
@@ -271,15 +271,15 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("POST", f"{_CAMERA}/reboot", body=_RebootBody, optional=True, sample='{"seconds": 0.5}')
 def _reboot(site: EmulatorSite, call: CallRequest) -> object:
     """Restart the camera, as by its power switch; without a body, by the quirk's setting."""
-    wanted: _RebootBody = call.body
-    _operator(site, call, "reboot")(wanted.seconds)
+    body: _RebootBody = call.body
+    _device_method(site, call, "reboot")(body.seconds)
     return {"camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/conditions", body=_Conditions, sample='{"overheat": true}')
 def _conditions(site: EmulatorSite, call: CallRequest) -> object:
     """Set or clear Overheat and System Error."""
-    set_condition = _operator(site, call, "set_condition")
+    set_condition = _device_method(site, call, "set_condition")
     for name, bit in CONDITIONS.items():
         on = getattr(call.body, name)
         if on is not None:
@@ -290,8 +290,8 @@ def _conditions(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("POST", f"{_CAMERA}/endian", body=_Endian, sample='{"endian": 1}')
 def _endian(site: EmulatorSite, call: CallRequest) -> object:
     """Byte order of results: 0 little, 1 big."""
-    wanted: _Endian = call.body
-    _operator(site, call, "set_endian")(wanted.endian)
+    body: _Endian = call.body
+    _device_method(site, call, "set_endian")(body.endian)
     return {"camera": _state(site, call)}
 
 
@@ -355,8 +355,8 @@ def _put_part(site: EmulatorSite, call: CallRequest) -> object:
         )
     if name not in pieces and len(pieces) >= MAX_PARTS:
         raise RefusedError(422, f"part {MAX_PARTS + 1}", f"{MAX_PARTS} parts on a table at most")
-    wanted: _PartPose = call.body
-    pieces[name] = TablePose(wanted.x, wanted.y, wanted.theta)
+    body: _PartPose = call.body
+    pieces[name] = TablePose(body.x, body.y, body.theta)
     return _scene(site, call)
 
 
@@ -379,7 +379,7 @@ def _reset_scene(site: EmulatorSite, call: CallRequest) -> object:
     return _scene(site, call)
 
 
-@CALLS.add("GET", f"{_CAMERA}/log", query=_Part)
+@CALLS.add("GET", f"{_CAMERA}/log", query=_LogQuery)
 async def _log(site: EmulatorSite, call: CallRequest) -> object:
     """Log entries from serial `?since=` on, `?limit=` at most; `next` is the serial to go on with.
 
@@ -388,11 +388,11 @@ async def _log(site: EmulatorSite, call: CallRequest) -> object:
     emulator, part = _emulator(site, call), call.query
     since: int = part.since or 0
 
-    def came() -> bool:
+    def has_entry() -> bool:
         return bool(emulator.log.since(since, 1)[0])
 
     if part.wait:
-        await site.wait_for(call.request, came, part.wait)
+        await site.wait_for(call.request, has_entry, part.wait)
     return serialize.log_part(emulator, since, part.limit)[0]
 
 
@@ -422,13 +422,13 @@ def _clear_log(site: EmulatorSite, call: CallRequest) -> object:
     f"{_CAMERA}/events",
     about="What happens, as server-sent events: `camera`, `scene`, `faults`, `log`, `clock`; "
     "the log from `?since=` on, else from now.",
-    query=_Place,
+    query=_LogStart,
 )
 def _events(site: EmulatorSite, call: CallRequest) -> object:
-    name = _name(site, call)
+    name = _camera_name(site, call)
     since: int | None = call.query.since
     last = call.request.headers.get("Last-Event-ID", "")
     if since is None and last.isdecimal() and len(last) < 20:
         since = int(last)
-    watcher = Watcher(name, site.cameras[name], since)
-    return site.streams.serve(call.request, watcher.look)
+    watcher = EmulatorWatcher(name, site.cameras[name], since)
+    return site.streams.serve(call.request, watcher.find_events)

@@ -16,28 +16,28 @@ MAX_SHOWN_CHARACTERS = 200
 
 @dataclass(eq=False)
 class RefusedError(Exception):
-    """A call cannot be carried out."""
+    """A call cannot be carried out; the text says what was received, and what was expected."""
 
     status: int  # the HTTP status code
-    came: str
+    received: str
     expected: str
-    # ``field``, ``came`` and ``expected`` of each wrong field
+    # of each wrong field: ``field``, ``came`` (the received value) and ``expected``
     fields: tuple[dict[str, str], ...] = ()
     headers: Mapping[str, str] = field(default_factory=dict[str, str])  # headers of the answer
 
-    def as_json(self, tried: str) -> dict[str, Any]:
-        """Return the answer's body; ``tried`` is method and path of the call."""
+    def as_json(self, call: str) -> dict[str, Any]:
+        """Return the answer's body; ``call``: method and path of the call."""
         answer = {
-            "error": f"{tried}: {self.came}; expected {self.expected}",
-            "tried": tried,
-            "came": self.came,
+            "error": f"{call}: {self.received}; expected {self.expected}",
+            "tried": call,
+            "came": self.received,
             "expected": self.expected,
         }
         return {**answer, "fields": self.fields} if self.fields else answer
 
 
-def shown(value: object) -> str:
-    """Return a value as text, cut after :data:`MAX_SHOWN_CHARACTERS` characters."""
+def short_repr(value: object) -> str:
+    """Return a value's ``repr()``, cut after :data:`MAX_SHOWN_CHARACTERS` characters."""
     text = repr(value)
     return text if len(text) <= MAX_SHOWN_CHARACTERS else f"{text[:MAX_SHOWN_CHARACTERS]}..."
 
@@ -56,7 +56,7 @@ def wrong_fields_error(error: ValidationError) -> RefusedError:
     fields = tuple(
         {
             "field": ".".join(str(part) for part in item["loc"]),
-            "came": "nothing" if item["type"] == "missing" else shown(item["input"]),
+            "came": "nothing" if item["type"] == "missing" else short_repr(item["input"]),
             "expected": _expected(item["type"], item["msg"]),
         }
         for item in error.errors(include_url=False)

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from smartcam.web._fleet_rows import FleetRow
     from smartcam.web._fleet_view import FleetView
 
-PERIOD: Final = 0.2
+CHECK_PERIOD: Final = 0.2
 """Seconds between two checks of the failing rows."""
 
 CAMERA_PERIOD: Final = 10.0
-"""Seconds that must pass between two pictures of one camera."""
+"""Least number of seconds between two pictures of one camera."""
 
-NEWER_RESULT_TIMEOUT: Final = 0.2
-"""Seconds after a picture within which a newer result may still arrive, if the camera had one."""
+NEWER_RESULT_DELAY: Final = 0.2
+"""Seconds to wait, after a picture, for a newer result that the camera may already have."""
 
 MAX_BYTES: Final = 1 << 28
 """Largest number of bytes that the pictures of all cameras may have together."""
@@ -31,8 +31,8 @@ MAX_PICTURES: Final = 10_000
 class FailurePictures:
     """Asks failing cameras for their pictures, one after the other.
 
-    A picture is kept only if no newer result has come when it arrives: otherwise it might show
-    another part.
+    A picture is kept only if no newer result has arrived with it: otherwise it might show another
+    part.
 
     Args:
         view: view of the fleet, which has the failing rows.
@@ -47,7 +47,7 @@ class FailurePictures:
         """Fetch pictures until the task is cancelled."""
         loop = asyncio.get_running_loop()
         while True:
-            await asyncio.sleep(PERIOD)
+            await asyncio.sleep(CHECK_PERIOD)
             for row in list(self._view.failing):
                 if loop.time() - row.picture_at < CAMERA_PERIOD:
                     continue
@@ -64,13 +64,13 @@ class FailurePictures:
             data = await camera.read_image()
         except SmartCamError:
             return  # the live page shows the camera's error
-        await asyncio.sleep(NEWER_RESULT_TIMEOUT)
+        await asyncio.sleep(NEWER_RESULT_DELAY)
         if row.failure != serial:
             return
-        row.history.attach(serial, data)
+        row.history.attach_picture(serial, data)
         self._attached.append((row, serial, len(data)))
         self._bytes += len(data)
         while self._bytes > MAX_BYTES or len(self._attached) > MAX_PICTURES:
-            oldest, number, size = self._attached.popleft()
-            oldest.history.drop_picture(number)
+            oldest_row, oldest_serial, size = self._attached.popleft()
+            oldest_row.history.drop_picture(oldest_serial)
             self._bytes -= size

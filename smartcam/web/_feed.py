@@ -1,11 +1,11 @@
-"""Find the changes of an emulated camera, and new entries of its log, for one event stream."""
+"""Find the changes of an emulated camera, and new entries of its log, for an event stream."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from smartcam.web import _serialize as serialize
-from smartcam.web._streams import PERIOD, News
+from smartcam.web._streams import PERIOD, StreamEvent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,14 +18,15 @@ MAX_LOG_NEWS = 200
 MAX_FAULTS_TOLD = 100
 """Largest number of faults that one event reports."""
 
-CLOCK_LOOKS = round(1.0 / PERIOD)
-"""Looks between two reports of the clock, one a second; a report also detects a closed reader."""
+LOOKS_PER_CLOCK = round(1.0 / PERIOD)
+"""Number of looks for changes between two reports of the clock, which come once a second. A report
+also detects a reader that is gone."""
 
 
-class Watcher:
-    """The state of a camera as one reader knows it.
+class EmulatorWatcher:
+    """Knows what one reader has received about a camera, and finds later changes.
 
-    ``since`` is the serial of the first log entry to send; None: only new entries.
+    ``since``: serial of the first log entry to send; None: only new entries.
     """
 
     def __init__(self, name: str, emulator: WireCamera, since: int | None = None) -> None:
@@ -33,38 +34,40 @@ class Watcher:
         self._emulator = emulator
         self._serial = serialize.log_count(emulator) if since is None else since
         self._last_values: dict[str, Any] = {}
-        self._looks = 0
+        self._look_count = 0
 
-    def look(self) -> Iterator[News]:
-        """Yield the changes since the last look; the first look yields everything but the log."""
+    def find_events(self) -> Iterator[StreamEvent]:
+        """Yield the changes since the last call; the first call yields everything but the log."""
         emulator = self._emulator
-        log = self._log()
-        yield from self._changed("camera", serialize.camera_state(self._name, emulator))
+        log = self._log_event()
+        yield from self._event_if_changed("camera", serialize.camera_state(self._name, emulator))
         if emulator.table is not None:
-            yield from self._changed("scene", serialize.scene_state(emulator, emulator.table))
-        if self._changed_faults():
-            yield News("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
+            yield from self._event_if_changed(
+                "scene", serialize.scene_state(emulator, emulator.table)
+            )
+        if self._faults_changed():
+            yield StreamEvent("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
         if log is not None:
             yield log
-        if self._looks % CLOCK_LOOKS == 0:
-            yield News("clock", serialize.times(emulator))
-        self._looks += 1
+        if self._look_count % LOOKS_PER_CLOCK == 0:
+            yield StreamEvent("clock", serialize.times(emulator))
+        self._look_count += 1
 
-    def _changed(self, kind: str, value: Any) -> Iterator[News]:
+    def _event_if_changed(self, kind: str, value: Any) -> Iterator[StreamEvent]:
         if self._last_values.get(kind) != value:
             self._last_values[kind] = value
-            yield News(kind, value)
+            yield StreamEvent(kind, value)
 
-    def _changed_faults(self) -> bool:
+    def _faults_changed(self) -> bool:
         fired = self._emulator.fired
-        now = (self._emulator.faults, len(fired), fired[-1] if fired else None)
-        before, self._last_values["faults"] = self._last_values.get("faults"), now
-        return now != before
+        current = (self._emulator.faults, len(fired), fired[-1] if fired else None)
+        previous, self._last_values["faults"] = self._last_values.get("faults"), current
+        return current != previous
 
-    def _log(self) -> News | None:
+    def _log_event(self) -> StreamEvent | None:
         emulator = self._emulator
         part, entries = serialize.log_part(emulator, self._serial, MAX_LOG_NEWS)
-        self._serial = part["next"]  # an earlier emulator's serial may have been higher
+        self._serial = part["next"]  # lower than before if another emulator began
         if not entries and not part["missed"]:
             return None
-        return News("log", part, self._serial)
+        return StreamEvent("log", part, self._serial)

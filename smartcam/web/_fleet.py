@@ -1,4 +1,4 @@
-"""The site of a fleet: a table of all its cameras, and a live page for each."""
+"""Define the site of a fleet: a table of all its cameras, and a live page for each."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from smartcam.web._routes import Action
 
 MAX_VIEWERS: Final = 32
-"""Largest number of pages of the table open at one time."""
+"""Largest number of open pages with the table."""
 
 MAX_CAMERAS: Final = 16
-"""Largest number of cameras that may have a page of their own open at one time."""
+"""Largest number of cameras whose own page is open, or was shortly before."""
 
 LINGER: Final = 30.0
-"""Seconds that a camera is followed after its own page has no viewer any more."""
+"""Seconds for which a camera is still followed after its own page has no viewer any more."""
 
 VIEWER_CHECK_PERIOD: Final = 1.0
 """Seconds between two checks for viewers."""
@@ -115,7 +115,7 @@ class FleetSite(Site):
         try:
             await self.view.start()
             if not self._tasks:
-                jobs = (self._keep(), FailurePictures(self.view).run())
+                jobs = (self._update_live_cameras(), FailurePictures(self.view).run())
                 self._tasks = [asyncio.create_task(job, name="smartcam.web.fleet") for job in jobs]
             await super().start()
         except BaseException:
@@ -154,13 +154,13 @@ class FleetSite(Site):
         Raises:
             RefusedError: 404, no camera has this name; 503, there are :data:`MAX_CAMERAS` already.
         """
-        known = self._live.get(name)
-        if known is None:
-            known = self._followed(name)
-        known.used_at = asyncio.get_running_loop().time()
-        return known
+        live = self._live.get(name)
+        if live is None:
+            live = self._follow_camera(name)
+        live.used_at = asyncio.get_running_loop().time()
+        return live
 
-    def _followed(self, name: str) -> WatchedCamera:
+    def _follow_camera(self, name: str) -> WatchedCamera:
         try:
             camera = self.fleet[name]
         except ConfigurationError as exc:
@@ -173,22 +173,22 @@ class FleetSite(Site):
         self._live[name] = live
         live.start()
         if row is not None and row.last is not None:
-            live.view.show(row.last)
+            live.view.add_result(row.last)
         return live
 
-    async def _keep(self) -> None:
-        """Leave cameras without viewers, and follow new objects of the others."""
+    async def _update_live_cameras(self) -> None:
+        """Stop following cameras without viewers; follow the new object of a replaced camera."""
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(VIEWER_CHECK_PERIOD)
             for name, live in list(self._live.items()):
-                if not live.watched and loop.time() - live.used_at > LINGER:
+                if not live.is_watched and loop.time() - live.used_at > LINGER:
                     del self._live[name]
                     await live.stop()
                     continue
                 camera = live.view.camera
-                if (now := self.fleet[name]) is not camera:
-                    await live.view.follow(now, live.view.loss)
+                if (current := self.fleet[name]) is not camera:
+                    await live.view.follow(current, live.view.loss)
 
 
 # ---------------------------------------------------------------------- calls
@@ -218,10 +218,10 @@ def _fleet(site: FleetSite, _call: CallRequest) -> object:
     "`sort`, `down`.",
 )
 async def _cameras(site: FleetSite, call: CallRequest) -> object:
-    sight: RowsInSight = call.query
-    names = (await site.view.ordered(sight.query)).names
+    rows_in_sight: RowsInSight = call.query
+    names = (await site.view.get_order(rows_in_sight.query)).names
     cameras: list[dict[str, Any]] = []
-    for name in names[sight.first : sight.first + sight.count]:
+    for name in names[rows_in_sight.first : rows_in_sight.first + rows_in_sight.count]:
         row = site.view.rows.get(name)
         if row is not None:  # the camera was not forgotten meanwhile
             cameras.append(row.fields())
@@ -262,8 +262,8 @@ async def _stored(site: FleetSite, call: CallRequest) -> object:
     return {"stores": [answer._asdict() for answer in await site.outlets.stored(call.query)]}
 
 
-def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
-    """Return a handler that acts on the camera in the path."""
+def _act_on_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
+    """Return a handler that acts on the camera whose name is in the path."""
 
     def handle(site: FleetSite, call: CallRequest) -> object:
         return handler(site.live(call.path["camera"]), call)
@@ -272,12 +272,12 @@ def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
 
 
 def _add_live_calls() -> None:
-    """Add the live page's calls for each camera."""
+    """Add the calls of the live page, with the camera's name in the path."""
     for row in LIVE_CALLS:
         if row.path == API:
             continue
         tail = row.path.removeprefix(API).removeprefix("/camera")
-        CALLS.adopt(row, f"{API}/cameras/{{camera}}{tail}", _of_camera(row.handler))
+        CALLS.add_row(row, f"{API}/cameras/{{camera}}{tail}", _act_on_camera(row.handler))
 
 
 _add_live_calls()

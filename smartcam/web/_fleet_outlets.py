@@ -1,4 +1,4 @@
-"""Outlets on a fleet's page: agents are asked once for all viewers."""
+"""Ask agents for their outlets, once for all viewers of a fleet's page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ANSWER_AGE: Final = 2.0
 """Seconds for which one answer is used for all pages."""
 
 MAX_STORE_QUESTIONS: Final = 4
-"""Largest number of questions to the stores at a time."""
+"""Largest number of questions to the stores that are under way."""
 
 
 class StoredQuery(BaseModel):
@@ -43,8 +43,8 @@ class OutletsView:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._accounts: list[ReportedOutlet] = []
-        self._at = -ANSWER_AGE
-        self._turn = asyncio.Lock()
+        self._asked_at = -ANSWER_AGE
+        self._lock = asyncio.Lock()
         self._store_questions = asyncio.Semaphore(MAX_STORE_QUESTIONS)
 
     async def accounts(self) -> list[ReportedOutlet]:
@@ -54,26 +54,26 @@ class OutletsView:
             RefusedError: 503, the fleet is closed.
         """
         loop = asyncio.get_running_loop()
-        async with self._turn:
-            if loop.time() - self._at >= ANSWER_AGE:
+        async with self._lock:
+            if loop.time() - self._asked_at >= ANSWER_AGE:
                 try:
                     self._accounts = await self._fleet.outlets()
                 except ConnectionClosedError as exc:
                     raise RefusedError(503, str(exc)[:300], expected="an open fleet") from exc
-                self._at = loop.time()
+                self._asked_at = loop.time()
             return self._accounts
 
-    async def stored(self, wanted: StoredQuery) -> list[ReportedStore]:
+    async def stored(self, query: StoredQuery) -> list[ReportedStore]:
         """Return the answers of the stores.
 
         Raises:
             RefusedError: 422, the pattern is not valid; 503, the fleet is closed.
         """
-        since = datetime.now(UTC) - timedelta(hours=wanted.hours)
+        since = datetime.now(UTC) - timedelta(hours=query.hours)
         async with self._store_questions:
             try:
                 return await self._fleet.stored_results(
-                    wanted.camera, since=since, failed=wanted.failed, most=wanted.most
+                    query.camera, since=since, failed=query.failed, most=query.most
                 )
             except ConfigurationError as exc:
                 raise RefusedError(422, str(exc)[:300], expected="a pattern of cameras") from exc

@@ -1,4 +1,4 @@
-"""Keep the row of a camera on the fleet's page: its state, its counts, its last result."""
+"""Keep the row of a camera in the table of a fleet: its state, its counts, its last result."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from smartcam.exceptions import InterpretationError, SmartCamError
 from smartcam.layout._inside import ShownUnits
 from smartcam.models import Status
 from smartcam.web._history import ShiftHistory
-from smartcam.web._live_view import layout_of, shown_value
-from smartcam.web._verdicts import Outcome, judged
+from smartcam.web._live_view import layout_of, value_fields
+from smartcam.web._verdicts import Outcome, outcome_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,26 +26,27 @@ if TYPE_CHECKING:
     from smartcam.streams import BatchSubscription, Subscription
 
 MAX_QUEUE: Final = 64
-"""Largest number of a camera's results that wait for the next update; others are only counted."""
+"""Largest number of a camera's results that wait for the next update; older ones are only
+counted."""
 
 MAX_QUEUE_BYTES: Final = 1 << 18
 """Largest number of bytes of the waiting results of a camera."""
 
 MAX_KEPT_BYTES: Final = 1 << 16
-"""Largest number of bytes of a result that is kept for its picture; of a longer result only the
+"""Largest number of bytes of a result whose contents a row shows; of a longer result only the
 length is shown."""
 
-MAX_DRAWN: Final = 30
-"""Largest number of parts of a result in its picture."""
+MAX_DRAWN_PARTS: Final = 30
+"""Largest number of parts of a result that a row draws."""
 
 MAX_TEXT_CHARACTERS: Final = 160
 """Largest number of characters of a text in a row."""
 
 RATE_SECONDS: Final = 5
-"""Seconds over which a rate is counted."""
+"""Number of seconds from which a rate is computed."""
 
 ERROR_MARK_SECONDS: Final = 60.0
-"""Seconds for which a camera keeps the mark of an error."""
+"""Seconds for which a row shows an error."""
 
 OUTCOMES: Final[tuple[Outcome, ...]] = ("passed", "failed", "other", "errors")
 
@@ -57,7 +58,7 @@ never connected.
 """
 
 SI: Final = ShownUnits()
-"""Units for texts in SI."""
+"""Units for texts in SI: no other units are shown."""
 
 _ERRORS: Final = Status.SYSTEM_ERROR | Status.OVERHEAT
 
@@ -66,7 +67,7 @@ class RowState(NamedTuple):
     """The state of a camera."""
 
     connected: bool
-    over: bool  # whether the camera was given up
+    has_ended: bool  # whether the camera was given up
     status: Status
     application: int | None
     reason: str  # reason why it is not connected
@@ -82,7 +83,7 @@ class FleetRow:
 
     Args:
         name: name of the camera.
-        ring: function that is called with the row when the row may have changed.
+        on_change: callback with the row, when the row may have changed.
         units: units that the page can show instead of SI.
 
     Attributes:
@@ -99,12 +100,12 @@ class FleetRow:
         error_at: time of the last error, on the loop's clock.
         history: outcomes and failures of the last hours.
         changed_at: time at which the camera was last connected or lost, seconds since 1970.
-        changed_seen: False if ``changed_at`` is only the time of the first update, since the change
-            came earlier.
+        changed_seen: False if ``changed_at`` is only the time of the first update; the change
+            itself was earlier.
         picture_at: time of the last try to get the picture of a failure, on the loop's clock.
     """
 
-    def __init__(self, name: str, ring: Callable[[FleetRow], None], units: ShownUnits) -> None:
+    def __init__(self, name: str, on_change: Callable[[FleetRow], None], units: ShownUnits) -> None:
         self.name: str = name
         self.agents: set[str] = set()
         self.camera: FleetCamera[Any] | None = None
@@ -122,9 +123,9 @@ class FleetRow:
         self.changed_at: float = time.time()
         self.changed_seen: bool = False
         self.picture_at: float = -math.inf
-        self._ring = ring
+        self._on_change = on_change
         self._units = units
-        self._counted = (0, 0)  # numbers of missed and dropped results
+        self._last_lost_counts = (0, 0)  # numbers of missed and dropped results at the last count
         self._last: Result[Any] | None = None
         self._layout: Layout | None = None  # layout of the last result
         self._counts_by_second: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
@@ -140,44 +141,44 @@ class FleetRow:
         """Follow a camera object, which may replace a camera that was given up."""
         if self.camera is camera:
             return
-        self.leave()
+        self.stop_following()
         self.camera = camera
-        ring = functools.partial(self._ring, self)
+        on_result = functools.partial(self._on_change, self)
         self._results = camera.results(
             batch=True, max_queue=MAX_QUEUE, max_queue_bytes=MAX_QUEUE_BYTES
         )
         self._events = camera.events(max_queue=1)
-        # every new result or event rings, so nothing needs to wait for them
-        self._results.share(_RowBell(ring))
+        # every new result or event causes a call, so that no task waits for them
+        self._results.share(_RowBell(on_result))
         self._events.share(_RowBell(self.note_change))
         self.note_change()
 
     def note_change(self) -> None:
         """Note that the row may have changed."""
         self.may_have_changed = True
-        self._ring(self)
+        self._on_change(self)
 
-    def leave(self) -> None:
-        """Stop following the camera; a second call does nothing."""
+    def stop_following(self) -> None:
+        """Stop following the camera. Idempotent."""
         for stream in (self._results, self._events):
             if stream is not None:
                 stream.close()
         self._results = self._events = self.camera = None
-        self._counted = (0, 0)
+        self._last_lost_counts = (0, 0)
 
     # ------------------------------------------------------------------ updates
 
-    async def take(self, now: float) -> collections.Counter[str]:
-        """Count the new results and return their outcomes; never wait."""
+    async def count_results(self, now: float) -> collections.Counter[str]:
+        """Count the new results, and return the numbers of their outcomes; never wait."""
         outcomes: collections.Counter[str] = collections.Counter()
-        stream, full = self._results, False
+        stream, was_full = self._results, False
         while stream is not None and stream.waiting:
             try:
                 batch = await anext(stream)
             except InterpretationError as exc:
                 outcomes["errors"] += 1
                 self.errors += 1
-                self._note(str(exc), now)
+                self._mark_error(str(exc), now)
                 self.history.add_error(str(exc))
                 continue
             except (StopAsyncIteration, SmartCamError):
@@ -185,22 +186,22 @@ class FleetRow:
             outcomes.update(self.history.add(result) for result in batch)
             self._last = batch[-1]
             self._layout = None if self.camera is None else layout_of(self.camera, self._last)
-            full |= len(batch) >= MAX_QUEUE
+            was_full |= len(batch) >= MAX_QUEUE
         self.count += outcomes.total()
-        if full:
-            self.account(outcomes, now)
+        if was_full:
+            self.count_lost_results(outcomes, now)
         return outcomes
 
-    def account(self, outcomes: collections.Counter[str], now: float) -> None:
-        """Count lost and dropped results; each has the outcome "other"."""
+    def count_lost_results(self, outcomes: collections.Counter[str], now: float) -> None:
+        """Count missed results as errors, and dropped results as "other", in ``outcomes``."""
         if self._results is None:
             return
-        account, before = self._results.statistics(), self._counted
-        self._counted = (account.missed, account.dropped)
-        missed, dropped = account.missed - before[0], account.dropped - before[1]
+        account, last_counts = self._results.statistics(), self._last_lost_counts
+        self._last_lost_counts = (account.missed, account.dropped)
+        missed, dropped = account.missed - last_counts[0], account.dropped - last_counts[1]
         if missed:
             text = f"{missed} results did not come: the agent was out of reach for too long"
-            self._note(text, now)
+            self._mark_error(text, now)
             self.history.add_missed(missed, text)
             outcomes["errors"] += missed
             self.errors += missed
@@ -208,7 +209,7 @@ class FleetRow:
             outcomes["other"] += dropped
         self.count += missed + dropped
 
-    def _note(self, error: str, now: float) -> None:
+    def _mark_error(self, error: str, now: float) -> None:
         self.error, self.error_at = error[:MAX_TEXT_CHARACTERS], now
 
     def refresh(self, now: float) -> tuple[bool, bool]:
@@ -219,22 +220,28 @@ class FleetRow:
         if connected != self._connected:
             self.changed_at, self.changed_seen = time.time(), self._state is not UNKNOWN
         self._connected, self.may_have_changed = connected, False
-        status, application, reason, over = Status(0), None, "", False
+        status, application, reason, has_ended = Status(0), None, "", False
         if camera is not None:
-            over = camera.ended
+            has_ended = camera.ended
             if connected:
                 application = camera.active_application
                 status = status if application is None else camera.status
             else:
-                reason = _why(camera)
+                reason = _loss_reason(camera)
         if lost:
-            self._note(reason or "lost", now)
+            self._mark_error(reason or "lost", now)
             self.history.add_loss(reason or "no agent shares the camera")
             self.errors += 1
         elif self.error_at is not None and now - self.error_at >= ERROR_MARK_SECONDS:
             self.error, self.error_at = "", None
         state = RowState(
-            connected, over, status, application, reason, self.error, tuple(sorted(self.agents))
+            connected,
+            has_ended,
+            status,
+            application,
+            reason,
+            self.error,
+            tuple(sorted(self.agents)),
         )
         if state == self._state:
             return False, False
@@ -243,17 +250,17 @@ class FleetRow:
         return True, lost
 
     def _describe(self, state: RowState) -> None:
-        """Set the words that describe the state."""
-        self.mode = self._word(state)
-        self.flags = _flags(self.mode, state, bad=self.error_at is not None)
+        """Set mode, flags and searched text from the state."""
+        self.mode = self._mode_of(state)
+        self.flags = _flags(self.mode, state, has_error=self.error_at is not None)
         words = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
         self.text = "\n".join(str(word) for word in words if word is not None).lower()
 
-    def _word(self, state: RowState) -> str:
+    def _mode_of(self, state: RowState) -> str:
         if not state.agents or self.camera is None:
             return "gone"
         if not state.connected:
-            if state.over:
+            if state.has_ended:
                 return "ended"
             return "awaited" if self.camera.active_application is None else "lost"
         if state.status & _ERRORS:
@@ -263,16 +270,16 @@ class FleetRow:
         return "running" if state.status & Status.RUNNING else "stopped"
 
     def update_rate(self) -> bool:
-        """Compute the rate once per second; return whether it will change by itself."""
+        """Compute the rate, once per second; return whether it will change without new results."""
         self._counts_by_second.append(self.count)
         self.rate = (self.count - self._counts_by_second[0]) / (len(self._counts_by_second) - 1)
         return self._counts_by_second[0] != self.count
 
     @property
     def failure(self) -> int:
-        """Serial number of the failure that is the newest result; 0 if that is no failure."""
-        behind = self._results is None or self._results.waiting
-        return 0 if behind else self.history.last_failure
+        """Serial of the newest result if it is a failure; 0 if it is not, or is not counted yet."""
+        has_uncounted = self._results is None or self._results.waiting
+        return 0 if has_uncounted else self.history.last_failure
 
     # ------------------------------------------------------------------ for the page
 
@@ -287,7 +294,7 @@ class FleetRow:
         return self._last.received_at.timestamp() if self._last is not None else 0.0
 
     def as_json(self) -> str:
-        """Return the row as JSON, made once for all pages."""
+        """Return the row as JSON, which is made once for all pages."""
         if self._json[0] != self.version:
             self._json = (self.version, json.dumps(self.fields(), separators=(",", ":")))
         return self._json[1]
@@ -305,7 +312,7 @@ class FleetRow:
             "rate": round(self.rate, 1),
             "count": self.count,
             "errors": self.errors,
-            "last": None if self._last is None else self._pictured(self._last),
+            "last": None if self._last is None else self._result_fields(self._last),
             "changed_at": round(self.changed_at),
             "changed_seen": self.changed_seen,
             "failed_since": self.history.failed_since,
@@ -314,7 +321,7 @@ class FleetRow:
             "trend": self.history.trend(),
         }
 
-    def _pictured(self, result: Result[Any]) -> dict[str, Any]:
+    def _result_fields(self, result: Result[Any]) -> dict[str, Any]:
         """Return a result as a row shows it: lines of text, or parts to be drawn.
 
         ``text`` is in SI, ``practical`` in the units that the page can show instead.
@@ -322,15 +329,15 @@ class FleetRow:
         fields: dict[str, Any] = {
             "at": round(result.received_at.timestamp(), 2),
             "number": result.number,
-            "outcome": judged(result.value),
+            "outcome": outcome_of(result.value),
         }
         if len(result.raw) > MAX_KEPT_BYTES:
             return {**fields, "text": f"{len(result.raw)} bytes"}
-        value = shown_value(result.value, self._layout)
+        value = value_fields(result.value, self._layout)
         if "parts" in value:
             parts = [
                 [part["name"][:40], *(round(part[key], 5) for key in ("x", "y", "theta"))]
-                for part in value["parts"][:MAX_DRAWN]
+                for part in value["parts"][:MAX_DRAWN_PARTS]
                 if None not in (part["x"], part["y"], part["theta"])
             ]
             return {**fields, "parts": parts, "parts_count": value["count"]}
@@ -343,7 +350,7 @@ class FleetRow:
         return {**fields, **{name: text[:MAX_TEXT_CHARACTERS] for name, text in lines.items()}}
 
 
-def _why(camera: FleetCamera[Any]) -> str:
+def _loss_reason(camera: FleetCamera[Any]) -> str:
     """Return the reason why a camera is not connected, from its agent if there is one."""
     trouble = camera.trouble
     if trouble is None:
@@ -352,24 +359,24 @@ def _why(camera: FleetCamera[Any]) -> str:
 
 
 class _RowBell(asyncio.Event):
-    """Calls a function instead of waking a task."""
+    """An event that calls a function instead of waking a task."""
 
-    def __init__(self, ring: Callable[[], None]) -> None:
+    def __init__(self, callback: Callable[[], None]) -> None:
         super().__init__()
-        self._call = ring
+        self._call = callback
 
     def set(self) -> None:
         self._call()
 
 
-def _flags(mode: str, state: RowState, *, bad: bool) -> frozenset[str]:
+def _flags(mode: str, state: RowState, *, has_error: bool) -> frozenset[str]:
     status, connected = state.status, state.connected
-    inspecting = bool(status & Status.RUNNING) and not status & Status.WAITING_FOR_TRIGGER
+    is_inspecting = bool(status & Status.RUNNING) and not status & Status.WAITING_FOR_TRIGGER
     flags = {
         "all": True,
         "connected": connected,
-        "errors": bad or not connected or mode == "error",
-        "busy": connected and (inspecting or bool(status & Status.BUSY)),
+        "errors": has_error or not connected or mode == "error",
+        "busy": connected and (is_inspecting or bool(status & Status.BUSY)),
         "stopped": mode == "stopped",
     }
     return frozenset(name for name, on in flags.items() if on)

@@ -1,4 +1,4 @@
-"""A viewer of the fleet's page, which gets the changes of the rows in sight."""
+"""Serve the WebSocket of a fleet's page, which gets the changes of the rows in sight."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ MAX_MESSAGE_BYTES: Final = 1024
 """Largest number of bytes of a message from a page."""
 
 ALIVE_INTERVAL: Final = 5.0
-"""Seconds after which a page gets a message even without changes, which shows a live link."""
+"""Seconds after which a page gets a message even without changes, so that it knows that the link is
+alive."""
 
 QUICK_INTERVAL: Final = 0.05
 """Seconds that must pass between two messages to a page that scrolls or searches."""
 
 ROWS_PER_TURN: Final = 10
-"""Rows that are converted to JSON before other tasks of the loop have a turn."""
+"""Largest number of rows that are converted to JSON in one turn of the event loop."""
 
 TOTALS_INTERVAL: Final = 1.0
 """Seconds between two messages with the totals of all cameras."""
@@ -74,59 +75,65 @@ class FleetSocket(PageSocket):
 
     def __init__(self, view: FleetView, about: dict[str, Any], request: web.Request) -> None:
         super().__init__(
-            request, PROTOCOL, "row", heartbeat=SHOW_TIMEOUT, longest=MAX_MESSAGE_BYTES
+            request, PROTOCOL, "row", heartbeat=SHOW_TIMEOUT, max_message_bytes=MAX_MESSAGE_BYTES
         )
         self._view = view
         self._about = about
-        self._sight = RowsInSight()
-        self._moved = asyncio.Event()  # set when other rows are in sight
-        self._looked = -1  # version of the view at the last look
+        self._rows_in_sight = RowsInSight()
+        self._sight_changed = asyncio.Event()  # set when other rows are in sight
+        self._sent_version = -1  # version of the view at the last check for changes
         self._versions_sent: dict[str, int] = {}  # versions of the rows that the page has
-        self._window: tuple[Any, ...] = ()  # window that the page has: found cameras and names
+        self._window: tuple[
+            Any, ...
+        ] = ()  # number of found rows, first row and names that the page has
         self._totals: dict[str, Any] = {}
         self._totals_at = -TOTALS_INTERVAL
         self._bars = 0  # start of the last bar of outcomes that the page has
 
-    def _receive(self, message: str) -> bool:
+    def _handle_message(self, message: str) -> bool:
         try:
-            self._sight = RowsInSight.model_validate_json(message)
+            self._rows_in_sight = RowsInSight.model_validate_json(message)
         except ValidationError:
             return False
-        self._moved.set()
+        self._sight_changed.set()
         return True
 
-    async def _show(self) -> None:
-        """Send the changes until the fleet ends; TimeoutError: the page does not show them."""
+    async def _send_messages(self) -> None:
+        """Send changes until the view ends; TimeoutError: the page does not show them in time."""
         loop = asyncio.get_running_loop()
         await self._send(json.dumps({**self._about, "now": time.time()}))
-        said_at = loop.time()
+        sent_at = loop.time()
         while not self._view.ended:
-            text = await self._news()
-            if text or loop.time() - said_at >= ALIVE_INTERVAL:
+            text = await self._next_message()
+            if text or loop.time() - sent_at >= ALIVE_INTERVAL:
                 await self._send(text or "{}")
-                said_at = loop.time()
+                sent_at = loop.time()
                 await asyncio.sleep(QUICK_INTERVAL)
             try:
                 async with asyncio.timeout(PERIOD):
-                    await self._moved.wait()
+                    await self._sight_changed.wait()
             except TimeoutError:
                 pass
 
     async def _send(self, text: str) -> None:
-        self._shown.clear()
+        self._was_shown.clear()
         async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_str(text)
-            await self._shown.wait()
+            await self._was_shown.wait()
 
     # ------------------------------------------------------------------ changes
 
-    async def _news(self) -> str:
+    async def _next_message(self) -> str:
         """Return a message with the changes since the last one; "" if there are none."""
-        moved = self._moved.is_set()
-        self._moved.clear()
+        sight_changed = self._sight_changed.is_set()
+        self._sight_changed.clear()
         parts = [*self._changed_totals()]
-        if moved or self._looked != self._view.version or self._view.is_late(self._sight.query):
-            self._looked = self._view.version
+        if (
+            sight_changed
+            or self._sent_version != self._view.version
+            or self._view.is_order_outdated(self._rows_in_sight.query)
+        ):
+            self._sent_version = self._view.version
             parts += [*await self._changed_rows(), *self._new_bars()]
         return f'{{{",".join(parts)},"now":{time.time():.2f}}}' if parts else ""
 
@@ -140,23 +147,23 @@ class FleetSocket(PageSocket):
             yield f'"totals":{json.dumps(totals)}'
 
     async def _changed_rows(self) -> list[str]:
-        view, sight, parts = self._view, self._sight, list[str]()
-        ordered = await view.ordered(sight.query)
-        count = len(ordered.names)
+        view, sight, parts = self._view, self._rows_in_sight, list[str]()
+        order = await view.get_order(sight.query)
+        count = len(order.names)
         first = max(0, min(sight.first, count - sight.count))
-        names = [name for name in ordered.names[first : first + sight.count] if name in view.rows]
+        names = [name for name in order.names[first : first + sight.count] if name in view.rows]
         window = (count, first, names)
         if window != self._window:
             self._window = window
             parts.append(f'"found":{count},"first":{first},"names":{json.dumps(names)}')
-        seen, self._versions_sent = self._versions_sent, {}
+        old_versions, self._versions_sent = self._versions_sent, {}
         changed: list[str] = []
         for name in names:
             row = view.rows.get(name)
             if row is None:
                 continue  # the row was forgotten
             self._versions_sent[name] = row.version
-            if seen.get(name) != row.version:
+            if old_versions.get(name) != row.version:
                 changed.append(row.as_json())
                 if len(changed) % ROWS_PER_TURN == 0:
                     await asyncio.sleep(0)

@@ -1,7 +1,8 @@
-"""Keep the fleet's page up to date: follow the fleet once for all viewers.
+"""Keep the data of a fleet's page: follow the fleet once for all viewers.
 
-One task checks the changed rows five times per second, which costs nothing without changes. It does
-not wait for viewers: they ask for rows in an order, and for changes newer than they know.
+One task updates the changed rows five times per second, which costs nothing without changes. It
+does not wait for viewers. They ask for rows in an order, and compare versions of rows to find
+changes.
 """
 
 from __future__ import annotations
@@ -25,30 +26,31 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 PERIOD: Final = 0.2
-"""Seconds between two looks, and between two updates of a page."""
+"""Seconds between two updates of the rows, and between two updates of a page."""
 
 MAX_EVENTS: Final = 50_000
-"""Largest number of events of cameras between two looks; after more, the whole fleet is read
+"""Largest number of events of the fleet between two updates; after more, the whole fleet is read
 again."""
 
 MAX_UNSHARED: Final = 10_000
-"""Largest number of cameras shown although no agent shares them any more; the oldest are
-forgotten."""
+"""Largest number of shown cameras that no agent shares any more. Beyond it, those that are gone for
+the longest time are forgotten."""
 
 ITEMS_PER_TURN: Final = 50
-"""Rows or results that are handled before other tasks of the loop have a turn."""
+"""Largest number of rows or results that are handled in one turn of the event loop."""
 
-MAX_SIFTED_ROWS: Final = 1000
-"""Largest number of rows that are searched before other tasks of the loop have a turn."""
+MAX_SEARCHED_ROWS: Final = 1000
+"""Largest number of rows that are searched in one turn of the event loop."""
 
 BAR_DURATION: Final = 5
-"""Seconds of one bar of the outcomes."""
+"""Seconds of results in one bar of the chart of outcomes."""
 
 SERIES_DURATION: Final = 600
 """Seconds over which outcomes are kept."""
 
-ORDER_LASTING_TIME: Final = 1.0
-"""Seconds that an order stays although its key changes: jumping rows cannot be read."""
+ORDER_DURATION: Final = 1.0
+"""Seconds for which an order of rows stays although rows change, since jumping rows cannot be
+read."""
 
 MAX_ORDERS: Final = 64
 """Largest number of orders that are kept for viewers."""
@@ -62,11 +64,11 @@ SORTS: Final[dict[str, Callable[[FleetRow], Any]]] = {
     "last": lambda row: row.last_at,
     "errors": lambda row: row.errors,
 }
-"""Keys by which rows are sorted, other than their name."""
+"""Functions that return the key by which rows are sorted, except for the name."""
 
 
 class RowQuery(NamedTuple):
-    """The query of a page: a choice of rows and their order."""
+    """A page's query: which rows, and in which order."""
 
     search: str = ""  # words that a row must all contain
     filter: Filter = "all"
@@ -75,11 +77,11 @@ class RowQuery(NamedTuple):
 
 
 class RowOrder(NamedTuple):
-    """Names in an order."""
+    """The names of a query's rows, in their order."""
 
     names: list[str]
-    version: int  # version of the view at its creation
-    at: float
+    version: int  # version of the view when the order was made
+    made_at: float  # time of the loop's clock
 
 
 class FleetView:
@@ -93,9 +95,9 @@ class FleetView:
         rows: cameras by name.
         version: version of all rows, which grows with each change.
         series: counts of the outcomes: start of a bar, seconds since 1970, and the number of
-            results that passed, failed, were neither, or were errors. Empty bars are left out.
+            results that passed, failed, had no verdict, or were errors. Empty bars are left out.
         failing: rows whose newest result is a failure without a picture.
-        ended: True once the view no longer follows the fleet.
+        ended: True if the view does not follow the fleet.
     """
 
     def __init__(self, fleet: Fleet, units: ShownUnits) -> None:
@@ -109,10 +111,12 @@ class FleetView:
         self.failing: dict[FleetRow, None] = {}
         self.ended: bool = True
         self.agents: set[str] = set()
-        self._names: list[str] = []  # sorted; empty until it is made again
-        self._rang: dict[FleetRow, None] = {}
-        self._aging: set[FleetRow] = set()  # rows whose rate or error mark changes by itself
-        self._unshared: dict[str, None] = {}  # the longest gone first
+        self._names: list[str] = []  # sorted; empty if it must be made again
+        self._changed_rows: dict[FleetRow, None] = {}
+        self._timed_rows: set[FleetRow] = (
+            set()
+        )  # rows that change with time: their rate, or their mark of an error
+        self._unshared: dict[str, None] = {}  # cameras that no agent shares, oldest first
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
@@ -122,22 +126,22 @@ class FleetView:
         self._events: Subscription[FleetEvent] | None = None
         self._task: asyncio.Task[None] | None = None
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ start and stop
 
     async def start(self) -> None:
-        """Begin; all cameras that exist are known when it returns."""
+        """Start to follow the fleet; when this returns, all present cameras are known."""
         if self._task is None:
             self.ended = False
-            await self._begin()
+            await self._read_fleet()
             self._task = asyncio.create_task(self._run(), name="smartcam.web.fleet")
-            self._task.add_done_callback(self._follows_no_more)
+            self._task.add_done_callback(self._on_task_done)
 
-    def _follows_no_more(self, task: asyncio.Task[None]) -> None:
+    def _on_task_done(self, task: asyncio.Task[None]) -> None:
         if task is self._task:
             self.ended = True
 
     async def stop(self) -> None:
-        """End. Harmless when called twice."""
+        """Stop following the fleet. Idempotent."""
         task, self._task = self._task, None
         self.ended = True
         if task is not None:
@@ -146,7 +150,7 @@ class FleetView:
         if self._events is not None:
             self._events.close()
         for row in self.rows.values():
-            row.leave()
+            row.stop_following()
 
     async def _run(self) -> None:
         try:
@@ -155,43 +159,43 @@ class FleetView:
                 await asyncio.sleep(PERIOD)
                 ticks += 1
                 await self._receive_events()
-                await self._look()
+                await self._update_changed_rows()
                 if ticks * PERIOD >= 1.0:
                     ticks = 0
-                    await self._age()
+                    await self._update_timed_rows()
         except Exception:
             _log.exception("! the fleet's page follows no more: a fault of ours")
             raise
 
     # ------------------------------------------------------------------ agents and cameras
 
-    async def _begin(self) -> None:
+    async def _read_fleet(self) -> None:
         """Find out which agents and cameras exist."""
         if self._events is not None:
             self._events.close()
         self._events = stream = self.fleet.events(max_queue=MAX_EVENTS)
-        before = {row.name: set(row.agents) for row in self.rows.values()}
+        previous = {row.name: set(row.agents) for row in self.rows.values()}
         self.agents.clear()
         for row in self.rows.values():
             row.agents.clear()
-        await self._take(stream, stream.statistics().queued)
-        for name, agents in before.items():
+        await self._read_events(stream, stream.statistics().queued)
+        for name, agents in previous.items():
             if agents != self.rows[name].agents:
                 self.rows[name].note_change()
-        await self._look()
+        await self._update_changed_rows()
 
     async def _receive_events(self) -> None:
-        """Note cameras that come or go."""
+        """Read new events about agents and cameras; read the whole fleet if some were dropped."""
         stream = self._events
         if stream is None:
             return
         account = stream.statistics()
         if account.dropped:
-            await self._begin()
+            await self._read_fleet()
         else:
-            await self._take(stream, account.queued)
+            await self._read_events(stream, account.queued)
 
-    async def _take(self, stream: Subscription[FleetEvent], count: int) -> None:
+    async def _read_events(self, stream: Subscription[FleetEvent], count: int) -> None:
         for number in range(count):
             self._on_event(await anext(stream))
             if number % ITEMS_PER_TURN == ITEMS_PER_TURN - 1:
@@ -206,7 +210,7 @@ class FleetView:
                 self.agents.discard(event.agent)
                 self.version += 1
             case CameraJoined():
-                self._join(event.camera, event.agent)
+                self._add_agent(event.camera, event.agent)
             case CameraLeft():
                 row = self.rows.get(event.camera)
                 if row is not None:
@@ -215,102 +219,104 @@ class FleetView:
             case _:
                 pass
 
-    def _join(self, name: str, agent: str) -> None:
+    def _add_agent(self, name: str, agent: str) -> None:
         row = self.rows.get(name)
         if row is None:
-            row = self.rows[name] = FleetRow(name, self._ring, self._units)
+            row = self.rows[name] = FleetRow(name, self._note_change, self._units)
             self._names = []
         self.agents.add(agent)
         row.agents.add(agent)
         row.follow(self.fleet[name])
         row.note_change()
 
-    def _ring(self, row: FleetRow) -> None:
-        self._rang[row] = None
+    def _note_change(self, row: FleetRow) -> None:
+        self._changed_rows[row] = None
 
     # ------------------------------------------------------------------ changes of rows
 
-    async def _look(self) -> None:
-        """Update the rows that have changed."""
-        loop, done = asyncio.get_running_loop(), 0
-        rang, self._rang = self._rang, {}
-        for row in rang:
+    async def _update_changed_rows(self) -> None:
+        """Update the rows that may have changed."""
+        loop, done_count = asyncio.get_running_loop(), 0
+        rows, self._changed_rows = self._changed_rows, {}
+        for row in rows:
             if self.rows.get(row.name) is not row:
                 continue  # the row was forgotten
-            before, now = row.count, loop.time()
-            outcomes = await row.take(now)
+            old_count, now = row.count, loop.time()
+            outcomes = await row.count_results(now)
             if row.may_have_changed:
-                row.account(outcomes, now)
-            arrived = self._count_in(row, outcomes, row.count - before)
+                row.count_lost_results(outcomes, now)
+            arrived = self._count_outcomes(row, outcomes, row.count - old_count)
             if row.may_have_changed or outcomes["errors"]:
-                self._refresh(row, now)
+                self._refresh_row(row, now)
             if row.history.wants_picture:
                 self.failing[row] = None
-            done += 1 + arrived
-            if done >= ITEMS_PER_TURN:
-                done = 0
+            done_count += 1 + arrived
+            if done_count >= ITEMS_PER_TURN:
+                done_count = 0
                 await asyncio.sleep(0)
 
-    def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], arrived: int) -> int:
-        """Count a camera's outcomes; return their number."""
+    def _count_outcomes(
+        self, row: FleetRow, outcomes: collections.Counter[str], arrived: int
+    ) -> int:
+        """Count the outcomes of ``arrived`` new results of a camera; return ``arrived``."""
         if arrived:
             self._bar.update(outcomes)
             self._count += arrived
             self._errors += outcomes["errors"]
-            self._aging.add(row)
-            self._change(row)
+            self._timed_rows.add(row)
+            self._mark_changed(row)
         return arrived
 
-    def _change(self, row: FleetRow) -> None:
+    def _mark_changed(self, row: FleetRow) -> None:
         self.version += 1
         row.version = self.version
 
-    def _refresh(self, row: FleetRow, now: float) -> None:
+    def _refresh_row(self, row: FleetRow, now: float) -> None:
         """Update a camera's state."""
         flags = row.flags
         changed, lost = row.refresh(now)
         if lost:
             self._errors += 1
         if changed:
-            self._change(row)
+            self._mark_changed(row)
         if flags is not row.flags:
             self._flags.subtract(flags)
             self._flags.update(row.flags)
         if row.error_at is not None or not row.agents or "connected" not in row.flags:
-            self._aging.add(row)  # the reason of a loss may change without an event
+            self._timed_rows.add(row)  # the reason of a loss may change without an event
         if row.agents:
             self._unshared.pop(row.name, None)
         elif row.name not in self._unshared:
             self._unshared[row.name] = None
             if len(self._unshared) > MAX_UNSHARED:
-                self._forget(next(iter(self._unshared)))
+                self._forget_row(next(iter(self._unshared)))
 
-    def _forget(self, name: str) -> None:
+    def _forget_row(self, name: str) -> None:
         row = self.rows.pop(name)
-        row.leave()
+        row.stop_following()
         self.failing.pop(row, None)
         self._flags.subtract(row.flags)
-        self._aging.discard(row)
+        self._timed_rows.discard(row)
         self._unshared.pop(name, None)
         self._names = []
         self.version += 1
 
-    async def _age(self) -> None:
-        """Count rates, once a second, and update values that change by themselves."""
+    async def _update_timed_rows(self) -> None:
+        """Update rates and other values that change with time, once a second."""
         now, wall = asyncio.get_running_loop().time(), time.time()
-        aging, self._aging = self._aging, set()
-        for number, row in enumerate(aging):
+        rows, self._timed_rows = self._timed_rows, set()
+        for number, row in enumerate(rows):
             if self.rows.get(row.name) is not row:
                 continue  # the row was forgotten
-            before, rate = row.count, row.rate
+            old_count, rate = row.count, row.rate
             outcomes: collections.Counter[str] = collections.Counter()
-            row.account(outcomes, now)
-            self._count_in(row, outcomes, row.count - before)
+            row.count_lost_results(outcomes, now)
+            self._count_outcomes(row, outcomes, row.count - old_count)
             if row.update_rate() or row.error_at is not None:
-                self._aging.add(row)
+                self._timed_rows.add(row)
             if row.rate != rate:
-                self._change(row)
-            self._refresh(row, now)
+                self._mark_changed(row)
+            self._refresh_row(row, now)
             if number % ITEMS_PER_TURN == ITEMS_PER_TURN - 1:
                 await asyncio.sleep(0)
         self._totals.append(self._count)
@@ -337,39 +343,39 @@ class FleetView:
             "failures": self._errors,
         }
 
-    async def ordered(self, query: RowQuery) -> RowOrder:
-        """Return the names of a query's rows; made once for all equal queries.
+    async def get_order(self, query: RowQuery) -> RowOrder:
+        """Return the names of a query's rows; equal queries share one order.
 
         Cancellation: safe.
         """
         now = asyncio.get_running_loop().time()
         known = self._orders.get(query)
         if known is not None and (
-            known.version == self.version or now - known.at < ORDER_LASTING_TIME
+            known.version == self.version or now - known.made_at < ORDER_DURATION
         ):
             self._orders.move_to_end(query)
             return known
         if not self._names:
             self._names = sorted(self.rows)
         version = self.version
-        made = RowOrder(await self._sorted(query), version, now)
-        self._orders[query] = made
+        order = RowOrder(await self._find_rows(query), version, now)
+        self._orders[query] = order
         self._orders.move_to_end(query)
         while len(self._orders) > MAX_ORDERS:
             self._orders.popitem(last=False)
-        return made
+        return order
 
-    def is_late(self, query: RowQuery) -> bool:
-        """Return True if a query's order is older than the last change."""
+    def is_order_outdated(self, query: RowQuery) -> bool:
+        """Return True if there is no order for a query, or it is older than the last change."""
         known = self._orders.get(query)
         return known is None or known.version != self.version
 
-    async def _sorted(self, query: RowQuery) -> list[str]:
+    async def _find_rows(self, query: RowQuery) -> list[str]:
         words, found = query.search.lower().split(), list[FleetRow]()
         names = self._names
-        for start in range(0, len(names), MAX_SIFTED_ROWS):
-            rows = map(self.rows.get, names[start : start + MAX_SIFTED_ROWS])
-            found += [row for row in rows if row is not None and _fits(row, query.filter, words)]
+        for start in range(0, len(names), MAX_SEARCHED_ROWS):
+            rows = map(self.rows.get, names[start : start + MAX_SEARCHED_ROWS])
+            found += [row for row in rows if row is not None and _matches(row, query.filter, words)]
             await asyncio.sleep(0)
         if query.sort in SORTS:
             found.sort(key=SORTS[query.sort], reverse=query.down)
@@ -378,5 +384,5 @@ class FleetView:
         return [row.name for row in found]
 
 
-def _fits(row: FleetRow, wanted: str, words: list[str]) -> bool:
-    return wanted in row.flags and all(word in row.text for word in words)
+def _matches(row: FleetRow, row_filter: str, words: list[str]) -> bool:
+    return row_filter in row.flags and all(word in row.text for word in words)

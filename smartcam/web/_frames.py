@@ -1,4 +1,4 @@
-"""The site of pictures: the newest frames of a few sources, for any number of viewers."""
+"""Show the newest frames of a few sources to the viewers of a site."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from smartcam.exceptions import (
     TriggerError,
     UnsupportedError,
 )
-from smartcam.web._errors import RefusedError, shown
+from smartcam.web._errors import RefusedError, short_repr
 from smartcam.web._jpeg import require_encoder
 from smartcam.web._pictures import FILES, SitePictures
 from smartcam.web._routes import CallBody, CallRequest, Calls
@@ -47,16 +47,16 @@ class FramesSite(Site):
         quality: quality of the JPEGs that are made, 1 to 100. A JPEG from a camera stays as it is.
         host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
-        changes: whether viewers may set features of the devices, execute their commands and
-            trigger them; then everyone who can open the page may.
+        changes: whether everyone who can open the page may set features of the devices, execute
+            their commands and trigger them.
         token: token that every call must carry in ``Authorization: Bearer``, as for
-            :class:`~smartcam.web.LiveSite`. A browser's WebSocket, which has no such header,
-            names it among its protocols: ``bearer.TOKEN``.
+            :class:`~smartcam.web.LiveSite`. A browser cannot set this header for a WebSocket: it
+            offers the subprotocol ``bearer.TOKEN`` instead.
 
     Attributes:
         sources: the given sources.
         changes: whether viewers may change the devices.
-        failures: reason why a source is not open, by its place in ``sources``; set by the program
+        failures: reason why a source is not open, by its index in ``sources``; set by the program
             that opens the sources.
 
     Raises:
@@ -103,11 +103,11 @@ CALLS: Calls[FramesSite] = Calls()
 """All calls."""
 
 
-def _place(site: FramesSite, call: CallRequest) -> int:
-    given = call.path["place"]
-    if not given.isdecimal() or len(given) > 3 or int(given) >= len(site.sources):
-        raise RefusedError(404, f"source {shown(given)}", f"0 to {len(site.sources) - 1}")
-    return int(given)
+def _source_index(site: FramesSite, call: CallRequest) -> int:
+    text = call.path["place"]
+    if not text.isdecimal() or len(text) > 3 or int(text) >= len(site.sources):
+        raise RefusedError(404, f"source {short_repr(text)}", f"0 to {len(site.sources) - 1}")
+    return int(text)
 
 
 class _NameBody(CallBody):
@@ -122,22 +122,22 @@ class _FeatureBody(_NameBody):
     value: bool | int | Annotated[float, Field(allow_inf_nan=False)] | str
 
 
-def _changing(site: FramesSite, call: CallRequest) -> int:
-    """Return the place of a source that viewers may change."""
+def _changeable_source_index(site: FramesSite, call: CallRequest) -> int:
+    """Return the index of a source that viewers may change."""
     if not site.changes:
         raise RefusedError(
             403, "a change of a device", "one that was started with --changes, or changes=True"
         )
-    return _place(site, call)
+    return _source_index(site, call)
 
 
 @contextlib.contextmanager
-def _refused(site: FramesSite, place: int) -> Iterator[None]:
-    """Turn a device's error into a refusal of the call."""
+def _refuse_on_error(site: FramesSite, index: int) -> Iterator[None]:
+    """Refuse the call if the block raises an error of the device."""
     try:
         yield
     except LocalProtocolError as exc:
-        failure = site.pictures.state(place)["failure"]
+        failure = site.pictures.state(index)["failure"]
         raise RefusedError(409, failure, "a source that is there") from exc
     except (FrameFeatureError, UnsupportedError) as exc:
         raise RefusedError(422, str(exc), "what the device has") from exc
@@ -145,8 +145,8 @@ def _refused(site: FramesSite, place: int) -> Iterator[None]:
         raise RefusedError(409, str(exc), "a source that gives frames") from exc
 
 
-async def _as_jpeg(site: FramesSite, place: int, frame: Frame) -> web.Response:
-    data = await site.pictures.press(place).jpeg(frame)
+async def _jpeg_answer(site: FramesSite, index: int, frame: Frame) -> web.Response:
+    data = await site.pictures.jpeg_maker(index).jpeg(frame)
     headers = {"Frame-Sequence": str(frame.sequence), "Frame-Age": f"{frame.age:.4f}"}
     return web.Response(body=data, content_type="image/jpeg", headers=headers)
 
@@ -160,15 +160,15 @@ def _calls(_site: FramesSite, _call: CallRequest) -> object:
 @CALLS.add("GET", f"{API}/sources")
 def _sources(site: FramesSite, _call: CallRequest) -> object:
     """The sources, with their states and counts."""
-    return {"sources": [site.pictures.state(place) for place in range(len(site.sources))]}
+    return {"sources": [site.pictures.state(index) for index in range(len(site.sources))]}
 
 
 @CALLS.add("GET", f"{API}/sources/{{place}}/features")
 async def _features(site: FramesSite, call: CallRequest) -> object:
     """The features of a source's device, with value and range; and whether they may be set here."""
-    place = _place(site, call)
-    with _refused(site, place):
-        described = await site.sources[place].features.describe()
+    index = _source_index(site, call)
+    with _refuse_on_error(site, index):
+        described = await site.sources[index].features.describe()
     features = [
         {**dataclasses.asdict(feature), "range": feature.range} for feature in described.values()
     ]
@@ -186,9 +186,9 @@ async def _features(site: FramesSite, call: CallRequest) -> object:
 )
 async def _set_feature(site: FramesSite, call: CallRequest) -> object:
     """Set a feature, if changes are allowed; answers the device's new value."""
-    place = _changing(site, call)
-    with _refused(site, place):
-        return {"value": await site.sources[place].features[call.body.name].set(call.body.value)}
+    index = _changeable_source_index(site, call)
+    with _refuse_on_error(site, index):
+        return {"value": await site.sources[index].features[call.body.name].set(call.body.value)}
 
 
 @CALLS.add(
@@ -196,26 +196,26 @@ async def _set_feature(site: FramesSite, call: CallRequest) -> object:
 )
 async def _command(site: FramesSite, call: CallRequest) -> object:
     """Execute a command, if changes are allowed; answers when the device has done it."""
-    place = _changing(site, call)
-    with _refused(site, place):
-        await site.sources[place].features[call.body.name].execute()
+    index = _changeable_source_index(site, call)
+    with _refuse_on_error(site, index):
+        await site.sources[index].features[call.body.name].execute()
     return {}
 
 
 @CALLS.add("POST", f"{API}/sources/{{place}}/trigger")
 async def _trigger(site: FramesSite, call: CallRequest) -> web.Response:
     """Trigger the device, if changes are allowed; answers the triggered picture as a JPEG."""
-    place = _changing(site, call)
-    with _refused(site, place):
-        return await _as_jpeg(site, place, await site.sources[place].trigger())
+    index = _changeable_source_index(site, call)
+    with _refuse_on_error(site, index):
+        return await _jpeg_answer(site, index, await site.sources[index].trigger())
 
 
 @CALLS.add("GET", f"{API}/sources/{{place}}/picture")
 async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
     """The newest frame, as a JPEG; the device streams for it."""
-    place = _place(site, call)
-    with _refused(site, place):
-        return await _as_jpeg(site, place, await site.sources[place].newest())
+    index = _source_index(site, call)
+    with _refuse_on_error(site, index):
+        return await _jpeg_answer(site, index, await site.sources[index].newest())
 
 
 @CALLS.add(
@@ -224,4 +224,4 @@ async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
     about="A WebSocket: the newest frame after each `next`, as a JPEG after JSON.",
 )
 async def _pictures(site: FramesSite, call: CallRequest) -> web.StreamResponse:
-    return await site.pictures.view(_place(site, call), call.request)
+    return await site.pictures.serve_viewer(_source_index(site, call), call.request)

@@ -1,4 +1,4 @@
-"""Guard a site: checks of Host, Origin and token, and the headers of every answer.
+"""Guard a site: check Host, Origin and token, and set the headers of every answer.
 
 A page of another web site runs in the same browser and can send requests to this machine. It must
 neither read nor change anything here, whatever name it uses for this machine:
@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 from smartcam._accepting import is_loopback
 from smartcam.exceptions import ConfigurationError
-from smartcam.web._errors import RefusedError, shown
+from smartcam.web._errors import RefusedError, short_repr
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 MIN_TOKEN_CHARACTERS = 16
-"""Least number of characters of a token, which must be hard to guess; made tokens have 32."""
+"""Least number of characters of a token, which must be hard to guess. New tokens have 32."""
 
 BEARER = "bearer."
-"""Beginning of a WebSocket protocol that carries the token."""
+"""Prefix of the WebSocket protocol that carries the token."""
 
 HEADERS: Mapping[str, str] = {
     "Content-Security-Policy": (
@@ -53,7 +53,7 @@ HEADERS: Mapping[str, str] = {
 class Guard:
     """The checks of one site."""
 
-    token: str | None  # token that calls must carry; None: none, on loopback only
+    token: str | None  # token that calls must carry; None: calls need none
 
     def check(self, request: web.Request, *, is_call: bool) -> None:
         """Refuse a request that does not come from the site's own pages.
@@ -61,7 +61,7 @@ class Guard:
         The files of the page need no token, since they hold no secret.
 
         Raises:
-            RefusedError: 403 for another site's, 401 for a missing or wrong token.
+            RefusedError: 403 for a request of another site, 401 for a missing or wrong token.
         """
         if self.token is None:
             check_host(request.host)
@@ -69,13 +69,15 @@ class Guard:
             _check_origin(request)
             self._check_token(_authorization(request))
 
-    def _check_token(self, given: str | None) -> None:
+    def _check_token(self, header: str | None) -> None:
         if self.token is None:
             return
-        wanted = f"Bearer {self.token}".encode()
-        offered = (given or "").encode("utf-8", "surrogateescape")
-        if not hmac.compare_digest(offered, wanted):
-            problem = "no Authorization" if given is None else "an Authorization with another token"
+        expected = f"Bearer {self.token}".encode()
+        received = (header or "").encode("utf-8", "surrogateescape")
+        if not hmac.compare_digest(received, expected):
+            problem = (
+                "no Authorization" if header is None else "an Authorization with another token"
+            )
             raise RefusedError(
                 401,
                 problem,
@@ -85,27 +87,27 @@ class Guard:
 
 
 def _authorization(request: web.Request) -> str | None:
-    given = request.headers.get("Authorization")
-    if given is None and request.headers.get("Upgrade", "").lower() == "websocket":
+    header = request.headers.get("Authorization")
+    if header is None and request.headers.get("Upgrade", "").lower() == "websocket":
         offered = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
         tokens = [offer.strip() for offer in offered if offer.strip().startswith(BEARER)]
         return f"Bearer {tokens[0].removeprefix(BEARER)}" if tokens else None
-    return given
+    return header
 
 
-def check_host(given: str, names: Collection[str] | None = None) -> None:
+def check_host(host: str, names: Collection[str] | None = None) -> None:
     """Refuse a request that names another machine, as DNS rebinding does.
 
     Args:
-        given: the request's ``Host``.
-        names: names of this machine, in lower case, that are allowed beside loopback and all
-            addresses; None: only names and addresses of loopback are allowed.
+        host: the request's ``Host``.
+        names: names of this machine, in lower case, that are allowed in addition to loopback and
+            all addresses; None: only names and addresses of loopback are allowed.
 
     Raises:
         RefusedError: 403.
     """
     try:
-        name = urlsplit(f"//{given}").hostname or ""
+        name = urlsplit(f"//{host}").hostname or ""
     except ValueError:
         name = ""
     if is_loopback(name) or (names is not None and (name in names or _is_address(name))):
@@ -113,7 +115,7 @@ def check_host(given: str, names: Collection[str] | None = None) -> None:
     expected = "localhost or another name of loopback"
     if names is not None:
         expected = f"an address, localhost, {', '.join(sorted(names))}, or one of operations.names"
-    raise RefusedError(403, f"Host {shown(given)}", expected)
+    raise RefusedError(403, f"Host {short_repr(host)}", expected)
 
 
 def _is_address(name: str) -> bool:
@@ -127,10 +129,12 @@ def _is_address(name: str) -> bool:
 def _check_origin(request: web.Request) -> None:
     origin = request.headers.get("Origin")
     if origin is not None and origin.partition("://")[2] != request.host:
-        raise RefusedError(403, f"Origin {shown(origin)}", f"the page's own: http://{request.host}")
+        raise RefusedError(
+            403, f"Origin {short_repr(origin)}", f"the page's own: http://{request.host}"
+        )
     site = request.headers.get("Sec-Fetch-Site", "none")
     if site not in {"none", "same-origin"}:
-        raise RefusedError(403, f"Sec-Fetch-Site {shown(site)}", "the page's own calls")
+        raise RefusedError(403, f"Sec-Fetch-Site {short_repr(site)}", "the page's own calls")
 
 
 def new_token() -> str:
@@ -138,8 +142,8 @@ def new_token() -> str:
     return secrets.token_urlsafe(24)
 
 
-def checked_token(token: str) -> str:
-    """Return the given token.
+def check_token(token: str) -> None:
+    """Check a token that a user chose.
 
     Raises:
         ConfigurationError: the token is too short, or has characters that a header or a URL
@@ -151,4 +155,3 @@ def checked_token(token: str) -> str:
             f"web: a token has {MIN_TOKEN_CHARACTERS} letters, digits, '-' and '_' at least, "
             f"this one has {len(token)} characters"
         )
-    return token

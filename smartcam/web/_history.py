@@ -1,4 +1,4 @@
-"""Keep the outcomes of a camera's results over a shift, as a trend and the last failures."""
+"""Keep the outcomes of a camera's results during a shift, and its last failures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.web._verdicts import failing, judged
+from smartcam.web._verdicts import describe_failures, outcome_of
 
 if TYPE_CHECKING:
     from smartcam.models import Result
@@ -26,7 +26,7 @@ SLOT_SECONDS: Final = 1800
 """Seconds of results in a slot of the short trend."""
 
 MAX_FAILURES: Final = 50
-"""Largest number of failures that are kept; equal ones in a row are one."""
+"""Largest number of failures that are kept; equal failures in a row count as one."""
 
 MAX_PICTURES: Final = 12
 """Largest number of pictures of failures that are kept."""
@@ -49,9 +49,9 @@ class Failure:
         serial: number of the failure, from 1.
         at: time of the first one, seconds since 1970.
         until: time of the last one.
-        number: number of the first result; None without a result.
+        number: number of the first failed result; None if no result belongs to the failure.
         what: text of the failure.
-        count: number of failures.
+        count: number of equal failures.
     """
 
     serial: int
@@ -63,7 +63,7 @@ class Failure:
 
 
 class ShiftHistory:
-    """Outcomes and failures of one camera, bounded.
+    """The outcomes and failures of one camera during the last shift.
 
     Attributes:
         version: number of changes.
@@ -82,41 +82,41 @@ class ShiftHistory:
         self._failures: collections.deque[Failure] = collections.deque(maxlen=MAX_FAILURES)
         self._pictures: collections.OrderedDict[int, bytes] = collections.OrderedDict()
         self._serial = 0  # serial of the last failure
-        self._newest = 0  # serial of the newest result if it is a failure, else 0
-        self._failed = 0
-        self._passed = False  # whether a result has passed since the last failure
+        self._newest_failure = 0  # serial of the newest result if it is a failure, else 0
+        self._failed_count = 0
+        self._has_passed = False  # whether a result has passed since the last failure
 
     def add(self, result: Result[Any]) -> Outcome:
         """Count a result; return its outcome."""
-        outcome = judged(result.value)
+        outcome = outcome_of(result.value)
         at = result.received_at.timestamp()
-        self._count_up(outcome, at)
-        self._newest = 0
+        self._count_outcome(outcome, at)
+        self._newest_failure = 0
         if outcome == "failed":
-            self._fail(at, result.number, failing(result.value))
+            self._add_failed_result(at, result.number, describe_failures(result.value))
         elif outcome == "passed":
-            self.failed_since, self.in_a_row, self._passed = None, 0, True
+            self.failed_since, self.in_a_row, self._has_passed = None, 0, True
         return outcome
 
     def add_error(self, text: str) -> None:
         """Count a container that could not be read."""
         at = time.time()
-        self._count_up("errors", at)
-        self._fail(at, None, f"not readable: {text}")
+        self._count_outcome("errors", at)
+        self._add_failed_result(at, None, f"not readable: {text}")
 
     def add_missed(self, count: int, text: str) -> None:
-        """Count missing results, with a text."""
+        """Count missing results; ``text`` describes them to users."""
         at = time.time()
-        self._count_up("errors", at, count)
-        self._newest = 0
-        self._note(at, None, text)
+        self._count_outcome("errors", at, count)
+        self._newest_failure = 0
+        self._add_failure(at, None, text)
 
     def add_loss(self, reason: str) -> None:
-        """Note that the connection was lost."""
-        self._newest = 0
-        self._note(time.time(), None, f"connection lost: {reason}")
+        """Add a lost connection to the failures."""
+        self._newest_failure = 0
+        self._add_failure(time.time(), None, f"connection lost: {reason}")
 
-    def _count_up(self, outcome: Outcome, at: float, count: int = 1) -> None:
+    def _count_outcome(self, outcome: Outcome, at: float, count: int = 1) -> None:
         self.version += 1
         begin = int(at // BAR_SECONDS * BAR_SECONDS)
         if not self._bars or self._bars[-1][0] < begin:
@@ -127,22 +127,22 @@ class ShiftHistory:
         self._bars[-1][1 + KINDS.index(outcome)] += count
         self.totals[KINDS.index(outcome)] += count
 
-    def _fail(self, at: float, number: int | None, text: str) -> None:
-        self._failed += 1
+    def _add_failed_result(self, at: float, number: int | None, text: str) -> None:
+        self._failed_count += 1
         self.in_a_row += 1
         if self.failed_since is None:
             self.failed_since = at
-        self._note(at, number, text)
-        self._newest = self._serial
+        self._add_failure(at, number, text)
+        self._newest_failure = self._serial
 
-    def _note(self, at: float, number: int | None, text: str) -> None:
+    def _add_failure(self, at: float, number: int | None, text: str) -> None:
         self.version += 1
         last = self._failures[-1] if self._failures else None
-        if last is not None and last.what == text[:MAX_TEXT_CHARACTERS] and not self._passed:
+        if last is not None and last.what == text[:MAX_TEXT_CHARACTERS] and not self._has_passed:
             last.count += 1
             last.until = at
             return
-        self._passed = False
+        self._has_passed = False
         self._serial += 1
         self._failures.append(Failure(self._serial, at, at, number, text[:MAX_TEXT_CHARACTERS]))
 
@@ -151,10 +151,10 @@ class ShiftHistory:
     @property
     def wants_picture(self) -> bool:
         """True if the newest result is a failure without a picture."""
-        return self._newest > 0 and self._newest not in self._pictures
+        return self._newest_failure > 0 and self._newest_failure not in self._pictures
 
-    def attach(self, serial: int, picture: bytes) -> None:
-        """Keep the first picture of a failure; pictures of the oldest failures make room."""
+    def attach_picture(self, serial: int, picture: bytes) -> None:
+        """Keep the first picture of a failure; drop those of the oldest failures if necessary."""
         if not serial or serial in self._pictures or len(picture) > MAX_PICTURE_BYTES:
             return
         self._pictures[serial] = picture
@@ -173,7 +173,7 @@ class ShiftHistory:
     @property
     def last_failure(self) -> int:
         """Serial of the newest result if it is a failure, else 0."""
-        return self._newest
+        return self._newest_failure
 
     def picture(self, serial: int) -> bytes | None:
         """Return the picture of a failure, None without one."""
@@ -190,7 +190,7 @@ class ShiftHistory:
         return {
             "bars": [*self._bars],
             "failures": failures,
-            "failed": self._failed,
+            "failed": self._failed_count,
             "failed_since": self.failed_since,
             "in_a_row": self.in_a_row,
         }
@@ -198,28 +198,31 @@ class ShiftHistory:
     def trend(self) -> dict[str, Any]:
         """Return the short trend, for a row of a table.
 
-        ``end`` is the end of the last slot, seconds since 1970. Each slot covers
-        :data:`SLOT_SECONDS` and is one character: the number of bad results in ten with a verdict,
-        rounded up (X: all bad); ``-`` if none had a verdict, a space without results.
+        ``end`` is the end of the last slot, seconds since 1970. ``places`` has one character for
+        each slot of :data:`SLOT_SECONDS`: the tenths of its results with a verdict that are bad,
+        rounded up (X: all are bad); ``-`` if no result had a verdict, a space without results.
         """
         if not self._bars:
             return {"end": 0, "places": ""}
         last = self._bars[-1][0] // SLOT_SECONDS
         count = SHIFT_SECONDS // SLOT_SECONDS
         slots = [[0, 0, 0, 0] for _ in range(count)]
-        for at, *outcomes in self._bars:
-            place = at // SLOT_SECONDS - last + count - 1
-            if place >= 0:
-                slots[place] = [
-                    count + more for count, more in zip(slots[place], outcomes, strict=True)
+        for begin, *outcomes in self._bars:
+            index = begin // SLOT_SECONDS - last + count - 1
+            if index >= 0:
+                slots[index] = [
+                    total + added for total, added in zip(slots[index], outcomes, strict=True)
                 ]
-        return {"end": (last + 1) * SLOT_SECONDS, "places": "".join(map(_place, slots)).lstrip(" ")}
+        return {
+            "end": (last + 1) * SLOT_SECONDS,
+            "places": "".join(map(_slot_character, slots)).lstrip(" "),
+        }
 
 
-def _place(outcomes: list[int]) -> str:
+def _slot_character(outcomes: list[int]) -> str:
     """Return the character of a slot of the short trend."""
     passed, failed, other, errors = outcomes
-    bad, judged = failed + errors, passed + failed + errors
-    if judged:
-        return "0123456789X"[-(-10 * bad // judged)]
+    bad_count, verdict_count = failed + errors, passed + failed + errors
+    if verdict_count:
+        return "0123456789X"[-(-10 * bad_count // verdict_count)]
     return "-" if other else " "

@@ -1,4 +1,4 @@
-"""A frame for viewers: its colours, at 8 bits, as a JPEG."""
+"""Turn a frame into a JPEG for viewers, with its colours at 8 bits."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ if TYPE_CHECKING:
 
     from smartcam.frames import Frame
 
-START: Final = b"\xff\xd8"
-TABLES: Final = b"\xff\xc4"
-"""Marker of a JPEG's Huffman tables; many webcams leave them out, which few programs can read."""
+JPEG_START: Final = b"\xff\xd8"
+HUFFMAN_TABLES: Final = b"\xff\xc4"
+"""Marker of a JPEG's Huffman tables. Many webcams leave the tables out; few programs can read such
+a JPEG."""
 
-HEAD: Final = 4096
-"""Number of first bytes that are searched for the tables, which precede the picture."""
+HEAD_BYTES: Final = 4096
+"""Number of bytes at the start of a JPEG that are searched for the tables."""
 
-READY: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
-"""Formats that become a JPEG without a conversion; formats of Y, U and V do, too."""
+DIRECT_FORMATS: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
+"""Formats that can be encoded as a JPEG without a conversion. Formats of Y, U and V can, too."""
 
 
 def jpeg(frame: Frame, quality: int) -> bytes:
@@ -37,14 +38,14 @@ def jpeg(frame: Frame, quality: int) -> bytes:
         quality: 1 to 100.
 
     Raises:
-        FrameFormatError: its bytes are wrong, or its size is too large for a JPEG.
-        MissingExtraError: a package that reads or makes it is not installed.
+        FrameFormatError: the frame's bytes are wrong, or it is too large for a JPEG.
+        MissingExtraError: a package that decodes the frame or makes the JPEG is not installed.
     """
     if is_whole_jpeg(frame):
         return bytes(frame.data)
-    if not _is_ready(frame):
-        return encoded(frame, stretched(picture(frame)), quality)
-    return _jpeg(frame, quality)
+    if not _can_encode_directly(frame):
+        return encoded(frame, scale_to_8_bits(picture(frame)), quality)
+    return _encode(frame, quality)
 
 
 def encoded(frame: Frame, pixels: NDArray[np.uint8], quality: int) -> bytes:
@@ -54,7 +55,7 @@ def encoded(frame: Frame, pixels: NDArray[np.uint8], quality: int) -> bytes:
         FrameFormatError: the size is too large for a JPEG.
         MissingExtraError: the extra ``frames`` is not installed.
     """
-    return _jpeg(with_pixels(frame, pixels, "Mono8" if pixels.ndim == 2 else "RGB8"), quality)
+    return _encode(with_pixels(frame, pixels, "Mono8" if pixels.ndim == 2 else "RGB8"), quality)
 
 
 def require_encoder() -> None:
@@ -67,16 +68,16 @@ def require_encoder() -> None:
 
 
 def is_whole_jpeg(frame: Frame) -> bool:
-    """Return True if a frame came as a JPEG that any program can read."""
-    head = bytes(frame.data[:HEAD])
-    return frame.format.name == "MJPEG" and head.startswith(START) and TABLES in head
+    """Return True if a frame is already a JPEG that any program can read."""
+    head = bytes(frame.data[:HEAD_BYTES])
+    return frame.format.name == "MJPEG" and head.startswith(JPEG_START) and HUFFMAN_TABLES in head
 
 
 def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
     """Return the pixels to show: (H, W, 3), red first; (H, W) for a frame without colours.
 
     Raises:
-        FrameFormatError: its bytes are wrong, or it has no brightness, which ``grey`` needs.
+        FrameFormatError: the frame's bytes are wrong, or ``grey`` is set and it has no brightness.
         MissingExtraError: a codec of a compressed format or a Bayer pattern is not installed.
     """
     if frame.format.name in {"PNG", "JPEGXL"}:
@@ -86,19 +87,19 @@ def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
     return frame.grey() if grey or frame.format.name.startswith("Mono") else frame.rgb()
 
 
-def stretched(levels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return levels of 8 bits; with more bits, the brightest becomes 255."""
+def scale_to_8_bits(levels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return levels at 8 bits; levels of more bits are scaled so that the largest becomes 255."""
     if levels.dtype == np.uint8:
         return levels
     top = max(1, int(levels.max()))
     return (levels.astype(np.uint32) * 255 // top).astype(np.uint8)
 
 
-def _is_ready(frame: Frame) -> bool:
-    return frame.format.name in READY or isinstance(frame.format.layout, YuvPairs | Planes)
+def _can_encode_directly(frame: Frame) -> bool:
+    return frame.format.name in DIRECT_FORMATS or isinstance(frame.format.layout, YuvPairs | Planes)
 
 
-def _jpeg(frame: Frame, quality: int) -> bytes:
+def _encode(frame: Frame, quality: int) -> bytes:
     try:
         return bytes(to_jpeg(frame, quality).data)
     except ValueError as exc:

@@ -1,4 +1,4 @@
-"""The live page's site: a camera's results, and calls that command it if allowed."""
+"""Define the live page's site: a camera's results, and calls that command the camera if allowed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from smartcam.web._live_view import LiveView
 from smartcam.web._pictures import FILES
 from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API, Site
-from smartcam.web._streams import PERIOD, News
+from smartcam.web._streams import PERIOD, StreamEvent
 from smartcam.web._units import PageUnits
 
 if TYPE_CHECKING:
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from smartcam.web._live_camera import ShowsCamera
 
 MAX_NEWS = 20
-"""Largest number of results in one event: at ten a second the page gets 200 a second, and the
-number of results that it missed."""
+"""Largest number of results in one event. With ten events a second the page gets 200 results a
+second, and the number of results that it missed."""
 
-CLOCK_LOOKS = round(1.0 / PERIOD)
-"""Looks between two reports of clock and account: one a second."""
+LOOKS_PER_CLOCK = round(1.0 / PERIOD)
+"""Number of looks for changes between two reports of clock and account, which come once a
+second."""
 
 
 class LiveSite(Site):
@@ -95,7 +96,7 @@ class LiveSite(Site):
 
 
 class LiveReader:
-    """The state of the camera as one reader knows it."""
+    """Knows what one reader has received about a camera, and finds later changes."""
 
     def __init__(self, site: ShowsCamera, since: int | None = None) -> None:
         self._site = site
@@ -103,28 +104,28 @@ class LiveReader:
         oldest = self._view.entries[0].serial if self._view.entries else self._view.serial
         self._serial = oldest if since is None else since
         self._last_values: dict[str, Any] = {}
-        self._looks = 0
-        self._history = -1  # version of the history that was sent
+        self._look_count = 0
+        self._sent_history_version = -1
 
-    def look(self) -> Iterator[News]:
-        """Yield the changes since the last look; the first look yields everything."""
+    def find_events(self) -> Iterator[StreamEvent]:
+        """Yield the changes since the last call; the first call yields everything."""
         view = self._view
-        yield from self._changed("camera", self._site.state())
-        yield from self._results()
+        yield from self._event_if_changed("camera", self._site.state())
+        yield from self._result_events()
         picture = 0 if view.picture is None else view.picture.serial
-        yield from self._changed("picture", {"serial": picture})
-        if self._looks % CLOCK_LOOKS == 0:
-            yield from self._changed("account", view.account())
-            points = list(view.series) if self._looks == 0 else list(view.series)[-1:]
-            yield News("clock", {"series": points})
-            if self._history != view.history.version:
-                self._history = view.history.version
-                yield News("history", view.history.as_json())
-        self._looks += 1
+        yield from self._event_if_changed("picture", {"serial": picture})
+        if self._look_count % LOOKS_PER_CLOCK == 0:
+            yield from self._event_if_changed("account", view.account())
+            points = list(view.series) if self._look_count == 0 else list(view.series)[-1:]
+            yield StreamEvent("clock", {"series": points})
+            if self._sent_history_version != view.history.version:
+                self._sent_history_version = view.history.version
+                yield StreamEvent("history", view.history.as_json())
+        self._look_count += 1
 
-    def _results(self) -> Iterator[News]:
+    def _result_events(self) -> Iterator[StreamEvent]:
         view = self._view
-        if self._serial > view.serial:  # number from an earlier process
+        if self._serial > view.serial:  # the reader's number is of an earlier process
             self._serial = 0
         new = [entry for entry in view.entries if entry.serial >= self._serial]
         missed = (new[0].serial if new else view.serial) - self._serial
@@ -133,12 +134,12 @@ class LiveReader:
         if shown or missed:
             self._serial = view.serial
             entries = [result.as_json() for result in shown]
-            yield News("results", {"results": entries, "missed": missed}, self._serial)
+            yield StreamEvent("results", {"results": entries, "missed": missed}, self._serial)
 
-    def _changed(self, kind: str, value: Any) -> Iterator[News]:
+    def _event_if_changed(self, kind: str, value: Any) -> Iterator[StreamEvent]:
         if self._last_values.get(kind) != value:
             self._last_values[kind] = value
-            yield News(kind, value)
+            yield StreamEvent(kind, value)
 
 
 # ---------------------------------------------------------------------- arguments of calls
@@ -159,12 +160,12 @@ CALLS: Calls[ShowsCamera] = Calls()
 """All calls."""
 
 
-async def _commanded(site: ShowsCamera, do: Callable[[], Awaitable[Any]]) -> Any:
-    """Command the camera, if that is allowed."""
+async def _run_command(site: ShowsCamera, command: Callable[[], Awaitable[Any]]) -> Any:
+    """Run a command to the camera if the page may command it; turn its error into a refusal."""
     if not site.control:
         raise RefusedError(403, "a command to the camera", "looking only: no --control was given")
     try:
-        return await do()
+        return await command()
     except SmartCamError as exc:
         raise RefusedError(
             409, f"{type(exc).__name__}: {exc}", "a camera that can do it now"
@@ -199,8 +200,8 @@ def _history(site: ShowsCamera, _call: CallRequest) -> object:
 def _failure(site: ShowsCamera, call: CallRequest) -> web.Response:
     """The picture of a failure, as the camera sent it."""
     serial = call.path["serial"]
-    known = serial.isdecimal() and len(serial) < 12
-    picture = site.view.history.picture(int(serial)) if known else None
+    is_valid = serial.isdecimal() and len(serial) < 12
+    picture = site.view.history.picture(int(serial)) if is_valid else None
     if picture is None:
         raise RefusedError(404, "no picture of it", "one of the last failures that have one")
     return _image(picture)
@@ -216,19 +217,19 @@ def _picture(site: ShowsCamera, _call: CallRequest) -> web.Response:
 
 
 _UNKNOWN = "application/octet-stream"
-_KINDS = ((b"BM", "image/bmp"), (b"\x89PNG", "image/png"), (b"\xff\xd8", "image/jpeg"))
+_IMAGE_TYPES = ((b"BM", "image/bmp"), (b"\x89PNG", "image/png"), (b"\xff\xd8", "image/jpeg"))
 """First bytes of the picture files that cameras send, and their types."""
 
 
 def _image(data: bytes) -> web.Response:
-    kind = next((kind for mark, kind in _KINDS if data.startswith(mark)), _UNKNOWN)
-    return web.Response(body=data, content_type=kind)
+    image_type = next((name for mark, name in _IMAGE_TYPES if data.startswith(mark)), _UNKNOWN)
+    return web.Response(body=data, content_type=image_type)
 
 
 @CALLS.add("POST", f"{API}/picture")
 def _want_picture(site: ShowsCamera, _call: CallRequest) -> object:
     """Ask the camera for its picture anew, once a second at most; an event reports it."""
-    site.view.want_picture()
+    site.view.request_picture()
     return site.view.state()
 
 
@@ -241,7 +242,7 @@ async def _frames(site: ShowsCamera, call: CallRequest) -> web.StreamResponse:
     pictures = site.frames.pictures
     if pictures is None:
         raise RefusedError(404, "a camera without frames", "one of a fleet, with frames: URL there")
-    return await pictures.view(0, call.request)
+    return await pictures.serve_viewer(0, call.request)
 
 
 @CALLS.add(
@@ -252,7 +253,7 @@ async def _frames(site: ShowsCamera, call: CallRequest) -> web.StreamResponse:
 def _events(site: ShowsCamera, call: CallRequest) -> object:
     last = call.request.headers.get("Last-Event-ID", "")
     since = int(last) if last.isdecimal() and len(last) < 20 else None
-    return site.streams.serve(call.request, LiveReader(site, since).look)
+    return site.streams.serve(call.request, LiveReader(site, since).find_events)
 
 
 @CALLS.add("POST", f"{API}/trigger", body=_TriggerBody, optional=True, sample='{"timeout": 5.0}')
@@ -260,14 +261,16 @@ async def _trigger(site: ShowsCamera, call: CallRequest) -> object:
     """Trigger; answers after the result, which an event reports."""
     body: _TriggerBody = call.body
     camera = site.view.camera
-    result = await _commanded(site, lambda: camera.trigger(body.application, timeout=body.timeout))
+    result = await _run_command(
+        site, lambda: camera.trigger(body.application, timeout=body.timeout)
+    )
     return {"number": result.number, "latency": result.latency}
 
 
 @CALLS.add("POST", f"{API}/switch", body=_SwitchBody, sample='{"application": 7}')
 async def _switch(site: ShowsCamera, call: CallRequest) -> object:
     """Load another application."""
-    await _commanded(site, lambda: site.view.camera.switch_application(call.body.application))
+    await _run_command(site, lambda: site.view.camera.switch_application(call.body.application))
     return site.view.state()
 
 
@@ -278,19 +281,19 @@ async def _take_back(site: ShowsCamera, _call: CallRequest) -> object:
     take_back = getattr(camera, "take_back", None)
     if take_back is None:
         raise RefusedError(409, "a camera of no fleet", "one of a fleet: its agent takes it back")
-    await _commanded(site, take_back)
+    await _run_command(site, take_back)
     return site.view.state()
 
 
 @CALLS.add("POST", f"{API}/start")
 async def _start(site: ShowsCamera, _call: CallRequest) -> object:
     """Enter run mode."""
-    await _commanded(site, site.view.camera.start)
+    await _run_command(site, site.view.camera.start)
     return site.view.state()
 
 
 @CALLS.add("POST", f"{API}/stop")
 async def _stop(site: ShowsCamera, _call: CallRequest) -> object:
     """Leave run mode."""
-    await _commanded(site, site.view.camera.stop)
+    await _run_command(site, site.view.camera.stop)
     return site.view.state()

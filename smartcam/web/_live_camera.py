@@ -1,4 +1,4 @@
-"""One camera on the live page, on any site with that page."""
+"""Have the live page show one camera, on every site that has this page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class ShowsCamera(Protocol):
-    """The camera on which the live page's calls act."""
+    """A site with the live page: the camera that the page's calls act on, and its state."""
 
     control: bool  # whether the page may command the camera
     units: PageUnits  # units that the page can show instead of SI
@@ -60,7 +60,7 @@ class WatchedCamera:
         self.used_at: float = 0.0
 
     @property
-    def watched(self) -> bool:
+    def is_watched(self) -> bool:
         """True while there are viewers."""
         pictures = self.frames.pictures
         return bool(len(self.streams)) or (pictures is not None and bool(pictures.viewers))
@@ -81,12 +81,12 @@ class WatchedCamera:
         return state_of(self)
 
 
-def state_of(shown: ShowsCamera) -> dict[str, Any]:
-    """Return the state of a camera and the rights of its page, as values for JSON."""
-    has_frames = shown.frames.pictures is not None
+def state_of(live: ShowsCamera) -> dict[str, Any]:
+    """Return the state of a shown camera and the rights of its page, as values for JSON."""
+    has_frames = live.frames.pictures is not None
     return {
-        **shown.view.state(),
-        "control": shown.control,
+        **live.view.state(),
+        "control": live.control,
         "frames": has_frames,
-        "units": shown.units.as_json(),
+        "units": live.units.as_json(),
     }

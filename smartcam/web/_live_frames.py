@@ -1,4 +1,4 @@
-"""The newest frame of the live page's camera, if that has frames."""
+"""Serve the newest frames of the live page's camera, if that camera has frames."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 JPEG_QUALITY: Final = 80
-"""Quality, 1 to 100, of the JPEGs that the agent makes; low, to save traffic on the bus."""
+"""Quality, 1 to 100, of the JPEGs that the agent makes: low, to save traffic on the bus."""
 
 CHECK_INTERVAL: Final = 0.1
 """Seconds between two checks of which camera the page shows, and whether it has frames."""
@@ -37,15 +37,15 @@ class HasFrames(Protocol):
 
 
 class LiveFrames:
-    """Follows the page's camera, and gives its frames to viewers.
+    """Gives viewers the frames of the camera that the page shows.
 
-    A camera without frames is not asked for any; a camera with frames streams while it has viewers.
+    A camera without frames is not asked for any. A camera with frames streams while it has viewers.
 
     Args:
         camera: function that returns the camera that the page shows now.
 
     Attributes:
-        pictures: pictures of its frames; None without frames.
+        pictures: pictures of the shown camera; None if it has no frames.
     """
 
     def __init__(self, camera: Callable[[], object]) -> None:
@@ -54,11 +54,11 @@ class LiveFrames:
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Begin."""
+        """Start to follow the page's camera."""
         self._task = asyncio.create_task(self._follow(), name="smartcam.live.frames")
 
     async def stop(self) -> None:
-        """End. Harmless when called twice."""
+        """Stop following the camera; do nothing if stopped."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
@@ -68,24 +68,24 @@ class LiveFrames:
         while True:
             camera: object = self._camera()
             if isinstance(camera, HasFrames) and camera.has_frames:
-                await self._show(camera)
+                await self._serve_frames_of(camera)
             await asyncio.sleep(CHECK_INTERVAL)
 
-    async def _show(self, camera: HasFrames) -> None:
-        """Keep the camera's frames until the page shows another camera."""
+    async def _serve_frames_of(self, camera: HasFrames) -> None:
+        """Serve a camera's frames until the page shows another camera."""
         pictures = SitePictures([camera.frame_source("jpeg", JPEG_QUALITY)], JPEG_QUALITY)
         pictures.start()
-        keeping = asyncio.create_task(pictures.keep_open(0), name="smartcam.live.source")
+        open_task = asyncio.create_task(pictures.keep_open(0), name="smartcam.live.source")
         self.pictures = pictures
         try:
-            while (  # noqa: ASYNC110 - nothing tells of it
-                self._camera() is camera and camera.has_frames and not keeping.done()
+            while (  # noqa: ASYNC110 - there is no event for it
+                self._camera() is camera and camera.has_frames and not open_task.done()
             ):
                 await asyncio.sleep(CHECK_INTERVAL)
         finally:
             self.pictures = None
-            keeping.cancel()
-            await asyncio.wait([keeping])
+            open_task.cancel()
+            await asyncio.wait([open_task])
             await pictures.stop()
-            if not keeping.cancelled():
-                _log.error("! the live page's frames end", exc_info=keeping.exception())
+            if not open_task.cancelled():
+                _log.error("! the live page's frames end", exc_info=open_task.exception())

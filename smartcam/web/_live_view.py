@@ -1,4 +1,4 @@
-"""Keep the live page's data: the last results, their rate, the last picture."""
+"""Keep the data of the live page: the last results, their rate, the last picture."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_RESULTS = 100
 """Largest number of results on the page; older ones are dropped."""
 
 MAX_VALUE_CHARACTERS = 20_000
-"""Largest number of characters of JSON that a value may have on the page; a larger one is cut."""
+"""Largest number of characters of a value as JSON on the page; a longer text is cut."""
 
 MAX_PARTS = 500
 """Largest number of localizations of a result that the page draws."""
@@ -35,7 +35,7 @@ MAX_SHOWN_RAW_BYTES = 64
 """Largest number of bytes of a container that the page shows."""
 
 SERIES_DURATION = 300
-"""Seconds of rate and latency that the page draws."""
+"""Seconds for which the page draws rate and latency."""
 
 IMAGE_PERIOD = 1.0
 """Least number of seconds between two pictures that are fetched for the page."""
@@ -43,7 +43,7 @@ IMAGE_PERIOD = 1.0
 
 @runtime_checkable
 class DrawsPictures(Protocol):
-    """A camera that draws its programs' findings into the last picture."""
+    """A camera that draws what its programs found into the last picture."""
 
     async def read_drawn_image(self) -> bytes:
         """Return the picture as a file's bytes."""
@@ -51,12 +51,12 @@ class DrawsPictures(Protocol):
 
 
 class ShownResult(NamedTuple):
-    """A result, or an error in its place."""
+    """A result on the page, or the error of a container that could not be read."""
 
     serial: int  # counted from 0
     result: Result[Any] | None
     error: str  # reason why a container could not be read, or ""
-    layout: Layout | None = None  # layout of tables, which have no units themselves
+    layout: Layout | None = None  # layout that a table's units come from
 
     def as_json(self) -> dict[str, Any]:
         """Return the result for the page, as values for JSON."""
@@ -72,7 +72,7 @@ class ShownResult(NamedTuple):
             "latency": result.latency,
             "size": len(result.raw),
             "raw": result.raw[:MAX_SHOWN_RAW_BYTES].hex(" "),
-            **shown_value(result.value, self.layout),
+            **value_fields(result.value, self.layout),
         }
 
 
@@ -102,20 +102,22 @@ class LiveView:
         history: ShiftHistory | None = None,
     ) -> None:
         self.history: ShiftHistory = history or ShiftHistory()
-        self._writes = history is None
+        self._owns_history = history is None
         self.camera: Camera[Any] = camera
         self.entries: collections.deque[ShownResult] = collections.deque(maxlen=MAX_RESULTS)
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES_DURATION)
         self.picture: Picture | None = None
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # time of the last connection or loss
-        self.changed_seen: bool = False  # False: that was before the view began
-        self.loss: str = ""  # reason why it is not connected, or ""
-        self._end: SmartCamError | None = None  # reason why it will never be connected again
+        self.changed_seen: bool = False  # False: it was before the view began
+        self.loss: str = ""  # reason why the camera is not connected, or ""
+        self._end_error: SmartCamError | None = (
+            None  # error that ended the camera's events for good
+        )
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
-        self._failure_asked = 0  # number of the failure whose picture was asked for
+        self._asked_failure = 0  # serial of the last failure whose picture was fetched
         self._latencies: list[float] = []  # latencies of the current second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
@@ -130,12 +132,17 @@ class LiveView:
         return self._serial
 
     def start(self) -> None:
-        """Begin."""
-        jobs = (self._follow_results(), self._follow_events(), self._tick(), self._fetch_pictures())
+        """Start to follow the camera."""
+        jobs = (
+            self._follow_results(),
+            self._follow_events(),
+            self._sample_rates(),
+            self._fetch_pictures(),
+        )
         self._tasks = [asyncio.create_task(job, name="smartcam.live") for job in jobs]
 
     async def stop(self) -> None:
-        """End. Harmless when called twice."""
+        """Stop following the camera; do nothing if stopped."""
         tasks, self._tasks = self._tasks, []
         self._results.close()
         self._events.close()
@@ -144,28 +151,28 @@ class LiveView:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def follow(self, camera: Camera[Any], loss: str) -> None:
-        """Show this unopened camera instead; ``loss``: reason why the old one is not connected.
+        """Follow another camera, which is not open yet; ``loss``: why the old one was left.
 
         Cancellation: leaves the view stopped.
         """
         await self.stop()
-        self._end, self.loss = None, loss
+        self._end_error, self.loss = None, loss
         self.camera = camera
         self._subscribe(camera)
         self.start()
 
-    def show(self, result: Result[Any]) -> None:
-        """Show a result from before the view began."""
-        self._add(result)
+    def add_result(self, result: Result[Any]) -> None:
+        """Add a result from before the view began."""
+        self._add_entry(result)
 
-    def want_picture(self) -> None:
-        """Fetch the camera's picture as soon as it is due, while there are viewers."""
+    def request_picture(self) -> None:
+        """Have the camera's picture fetched soon, while there are viewers."""
         self._picture_wanted = True
 
     def state(self) -> dict[str, Any]:
         """Return the state of the camera, as values for JSON."""
         camera = self.camera
-        known = camera.active_application is not None
+        has_state = camera.active_application is not None
         return {
             "name": camera.name,
             "url": camera.url,
@@ -174,9 +181,9 @@ class LiveView:
             "last_error": "" if camera.connected else camera.statistics().last_error or "",
             "changed_at": self.changed_at,
             "changed_seen": self.changed_seen,
-            "status": camera.status.names if known else [],
+            "status": camera.status.names if has_state else [],
             "application": camera.active_application,
-            "can": camera.capabilities if known else None,
+            "can": camera.capabilities if has_state else None,
             "picture_error": self.picture_error,
         }
 
@@ -185,13 +192,13 @@ class LiveView:
             return "connected"
         if self.camera.active_application is None:
             return "awaited"
-        if isinstance(self._end or self.camera.trouble, ConnectionTakenError):
+        if isinstance(self._end_error or self.camera.trouble, ConnectionTakenError):
             return "taken"
-        return "lost" if self._end is None else "ended"
+        return "lost" if self._end_error is None else "ended"
 
     def account(self) -> dict[str, Any]:
         """Return the counters of results, as values for JSON."""
-        counted = self.camera.statistics()
+        statistics = self.camera.statistics()
         names = (
             *("received", "triggered", "streamed", "late", "wrong_application"),
             *(
@@ -202,9 +209,11 @@ class LiveView:
                 "reconnects",
             ),
         )
-        return {name: getattr(counted, name) for name in names} | {"not_shown": self._not_shown()}
+        return {name: getattr(statistics, name) for name in names} | {
+            "not_shown": self._unshown_count()
+        }
 
-    def _not_shown(self) -> int:
+    def _unshown_count(self) -> int:
         """Return the number of results dropped because the page was too slow for them."""
         return self._results.statistics().dropped
 
@@ -215,24 +224,24 @@ class LiveView:
             try:
                 batch = await anext(self._results)
             except InterpretationError as exc:
-                self._add(None, str(exc))
+                self._add_entry(None, str(exc))
                 continue
             except (StopAsyncIteration, SmartCamError):
                 return
-            if self._writes:
+            if self._owns_history:
                 for result in batch:
                     self.history.add(result)
             self._serial += max(0, len(batch) - MAX_RESULTS)
             for result in batch[-MAX_RESULTS:]:
-                self._add(result)
+                self._add_entry(result)
             self._latencies += [result.latency for result in batch if result.latency is not None]
             self._picture_wanted = True
 
-    def _add(self, result: Result[Any] | None, error: str = "") -> None:
+    def _add_entry(self, result: Result[Any] | None, error: str = "") -> None:
         layout = None if result is None else layout_of(self.camera, result)
         self.entries.append(ShownResult(self._serial, result, error, layout))
         self._serial += 1
-        if not self._writes:
+        if not self._owns_history:
             return
         if result is None:
             self.history.add_error(error)
@@ -243,32 +252,38 @@ class LiveView:
                 if isinstance(event, (Connected, Reconnected, Disconnected)):
                     self.changed_at, self.changed_seen = event.at.timestamp(), True
                     self.loss = event.reason if isinstance(event, Disconnected) else ""
-                    if isinstance(event, Disconnected) and not event.expected and self._writes:
+                    if (
+                        isinstance(event, Disconnected)
+                        and not event.expected
+                        and self._owns_history
+                    ):
                         self.history.add_loss(self.loss)
                     self._picture_wanted |= not self.loss
         except SmartCamError as exc:
-            self._end, self.loss = exc, str(exc)
+            self._end_error, self.loss = exc, str(exc)
             self.changed_at, self.changed_seen = time.time(), True
 
-    async def _tick(self) -> None:
-        before = self.camera.statistics().received
+    async def _sample_rates(self) -> None:
+        last_received = self.camera.statistics().received
         while True:
             await asyncio.sleep(1.0)
             received = self.camera.statistics().received
             latencies, self._latencies = sorted(self._latencies), []
             median = latencies[len(latencies) // 2] if latencies else None
             self.series.append(
-                {"at": time.time(), "rate": max(0, received - before), "latency": median}
+                {"at": time.time(), "rate": max(0, received - last_received), "latency": median}
             )
-            before = received
+            last_received = received
 
     async def _fetch_pictures(self) -> None:
         while True:
-            wanted = self._picture_wanted and self._is_watched()
+            is_wanted = self._picture_wanted and self._is_watched()
             failure = self.history.last_failure
-            missing = self._writes and self.history.wants_picture and failure != self._failure_asked
-            if (wanted or missing) and self.camera.connected:
-                self._failure_asked = failure
+            is_missing = (
+                self._owns_history and self.history.wants_picture and failure != self._asked_failure
+            )
+            if (is_wanted or is_missing) and self.camera.connected:
+                self._asked_failure = failure
                 self._picture_wanted = False
                 if self.camera.capabilities.read_image:
                     await self._fetch_picture()
@@ -288,28 +303,33 @@ class LiveView:
             self.picture_error = str(exc)
         else:
             self.picture_error = ""
-            # no newer result came meanwhile
-            if self._writes and failure == self.history.last_failure and not self._results.waiting:
-                self.history.attach(failure, data)
+            # only if no newer result came meanwhile: the picture may be of that one
+            if (
+                self._owns_history
+                and failure == self.history.last_failure
+                and not self._results.waiting
+            ):
+                self.history.attach_picture(failure, data)
             self.picture = Picture(1 + (self.picture.serial if self.picture else 0), data)
 
 
 def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
-    """Return the layout by which a camera's result was read; None without one."""
+    """Return the layout by which a camera's result was interpreted; None without a layout."""
     interpreter = own_interpreter(camera, result.application)
     return None if interpreter is None else interpreter.layout
 
 
-def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
+def value_fields(value: Any, layout: Layout | None = None) -> dict[str, Any]:
     """Return a value for the page: parts to draw, or JSON, which is cut if it is long.
 
-    ``units``: units of its fields, and of the fields of its lists. ``layout``: layout of a table.
+    ``units`` has the units of its fields, and of the fields of its lists; those of a table come
+    from ``layout``.
     """
     if isinstance(value, list) and all(isinstance(part, Localization) for part in value):
         localizations: list[Localization] = value
         frame = localizations[0].pose.header.frame_id if localizations else ""
         return {
-            "parts": [_part(localization) for localization in localizations[:MAX_PARTS]],
+            "parts": [_part_fields(localization) for localization in localizations[:MAX_PARTS]],
             "count": len(localizations),
             "frame": frame,
         }
@@ -342,8 +362,8 @@ def _as_text(value: Any) -> Any:
     return text if text and text.replace("\n", " ").isprintable() else value
 
 
-def _part(localization: Localization) -> dict[str, Any]:
-    """Return a part's place on the plane: metres, and radians about z."""
+def _part_fields(localization: Localization) -> dict[str, Any]:
+    """Return a part's position in metres, and its angle about z in radians."""
     (x, y, z), (i, j, k, w) = localization.pose.position, localization.pose.orientation
     theta = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
     place = {"x": x, "y": y, "z": z, "theta": theta}

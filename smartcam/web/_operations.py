@@ -1,4 +1,4 @@
-"""An agent's health and numbers over HTTP: ``/healthz``, ``/readyz``, ``/metrics``."""
+"""Serve an agent's health and numbers over HTTP: ``/healthz``, ``/readyz``, ``/metrics``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._inside import OperationsSection, exposition, read_numbers, require_client
 from smartcam.settings import validated
-from smartcam.web._connections import visitor_of
+from smartcam.web._connections import connection_of
 from smartcam.web._errors import RefusedError
 from smartcam.web._guard import HEADERS, check_host
 from smartcam.web._site import OpenPort, open_port
@@ -66,10 +66,10 @@ class OperationsSite(Server):
             raise ConfigurationError("operations.listen: null: there is nowhere to listen")
         self._host, self._port = section.place
         self._names = {socket.gethostname().lower(), *(name.lower() for name in section.names)}
-        self._each = section.latency == "camera"
-        self._tried = False
-        self._open: OpenPort | None = None
-        self._making: asyncio.Task[tuple[bytes, str]] | None = None
+        self._per_camera = section.latency == "camera"
+        self._all_tried = False
+        self._open_port: OpenPort | None = None
+        self._metrics_task: asyncio.Task[tuple[bytes, str]] | None = None
 
     @property
     def port(self) -> int:
@@ -84,10 +84,10 @@ class OperationsSite(Server):
 
         Cancellation: leaves the site stopped.
         """
-        if self._open is not None:
+        if self._open_port is not None:
             return
         names = None if is_loopback(self._host) else self._names
-        application = web.Application(middlewares=[_guarded(names)], client_max_size=0)
+        application = web.Application(middlewares=[_middleware(names)], client_max_size=0)
         application.on_response_prepare.append(_add_headers)
         for path, handler in self._pages().items():
             application.router.add_get(path, handler)
@@ -97,20 +97,20 @@ class OperationsSite(Server):
             raise ConfigurationError(
                 f"operations.listen: cannot listen on {self._host}:{self._port}: {exc}"
             ) from exc
-        self._port, self._open = opened.port, opened
+        self._port, self._open_port = opened.port, opened
 
     async def stop(self) -> None:
         """Close the port and every connection; do nothing if stopped. Bounded."""
-        opened, self._open = self._open, None
+        opened, self._open_port = self._open_port, None
         if opened is None:
             return
         try:
             await finish(opened.close)
         finally:
-            making, self._making = self._making, None
-            if making is not None:
-                making.cancel()
-                await asyncio.wait({making})
+            task, self._metrics_task = self._metrics_task, None
+            if task is not None:
+                task.cancel()
+                await asyncio.wait({task})
 
     # ------------------------------------------------------------------ answers
 
@@ -130,15 +130,16 @@ class OperationsSite(Server):
         )
 
     def readiness(self) -> dict[str, Any]:
-        """Return the readiness: the agent is on the bus and has tried each camera once; for JSON.
+        """Return the readiness, as values for JSON.
 
-        A camera that is lost, or added by a reload, does not change it.
+        The agent is ready when it is on the bus and has once tried to connect to each camera. A
+        camera that is lost, or added by a reload, does not change this.
         """
         server = self._server
         hosts = server.hosts.values()
         started = server.agent is not None
         tried = sum(host.was_tried for host in hosts)
-        self._tried = started and (self._tried or tried == len(hosts))
+        self._all_tried = started and (self._all_tried or tried == len(hosts))
         missing = [host.name for host in hosts if not host.connected]
         reason = None
         if not server.reached:
@@ -147,7 +148,7 @@ class OperationsSite(Server):
                 reason += f": nobody answers at {', '.join(server.file.endpoints[1])}"
         elif server.agent is not None and server.agent.retired_by is not None:
             reason = str(server.agent.retired_by)
-        elif not self._tried:
+        elif not self._all_tried:
             reason = f"{tried} of {len(hosts)} cameras were tried"
         return {
             "ready": reason is None,
@@ -160,20 +161,20 @@ class OperationsSite(Server):
 
     async def _metrics(self, _request: web.Request) -> web.Response:
         """Answer with the current numbers; requests at the same time get the same answer."""
-        if self._making is None or self._making.done():
-            self._making = asyncio.get_running_loop().create_task(
-                self._made(), name="smartcam.metrics"
+        if self._metrics_task is None or self._metrics_task.done():
+            self._metrics_task = asyncio.get_running_loop().create_task(
+                self._make_metrics(), name="smartcam.metrics"
             )
-        body, kind = await asyncio.shield(self._making)
+        body, kind = await asyncio.shield(self._metrics_task)
         return web.Response(body=body, headers={"Content-Type": kind})
 
-    async def _made(self) -> tuple[bytes, str]:
+    async def _make_metrics(self) -> tuple[bytes, str]:
         numbers = await read_numbers(self._server)
-        return await exposition(numbers, each=self._each)
+        return await exposition(numbers, per_camera=self._per_camera)
 
 
-def _guarded(names: Collection[str] | None) -> Any:
-    """Return the middleware of all handlers: the connection's place, the guard, refusals as text.
+def _middleware(names: Collection[str] | None) -> Any:
+    """Return the middleware of all handlers: it bounds connections, and refuses with a text.
 
     Args:
         names: names of this machine that requests may use; None: only loopback names.
@@ -181,12 +182,12 @@ def _guarded(names: Collection[str] | None) -> Any:
 
     @web.middleware
     async def guarded(request: web.Request, handler: _Handler) -> web.StreamResponse:
-        visitor = visitor_of(request)
+        connection = connection_of(request)
         with contextlib.ExitStack() as stack:
-            if visitor is not None:
-                stack.enter_context(visitor.request(request))
-                stack.enter_context(visitor.answer())
-            response = await _answered(request, handler, names)
+            if connection is not None:
+                stack.enter_context(connection.serving_request(request))
+                stack.enter_context(connection.answering())
+            response = await _answer(request, handler, names)
         if not request.content.is_eof():
             response.force_close()
         return response
@@ -194,7 +195,7 @@ def _guarded(names: Collection[str] | None) -> Any:
     return guarded
 
 
-async def _answered(
+async def _answer(
     request: web.Request, handler: _Handler, names: Collection[str] | None
 ) -> web.StreamResponse:
     """Return the answer to a request; it shows no details of an internal error."""
@@ -202,7 +203,7 @@ async def _answered(
         check_host(request.host, names)
         return await handler(request)
     except RefusedError as exc:
-        text = f"{exc.status} {exc.came}: expected {exc.expected}\n"
+        text = f"{exc.status} {exc.received}: expected {exc.expected}\n"
         return web.Response(status=exc.status, text=text)
     except web.HTTPException as exc:
         text = f"{exc.status} {exc.reason}: there are /healthz, /readyz, /metrics\n"

@@ -1,4 +1,4 @@
-"""The pages of the sites: a common frame with the contents of each page's file."""
+"""Put the pages of the sites together: a common head and top, and each page's own file."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ class Page(NamedTuple):
 
     Attributes:
         title: title of the page.
-        printed: the command that prints the page's address, as HTML; empty for a page with a top of
-            its own.
+        printed: the command that prints the page's address, as HTML; empty for a page that has its
+            own top.
         styles: names of the style sheets before its own.
-        beside: contents beside the title, as HTML.
+        beside: what stands next to the title, as HTML.
         does: verb in the sentence about the page's calls, ``does`` or ``shows``.
     """
 
@@ -49,12 +49,12 @@ PAGES: Final = {
 
 
 def read_file(name: str) -> bytes:
-    """Return one of the files that pages are made of."""
+    """Return the bytes of a file of ``smartcam/web/page``."""
     return importlib.resources.files("smartcam.web").joinpath("page", name).read_bytes()
 
 
 def page_html(name: str) -> str:
-    """Return a page: the common head and top, and the page's own contents."""
+    """Return the HTML of a page: the common head and top, then its own file."""
     page = PAGES[name]
     sheets = [f'  <link rel="stylesheet" href="/{sheet}.css">' for sheet in (*page.styles, name)]
     values = page._asdict() | {"styles": "\n".join(sheets), "script": name}

@@ -1,9 +1,8 @@
-"""The newest frames of some sources, for viewers: the common part of pages with pictures.
+"""Send the newest frames of some sources to viewers, for all pages that have pictures.
 
-Each viewer of a source has its own reader and WebSocket, with at most one picture in transfer: when
-the page reports that it has shown the last picture, the newest one is sent. So a slow
-viewer skips pictures, and delays neither the device nor other viewers. Without viewers there is no
-reader, and the device does not stream.
+Each viewer of a source has its own reader and WebSocket. The newest picture is sent when the page
+reports that it has shown the last one. So a slow viewer skips pictures, and delays neither the
+device nor other viewers. Without viewers there is no reader, and the device does not stream.
 """
 
 from __future__ import annotations
@@ -39,30 +38,30 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 FILES: Final = ("pictures.css", "pictures.js")
-"""Files of pages with pictures, beside their own."""
+"""Files that pages with pictures need in addition to their own."""
 
 MAX_VIEWERS: Final = 32
-"""Largest number of WebSockets at a time: eight people before four cameras."""
+"""Largest number of WebSockets at a time: eight people who each look at four cameras."""
 
 PROTOCOL: Final = "smartcam.frames"
 """Subprotocol of the WebSockets that send pictures."""
 
 MAX_PICTURE_BYTES: Final = 1 << 24
-"""Largest number of bytes of a picture that is sent; a camera's own JPEGs may be of any
+"""Largest number of bytes of a picture that is sent; JPEGs that come from a camera can be of any
 size."""
 
 ACCOUNT_PERIOD: Final = 1.0
-"""Seconds without a frame after which the page gets the account anyway."""
+"""Seconds without a frame after which the page gets the counts of frames without a picture."""
 
 THREADS: Final = 2
-"""Threads that make JPEGs; more threads would wait for the processor."""
+"""Number of threads that make JPEGs; more threads would only wait for the processor."""
 
 REOPEN_BACKOFF: Final = Backoff(initial=0.5, maximum=5.0)
 """Delays before a source that ended with an error is read again."""
 
 
 def _ignore(_error: SmartCamError | None) -> None:
-    """Ignore the outcome of a try."""
+    """Ignore the result of an attempt to open a source."""
 
 
 class SitePictures:
@@ -74,7 +73,7 @@ class SitePictures:
 
     Attributes:
         sources: the given sources.
-        failures: reason why a source is not open, by its place in ``sources``.
+        failures: reason why a source is not open, by its index in ``sources``.
         viewers: sockets of the pages that show a source.
     """
 
@@ -85,17 +84,17 @@ class SitePictures:
         self.failures: dict[int, str] = {}
         self.viewers: set[Viewer] = set()
         self._quality = quality
-        self._presses: list[Press] = []
+        self._jpeg_makers: list[JpegMaker] = []
         self._threads: ThreadPoolExecutor | None = None
 
     def start(self) -> None:
         """Start the threads that make pictures; do nothing if they run."""
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="smartcam.web.jpeg")
-            self._presses = [Press(self._threads, self._quality) for _ in self.sources]
+            self._jpeg_makers = [JpegMaker(self._threads, self._quality) for _ in self.sources]
 
     def end_viewers(self) -> None:
-        """Notify all viewers of the site's end."""
+        """Tell all viewers that the site ends."""
         for viewer in self.viewers:
             viewer.end()
 
@@ -106,28 +105,28 @@ class SitePictures:
         """
         self.end_viewers()
         for viewer in tuple(self.viewers):
-            await viewer.gone.wait()
+            await viewer.has_left.wait()
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)
 
-    def press(self, place: int) -> Press:
-        """Return the maker of JPEGs of a source."""
-        return self._presses[place]
+    def jpeg_maker(self, index: int) -> JpegMaker:
+        """Return the object that makes the JPEGs of a source."""
+        return self._jpeg_makers[index]
 
-    def state(self, place: int) -> dict[str, Any]:
+    def state(self, index: int) -> dict[str, Any]:
         """Return the state of a source, as values for JSON."""
-        source = self.sources[place]
+        source = self.sources[index]
         try:
-            streams: str | None = str(source.format)
-        except LocalProtocolError:
-            streams = None
+            format_text: str | None = str(source.format)
+        except LocalProtocolError:  # not open
+            format_text = None
         account = source.statistics()
         return {
-            "place": place,
+            "place": index,
             "name": source.name,
-            "format": streams,
-            "failure": self._failure(place) if streams is None else "",
+            "format": format_text,
+            "failure": self._failure(index) if format_text is None else "",
             "streaming": account.streaming,
             "readers": account.readers,
             "started": account.started,
@@ -136,70 +135,72 @@ class SitePictures:
             "features": source.has_features,
         }
 
-    def _failure(self, place: int) -> str:
-        return self.failures.get(place, f"{self.sources[place].name} is not open")
+    def _failure(self, index: int) -> str:
+        return self.failures.get(index, f"{self.sources[index].name} is not open")
 
     async def keep_open(
-        self, place: int, tried: Callable[[SmartCamError | None], None] = _ignore
+        self, index: int, on_attempt: Callable[[SmartCamError | None], None] = _ignore
     ) -> None:
         """Keep a source open until the task is cancelled; try again if it cannot be opened.
 
         Args:
-            place: place of the source.
-            tried: function that gets the error of each try, None for success.
+            index: index of the source.
+            on_attempt: function that gets the error of each attempt; None: it succeeded.
         """
         for delay in Backoff().delays():
             try:
-                async with self.sources[place]:
-                    self.failures.pop(place, None)
-                    tried(None)
+                async with self.sources[index]:
+                    self.failures.pop(index, None)
+                    on_attempt(None)
                     await asyncio.Event().wait()
             except (FrameSourceError, ConfigurationError, UnsupportedError) as exc:
-                self.failures[place] = str(exc)
-                tried(exc)
+                self.failures[index] = str(exc)
+                on_attempt(exc)
             await asyncio.sleep(delay)
 
-    async def view(self, place: int, request: web.Request) -> web.WebSocketResponse:
-        """Show a source to a viewer, until the end.
+    async def serve_viewer(self, index: int, request: web.Request) -> web.WebSocketResponse:
+        """Send the pictures of a source to a viewer until the viewer leaves or the site ends.
 
         Raises:
             RefusedError: the request is no WebSocket, or there are :data:`MAX_VIEWERS` already.
         """
         check_websocket(request, PROTOCOL, len(self.viewers), MAX_VIEWERS)
-        return await Viewer(self, place, request).serve()
+        return await Viewer(self, index, request).serve()
 
 
-class Press:
-    """Makes JPEGs of a source in threads, each frame once for all viewers."""
+class JpegMaker:
+    """Makes the JPEGs of a source in threads; each frame once for all viewers."""
 
     def __init__(self, threads: ThreadPoolExecutor, quality: int) -> None:
         self._threads = threads
         self._quality = quality
         self._frame: Frame | None = None
-        self._made: asyncio.Future[bytes] | None = None
+        self._jpeg_future: asyncio.Future[bytes] | None = None
 
     async def jpeg(self, frame: Frame) -> bytes:
         """Return a frame as a JPEG.
 
         Raises:
-            FrameFormatError: its bytes are wrong, or too many.
+            FrameFormatError: the frame's bytes are wrong, or the JPEG is too large.
             MissingExtraError: a codec is not installed.
 
-        Cancellation: safe; other callers that wait for the JPEG get it.
+        Cancellation: safe; other callers that wait for the same JPEG still get it.
         """
-        if self._made is None or self._frame is not frame:
+        if self._jpeg_future is None or self._frame is not frame:
             loop = asyncio.get_running_loop()
             self._frame = frame
-            self._made = loop.run_in_executor(self._threads, _pressed, frame, self._quality)
-            self._made.add_done_callback(_retrieved)
-        return await asyncio.shield(self._made)
+            self._jpeg_future = loop.run_in_executor(
+                self._threads, _make_jpeg, frame, self._quality
+            )
+            self._jpeg_future.add_done_callback(_mark_retrieved)
+        return await asyncio.shield(self._jpeg_future)
 
-    def forget(self) -> None:
-        """Drop the kept pictures."""
-        self._frame = self._made = None
+    def drop_picture(self) -> None:
+        """Drop the last frame and its JPEG."""
+        self._frame = self._jpeg_future = None
 
 
-def _pressed(frame: Frame, quality: int) -> bytes:
+def _make_jpeg(frame: Frame, quality: int) -> bytes:
     with from_part("frames", "pictures on a page need"):
         from smartcam.web._jpeg import jpeg
     data = jpeg(frame, quality)
@@ -211,53 +212,53 @@ def _pressed(frame: Frame, quality: int) -> bytes:
     return data
 
 
-def _retrieved(made: asyncio.Future[bytes]) -> None:
-    if not made.cancelled():
-        made.exception()  # marks the error as handled if all callers are gone
+def _mark_retrieved(future: asyncio.Future[bytes]) -> None:
+    if not future.cancelled():
+        future.exception()  # asyncio would log an error that no caller retrieves
 
 
 class Viewer(PageSocket):
-    """The WebSocket of a page that shows a source.
+    """The WebSocket that sends the pictures of a source to a page.
 
     Attributes:
-        place: place of the source.
+        place: index of the source.
         address: address of the viewer.
-        gone: event that is set when the viewer has left.
+        has_left: event that is set when the viewer has left.
     """
 
-    def __init__(self, pictures: SitePictures, place: int, request: web.Request) -> None:
+    def __init__(self, pictures: SitePictures, index: int, request: web.Request) -> None:
         super().__init__(request, PROTOCOL, "picture")
         self._pictures = pictures
-        self._source = pictures.sources[place]
-        self.place: int = place
+        self._source = pictures.sources[index]
+        self.place: int = index
         self.address: str = request.remote or ""
-        self.gone = asyncio.Event()
-        self._sent = 0
+        self.has_left = asyncio.Event()
+        self._sent_count = 0
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show frames until the page is closed."""
+        """Send pictures until the page is closed."""
         self._pictures.viewers.add(self)
         try:
             return await super().serve()
         finally:
             self._pictures.viewers.discard(self)
-            self.gone.set()
+            self.has_left.set()
             if not any(viewer.place == self.place for viewer in self._pictures.viewers):
-                self._pictures.press(self.place).forget()
+                self._pictures.jpeg_maker(self.place).drop_picture()
 
-    async def _show(self) -> None:
-        """Show frames, and read the source again after it ended.
+    async def _send_messages(self) -> None:
+        """Send pictures, and read the source again after it was lost.
 
-        The page shows a lost source as lost until its next picture.
+        The page shows a source as lost until the next picture arrives.
         """
         delays, lost = REOPEN_BACKOFF.delays(), False
         while True:
-            before = self._sent
+            count_before = self._sent_count
             try:
                 async with self._source.reader(timeout=ACCOUNT_PERIOD) as reader:
                     if not lost:
                         await self._send({"state": "waiting", **self._pictures.state(self.place)})
-                    await self._show_frames(reader)
+                    await self._send_pictures(reader)
             except LocalProtocolError:
                 await self._send(
                     {"state": "awaited", "text": self._pictures.state(self.place)["failure"]}
@@ -268,49 +269,49 @@ class Viewer(PageSocket):
                 lost = True
             else:
                 await self._send({"state": "ended", "text": f"{self._source.name} has ended."})
-                # after a second message the page would play the recording again
+                # a new reader would play a recording again from its start
                 await asyncio.Event().wait()
-            if self._sent > before:
+            if self._sent_count > count_before:
                 delays = REOPEN_BACKOFF.delays()
             await asyncio.sleep(next(delays))
 
-    async def _show_frames(self, reader: FrameReader) -> None:
-        """Show frames until the source ends."""
-        bad = 0
+    async def _send_pictures(self, reader: FrameReader) -> None:
+        """Send pictures until the source ends."""
+        bad_count = 0
         while True:
             try:
                 frame = await anext(reader)
             except FrameTimeoutError:
-                await self._send({"account": _account(reader, bad)})
+                await self._send({"account": _account(reader, bad_count)})
                 continue
             except StopAsyncIteration:
                 return
             try:
-                picture = await self._pictures.press(self.place).jpeg(frame)
+                picture = await self._pictures.jpeg_maker(self.place).jpeg(frame)
             except FrameFormatError as exc:
-                bad += 1
-                await self._send({"account": _account(reader, bad), "bad": str(exc)})
+                bad_count += 1
+                await self._send({"account": _account(reader, bad_count), "bad": str(exc)})
                 continue
-            await self._send_picture(_about(frame), _account(reader, bad), picture)
+            await self._send_picture(_frame_fields(frame), _account(reader, bad_count), picture)
 
     async def _send_picture(
         self, frame: dict[str, Any], account: dict[str, Any], picture: bytes
     ) -> None:
-        """Send a picture after its JSON, and wait until it is shown; TimeoutError: too late."""
+        """Send JSON and a picture, and wait until the page has shown it; TimeoutError: too late."""
         head = json.dumps({"frame": frame, "account": account}).encode()
-        self._shown.clear()
+        self._was_shown.clear()
         async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_bytes(len(head).to_bytes(4, "little") + head + picture)
-            self._sent += 1
-            await self._shown.wait()
+            self._sent_count += 1
+            await self._was_shown.wait()
 
     async def _send(self, value: dict[str, Any]) -> None:
         async with asyncio.timeout(SHOW_TIMEOUT):
             await self._socket.send_str(json.dumps(value))
 
 
-def _about(frame: Frame) -> dict[str, Any]:
-    """Return the description of a frame for a page, with the frame's present age."""
+def _frame_fields(frame: Frame) -> dict[str, Any]:
+    """Return a frame's properties for a page; ``age`` is its age now."""
     return {
         "sequence": frame.sequence,
         "width": frame.width,
@@ -321,8 +322,8 @@ def _about(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _account(reader: FrameReader, bad: int) -> dict[str, Any]:
-    """Return the counts of a viewer's frames so far; ``at``: seconds of ``time.monotonic()``."""
+def _account(reader: FrameReader, bad_count: int) -> dict[str, Any]:
+    """Return the counts of a viewer's frames so far, and their time by ``time.monotonic()``."""
     account = reader.statistics()
     return {
         "at": time.monotonic(),
@@ -330,5 +331,5 @@ def _account(reader: FrameReader, bad: int) -> dict[str, Any]:
         "delivered": account.delivered,
         "skipped": account.skipped,
         "lost": account.lost,
-        "bad": bad,
+        "bad": bad_count,
     }

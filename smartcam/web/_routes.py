@@ -1,7 +1,7 @@
-"""HTTP calls as a table: method, path, arguments, handler.
+"""Define HTTP calls by a table: method, path, arguments, handler.
 
-A call gets a JSON body or a query, which pydantic checks, and answers JSON. Handlers are plain
-functions: their effect on an emulator is complete when they return.
+A call gets a JSON body or a query, which pydantic checks, and answers JSON. Most handlers are plain
+functions, whose effect is complete when they return.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from smartcam.exceptions import ConfigurationError, LinkError
 from smartcam.models import jsonable
-from smartcam.web._connections import visitor_of
-from smartcam.web._errors import RefusedError, shown, wrong_fields_error
+from smartcam.web._connections import connection_of
+from smartcam.web._errors import RefusedError, short_repr, wrong_fields_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,7 +35,7 @@ MAX_BODY_BYTES = 1 << 18
 """Largest number of bytes of a call's body: room for a fault that inserts 64 kB, in hex."""
 
 READ_TIMEOUT = 10.0
-"""Seconds within which a call's body must have come."""
+"""Seconds within which a call's body must have been received."""
 
 C = TypeVar("C")
 
@@ -57,8 +57,8 @@ class CallRequest:
 
     request: web.Request  # the request; its body was read
     path: Mapping[str, str]  # the variable parts of the path
-    query: Any  # the call's query, checked; None if it takes none
-    body: Any  # the call's body, checked; None if it takes none
+    query: Any  # the checked query; None if the call has no query
+    body: Any  # the checked body; None if the call has no body
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,14 +67,13 @@ class _Call(Generic[C]):
 
     method: _Method  # HTTP method
     path: str  # path with variable parts in braces
-    about: str  # purpose and answer, for people
-    # handler: gets the site and the request; returns the answer, or raises RefusedError. An
-    # event stream returns a coroutine.
+    about: str  # text on purpose and answer, for people
+    # function that gets the site and the request, and returns the answer or a coroutine of it
     handler: Action[C]
-    query: type[BaseModel] | None = None  # the query's model; None: it takes none
-    body: _Model | None = None  # the body's model; None: it takes none
+    query: type[BaseModel] | None = None  # the query's model; None: the call has no query
+    body: _Model | None = None  # the body's model; None: the call has no body
     optional: bool = False  # whether the body may be missing
-    sample: str = ""  # a body, for people
+    sample: str = ""  # an example of a body, for people
 
     async def answer(self, site: C, request: web.Request) -> web.StreamResponse:
         """Answer a request.
@@ -85,11 +84,11 @@ class _Call(Generic[C]):
         call = CallRequest(
             request=request,
             path=request.match_info,
-            query=_checked_query(self.query, request),
+            query=_check_query(self.query, request),
             body=await self._read_body(request),
         )
-        visitor = visitor_of(request)
-        with contextlib.nullcontext() if visitor is None else visitor.answer():
+        connection = connection_of(request)
+        with contextlib.nullcontext() if connection is None else connection.answering():
             value = self.handler(site, call)
             if inspect.isawaitable(value):
                 value = await value
@@ -107,28 +106,28 @@ class _Call(Generic[C]):
             if self.body is None or self.optional:
                 return None if self.body is None else _validate(self.body, {})
             raise RefusedError(422, "no body", f"JSON, for example {self.sample}")
-        value = _parsed(request.content_type, data)
+        value = _parse_json(request.content_type, data)
         if self.body is None:
             if value == {}:
                 return None
-            raise RefusedError(422, f"the body {shown(value)}", "no body")
+            raise RefusedError(422, f"the body {short_repr(value)}", "no body")
         return _validate(self.body, value)
 
 
-def _parsed(content_type: str, data: bytes) -> Any:
+def _parse_json(content_type: str, data: bytes) -> Any:
     if content_type != "application/json":
         raise RefusedError(
             415,
-            f"a body of type {shown(content_type)}",
+            f"a body of type {short_repr(content_type)}",
             "Content-Type: application/json (with curl: --json)",
         )
     try:
-        return json.loads(data, parse_constant=_no_constant)
+        return json.loads(data, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as exc:
         raise RefusedError(400, f"a body that is no JSON: {exc}", "JSON") from exc
 
 
-def _no_constant(name: str) -> NoReturn:
+def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no number")
 
 
@@ -141,12 +140,12 @@ def _validate(model: _Model, value: object) -> Any:
         raise wrong_fields_error(exc) from exc
 
 
-def _checked_query(model: type[BaseModel] | None, request: web.Request) -> Any:
-    given = dict(request.query)
+def _check_query(model: type[BaseModel] | None, request: web.Request) -> Any:
+    query = dict(request.query)
     if model is not None:
-        return _validate(model, given)
-    if given:
-        raise RefusedError(422, f"the query {shown(given)}", "none")
+        return _validate(model, query)
+    if query:
+        raise RefusedError(422, f"the query {short_repr(query)}", "none")
     return None
 
 
@@ -165,31 +164,36 @@ class Calls(Generic[C]):
         return iter(self._rows)
 
     def add(
-        self, method: _Method, path: str, *, about: str = "", **takes: Any
+        self, method: _Method, path: str, *, about: str = "", **options: Any
     ) -> Callable[[Action[C]], Action[C]]:
         """Make the decorated function a call's handler; its docstring describes the call.
 
-        ``about`` describes a call that needs more room; ``takes`` are ``query``, ``body``,
+        ``about`` describes a call that needs more room; ``options`` are ``query``, ``body``,
         ``optional`` and ``sample`` of the call.
         """
 
         def declare(handler: Action[C]) -> Action[C]:
             text = about or " ".join((handler.__doc__ or "").split())
-            row = _Call(method=method, path=path, about=text, handler=handler, **takes)
+            row = _Call(method=method, path=path, about=text, handler=handler, **options)
             self._rows.append(row)
             return handler
 
         return declare
 
-    def adopt(self, row: _Call[Any], path: str, handler: Action[C]) -> None:
-        """Add another table's call, at a path of this table, with another handler."""
+    def add_row(self, row: _Call[Any], path: str, handler: Action[C]) -> None:
+        """Add a call of another table, with another path and another handler."""
         self._rows.append(dataclasses.replace(row, path=path, handler=handler))
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return the calls as JSON-able rows: ``method``, ``path``, ``about``, ``body``."""
         return [
-            {"method": c.method, "path": c.path, "about": c.about, "body": c.sample or None}
-            for c in self
+            {
+                "method": call.method,
+                "path": call.path,
+                "about": call.about,
+                "body": call.sample or None,
+            }
+            for call in self
         ]
 
 
@@ -206,21 +210,23 @@ def routes(calls: Calls[C], site: C) -> list[web.RouteDef]:
 
 
 def middleware(guard: Guard, prefix: str) -> Any:
-    """Return the middleware of all handlers: the connection's place, the guard, refusals as JSON.
+    """Return the middleware of all handlers: it bounds connections, checks, and refuses with JSON.
 
-    Paths that are calls have the prefix.
+    The paths of calls begin with ``prefix``.
     """
 
     @web.middleware
-    async def placed(request: web.Request, handler: _Handler) -> web.StreamResponse:
-        visitor = visitor_of(request)
-        with contextlib.nullcontext() if visitor is None else visitor.request(request):
-            response = await guarded(request, handler)
+    async def serve(request: web.Request, handler: _Handler) -> web.StreamResponse:
+        connection = connection_of(request)
+        with (
+            contextlib.nullcontext() if connection is None else connection.serving_request(request)
+        ):
+            response = await answer(request, handler)
         if not request.content.is_eof():
             response.force_close()
         return response
 
-    async def guarded(request: web.Request, handler: _Handler) -> web.StreamResponse:
+    async def answer(request: web.Request, handler: _Handler) -> web.StreamResponse:
         try:
             guard.check(request, is_call=request.path.startswith(prefix))
             return await handler(request)
@@ -234,16 +240,16 @@ def middleware(guard: Guard, prefix: str) -> Any:
             refusal = RefusedError(400, "a connection that ended", "the whole of a request")
         except ConfigurationError as exc:
             refusal = RefusedError(422, str(exc), "what this camera has")
-        except Exception:  # noqa: BLE001  the last place: the client is told
+        except Exception:  # noqa: BLE001  no error may be without an answer
             refusal = _internal_error(request)
-        tried = f"{request.method} {request.path}"
-        return _json(refusal.status, refusal.as_json(shown(tried)[1:-1]), refusal.headers)
+        call = f"{request.method} {request.path}"
+        return _json(refusal.status, refusal.as_json(short_repr(call)[1:-1]), refusal.headers)
 
-    return placed
+    return serve
 
 
 def _internal_error(request: web.Request) -> RefusedError:
-    """Log the exception that is being handled, and return the refusal for the client."""
+    """Log the exception that is handled now, and return the refusal for the client."""
     _log.exception("! %s %s: a fault of ours", request.method, request.path)
     return RefusedError(500, "a fault of ours", "this to be reported, with the log")
 

@@ -1,4 +1,4 @@
-"""An emulated camera as JSON, for calls and events."""
+"""Describe an emulated camera as JSON, for calls and events."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder
 
 SENSOR = (1280, 1024)
-"""Pixels of the sensor for which the scene is scaled (derived: 1280 stands in the type's code)."""
+"""Width and height, in pixels, of the sensor for which the scene is scaled (derived: 1280 is part
+of the type's code)."""
 
 MAX_HEX_BYTES = 512
-"""Largest number of bytes of a payload that a list of log entries shows; a single entry has
-all."""
+"""Largest number of bytes of a payload in a list of log entries; a single entry has all bytes."""
 
 MAX_VALUES_BYTES = 2048
-"""Largest number of bytes of a result that a list of log entries shows decoded; a single entry has
-no bound."""
+"""Largest number of bytes of a result that a list of log entries shows decoded. A single entry
+shows a result of any size decoded."""
 
 MAX_REPLY_BYTES = 1 << 18
-"""Largest number of bytes of payload in a list of log entries, as far as they are shown, or of
-faults: the list ends there, so an answer stays a few megabytes of JSON."""
+"""Largest number of shown payload bytes in a list of log entries or faults. The list ends there, so
+that an answer is at most a few megabytes of JSON."""
 
 MAX_LISTED = 1000
 """Largest number of faults that a list shows."""
 
 TABLE_GENERATORS = {"tangram": False, "tangram_pixels": True}
-"""Generators that use the table, and whether they report pixels."""
+"""Names of the generators that use the table; True: it reports pixels instead of metres."""
 
 
 # ---------------------------------------------------------------------- the camera
 
 
-OPERATOR = (
+OPERATOR_ACTIONS = (
     "trigger",
     "start",
     "stop",
@@ -56,37 +56,37 @@ OPERATOR = (
     "set_endian",
     "reboot",
 )
-"""Actions that an operator may have, by the devices' names for them."""
+"""Methods of a device that are an operator's actions; a device may lack some of them."""
 
 
 def abilities(emulator: WireCamera) -> list[str]:
     """Return the names of an operator's actions, with ``scene`` and ``clock`` if present."""
-    able = [name for name in OPERATOR if hasattr(emulator.device, name)]
-    has = {"scene": emulator.table, "clock": emulator.clock_time}
-    return able + [name for name, ability in has.items() if ability is not None]
+    actions = [name for name in OPERATOR_ACTIONS if hasattr(emulator.device, name)]
+    parts = {"scene": emulator.table, "clock": emulator.clock_time}
+    return actions + [name for name, part in parts.items() if part is not None]
 
 
 def camera_row(name: str, emulator: WireCamera) -> dict[str, Any]:
-    """Return a camera as a list of cameras shows it."""
+    """Return the row of a camera in a list of cameras."""
     return _row(name, emulator, emulator.shown())
 
 
-def _row(name: str, emulator: WireCamera, shown: dict[str, Any]) -> dict[str, Any]:
+def _row(name: str, emulator: WireCamera, state: dict[str, Any]) -> dict[str, Any]:
     return {
         "name": name,
         "url": emulator.url,
-        **{key: shown[key] for key in ("mode", "status", "active_application")},
+        **{key: state[key] for key in ("mode", "status", "active_application")},
         "session": next(iter(emulator.sessions), None),
     }
 
 
 def camera_state(name: str, emulator: WireCamera) -> dict[str, Any]:
     """Return the whole state of a camera, except scene, faults and log."""
-    shown = emulator.shown()
+    state = emulator.shown()
     return {
-        **_row(name, emulator, shown),
-        **shown,
-        "status_word": shown["status"].value,
+        **_row(name, emulator, state),
+        **state,
+        "status_word": state["status"].value,
         "links": emulator.links,
         "commands": list(emulator.commands),
         "host": emulator.host,
@@ -109,12 +109,12 @@ def times(emulator: WireCamera) -> dict[str, Any]:
 
 
 def log_count(emulator: WireCamera) -> int:
-    """Return the number of all entries so far: the serial after the last one."""
+    """Return the number of all entries so far, which is the serial of the next entry."""
     return emulator.log.since(sys.maxsize, 0)[1]
 
 
 def log_range(emulator: WireCamera) -> dict[str, int]:
-    """Return the serials of the log: ``first`` is the oldest entry, ``next`` the next one."""
+    """Return two serials of the log: ``first`` of the oldest entry, ``next`` of the next entry."""
     count = log_count(emulator)
     return {"first": count - len(emulator.log), "next": count}
 
@@ -122,16 +122,16 @@ def log_range(emulator: WireCamera) -> dict[str, int]:
 def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
     """Return entries from a serial on, as JSON and as objects, up to ``limit`` or MAX_REPLY_BYTES.
 
-    ``next`` is the serial to go on with, ``missed`` the number of dropped entries.
+    ``next`` is the serial of the entry after these, ``missed`` the number of dropped entries.
     """
     entries, count = emulator.log.since(since, limit)
     first = min(max(since, count - len(emulator.log)), count)
     listed: list[dict[str, Any]] = []
-    room = MAX_REPLY_BYTES
+    free_bytes = MAX_REPLY_BYTES
     for serial, entry in enumerate(entries, first):
         listed.append(camera_entry(serial, entry, emulator))
-        room -= min(listed[-1]["size"], MAX_VALUES_BYTES)
-        if room <= 0:
+        free_bytes -= min(listed[-1]["size"], MAX_VALUES_BYTES)
+        if free_bytes <= 0:
             break
     part = {"entries": listed, "next": first + len(listed), "missed": max(0, first - since)}
     return part, entries[: len(listed)]
@@ -145,7 +145,7 @@ def camera_entry(
     Unless ``whole``, a long payload is cut; ``size`` and ``wire_size`` give its length, and
     ``values`` is null.
     """
-    shown = None if whole else MAX_HEX_BYTES * 3 - 1
+    hex_length = None if whole else MAX_HEX_BYTES * 3 - 1
     message, wire = entry.message, entry.wire
     values = None if message is None else _values(message, emulator, whole=whole)
     return {
@@ -158,18 +158,18 @@ def camera_entry(
         "fields": {} if message is None else _fields(message, emulator.codec),
         "values": values,
         "text": entry.text[:MAX_HEX_BYTES] if isinstance(emulator, LineCamera) else None,
-        "hex": entry.hex[:shown],
-        "size": _size(entry.hex),
+        "hex": entry.hex[:hex_length],
+        "size": _hex_size(entry.hex),
         "error": entry.error,
-        "search": _search(entry.hex) if entry.error and entry.direction == "in" else None,
+        "search": _client_dialect(entry.hex) if entry.error and entry.direction == "in" else None,
         "fault": entry.fault,
-        "wire": None if wire is None else wire[:shown],
-        "wire_size": None if wire is None else _size(wire),
+        "wire": None if wire is None else wire[:hex_length],
+        "wire_size": None if wire is None else _hex_size(wire),
     }
 
 
-def _search(data: str) -> str | None:
-    """Return the dialect that a client tries, by the first bytes it sends; None: no dialect."""
+def _client_dialect(data: str) -> str | None:
+    """Return the dialect that a client tries to speak, by its first bytes; None: no dialect."""
     return next((name for hello, name in _greetings() if data.startswith(hello)), None)
 
 
@@ -182,13 +182,13 @@ def _greetings() -> list[tuple[str, str]]:
     ]
 
 
-def _size(text: str) -> int:
-    """Return the number of bytes of a text of hex."""
+def _hex_size(text: str) -> int:
+    """Return the number of bytes of a hex text."""
     return (len(text) + 1) // 3
 
 
 def _fields(message: m.Message, dialect: WireCodec) -> dict[str, Any]:
-    """Return the fields on the dialect's wire, without bytes, which are in the payload's hex."""
+    """Return the fields that a dialect transfers, except data: the payload's hex shows it."""
     names = _field_names(dialect).get(type(message), ())
     return {name: getattr(message, name) for name in names}
 
@@ -202,7 +202,7 @@ def _field_names(dialect: WireCodec) -> Mapping[type[m.Message], tuple[str, ...]
 
 
 def _values(message: m.Message, emulator: WireCamera, *, whole: bool) -> Any:
-    """Return a result's values by its application's layout, None without one."""
+    """Return a result's values by the layout of its application; None without a layout."""
     if not isinstance(message, m.ResultContainer):
         return None
     if message.cells is not None:
@@ -225,30 +225,32 @@ def _byte_order(device: Device) -> ByteOrder:
 
 
 def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
-    """Return the waiting faults and the last ones that have happened."""
+    """Return the faults that wait to happen, and the last ones that have happened."""
     waiting, fired = emulator.faults, list(emulator.fired)
-    last = (event.fault for event in reversed(fired))
+    newest_first = (event.fault for event in reversed(fired))
     return {
         "waiting": [_fault(fault) for fault in waiting[: _shown_count(waiting, limit)]],
         "waiting_count": len(waiting),
-        "fired": [_fired(event) for event in fired[len(fired) - _shown_count(last, limit) :]],
+        "fired": [
+            _fired(event) for event in fired[len(fired) - _shown_count(newest_first, limit) :]
+        ],
     }
 
 
 def _shown_count(faults: Iterable[BaseFault], limit: int) -> int:
-    """Return the number of faults shown: ``limit``, or MAX_REPLY_BYTES of inserted data."""
-    count, room = 0, MAX_REPLY_BYTES
+    """Return the number of faults to show: ``limit`` of them, MAX_REPLY_BYTES of data at most."""
+    count, free_bytes = 0, MAX_REPLY_BYTES
     for fault in faults:
-        room -= len(getattr(fault, "data", None) or b"")
-        if count == limit or room < 0:
+        free_bytes -= len(getattr(fault, "data", None) or b"")
+        if count == limit or free_bytes < 0:
             break
         count += 1
     return count
 
 
 def _fault(fault: BaseFault) -> dict[str, Any]:
-    given = fault.model_dump(mode="json", exclude_unset=True)
-    return {"kind": getattr(fault, "kind", None), **given}
+    fields = fault.model_dump(mode="json", exclude_unset=True)
+    return {"kind": getattr(fault, "kind", None), **fields}
 
 
 def _fired(event: FiredFault) -> dict[str, Any]:
@@ -275,8 +277,8 @@ def kinds() -> list[dict[str, Any]]:
 def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
     """Return the table: true poses of the parts, the camera's view, and the last reported poses.
 
-    Lengths are metres on the table, angles radians. ``lookers`` are the ids of the applications
-    that use it.
+    Lengths are in metres on the table, angles in radians. ``lookers`` are the ids of the
+    applications that use the table.
     """
     applications = emulator.device.applications.values()
     return {
@@ -290,7 +292,7 @@ def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
         "seed": scene.seed,
         "y_down": scene.y_down,
         "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
-        "lookers": [application.id for application in applications if _looks(application)],
+        "lookers": [application.id for application in applications if _uses_table(application)],
         "reported": _reported(emulator, scene),
     }
 
@@ -322,7 +324,7 @@ def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
     last = emulator.last_report
     application = None if last is None else emulator.application_of(last.result)
     layout = None if application is None else application.result_layout
-    if last is None or application is None or layout is None or not _looks(application):
+    if last is None or application is None or layout is None or not _uses_table(application):
         return None
     records = layout.parse_records(last.result.data, last.byte_order)
     poses = [
@@ -333,8 +335,8 @@ def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
     return {"application": application.id, "time": round(last.time, 6), "parts": parts}
 
 
-def _looks(application: Application) -> bool:
-    """Return True if an application sees the table and reports the places of the parts."""
+def _uses_table(application: Application) -> bool:
+    """Return True if an application uses the table and reports the poses of the parts."""
     layout = application.result_layout
     fields = set[str]() if layout is None else {field.name for field in layout.fields}
     return str(application.generator) in TABLE_GENERATORS and {"x", "y", "theta"} <= fields
@@ -343,7 +345,7 @@ def _looks(application: Application) -> bool:
 def _pose(record: Any, scene: TableScene, *, pixels: bool) -> dict[str, Any] | None:
     values = record._asdict()
     if not any(values.values()):
-        return None  # a slot that is not filled
+        return None  # an empty slot of the result
     pose = TablePose(values["x"], values["y"], values["theta"])
     if pixels:
         pose = scene.to_table(Observation("", *pose, 1.0))

@@ -1,4 +1,4 @@
-"""The shapes of the tangram pieces, to draw them.
+"""Outline the tangram pieces, to draw them.
 
 A tangram is a square cut into seven pieces; this one has sides of 0.1 m, so that the pieces do not
 touch in the scene (derived from :data:`~smartcam.emulator._scene.PIECES`). The pose of a piece
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SIDE = 0.1
-"""Side of the square that all seven make, metres."""
+"""Side of the square that all seven pieces make together, in metres."""
 
 Outline: TypeAlias = tuple[tuple[float, float], ...]
-"""Corners x, y about the centroid, metres, counter-clockwise."""
+"""Corners x, y relative to the centroid, in metres, counter-clockwise."""
 
 
 def _triangle(longest: float) -> Outline:

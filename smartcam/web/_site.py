@@ -1,4 +1,4 @@
-"""A web site in the running event loop: a page, which is a few files, and calls."""
+"""Serve a web site in the running event loop: a page, which is a few files, and calls."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from smartcam._accepting import is_loopback, listening
 from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.web._connections import KEEP_ALIVE_TIMEOUT, Visitors
-from smartcam.web._guard import HEADERS, Guard, checked_token, new_token
+from smartcam.web._connections import KEEP_ALIVE_TIMEOUT, SiteConnections
+from smartcam.web._guard import HEADERS, Guard, check_token, new_token
 from smartcam.web._pages import page_html, read_file
 from smartcam.web._routes import MAX_BODY_BYTES, middleware, routes
 from smartcam.web._streams import Streams
@@ -26,17 +26,18 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 API = "/api"
-"""Prefix of the paths of all calls."""
+"""First part of the paths of all calls."""
 
 FINISH_TIMEOUT = 0.2
-"""Seconds that unfinished answers have to end when the site stops, and again after a cancel."""
+"""Seconds that unfinished answers have to end when the site stops, and again after they are
+cancelled."""
 
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
-_ANY = frozenset({"", "0.0.0.0", "::"})  # noqa: S104  names, nothing is bound here
+_ALL_ADDRESSES = frozenset({"", "0.0.0.0", "::"})  # noqa: S104  only compared
 
 
 class Site(Server):
-    """A page and its calls on a port; the calls' handlers get the site.
+    """A page and its calls on a port; the handlers of the calls get the site.
 
     Args:
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css, and
@@ -66,7 +67,7 @@ class Site(Server):
         pages: Mapping[str, str] | None = None,
     ) -> None:
         if token is not None:
-            checked_token(token)
+            check_token(token)
         elif not is_loopback(host):
             token = new_token()
         self.host: str = host
@@ -77,7 +78,7 @@ class Site(Server):
         self._files = ("base.css", "base.js", f"{page}.css", f"{page}.js", *files)
         self._pages = dict(pages or {})
         self._port = port
-        self._open: OpenPort | None = None
+        self._open_port: OpenPort | None = None
 
     @property
     def port(self) -> int:
@@ -90,7 +91,7 @@ class Site(Server):
 
         It has this machine's name if the site listens on all addresses.
         """
-        name = socket.gethostname() if self.host in _ANY else self.host
+        name = socket.gethostname() if self.host in _ALL_ADDRESSES else self.host
         return f"http://{f'[{name}]' if ':' in name else name}:{self._port}"
 
     @property
@@ -106,7 +107,7 @@ class Site(Server):
 
         Cancellation: leaves the site stopped.
         """
-        if self._open is not None:
+        if self._open_port is not None:
             return
         self.streams = Streams()
         try:
@@ -115,14 +116,14 @@ class Site(Server):
             )
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(f"web: cannot listen on {self.api}: {exc}") from exc
-        self._port, self._open = opened.port, opened
+        self._port, self._open_port = opened.port, opened
 
     async def stop(self) -> None:
         """Close the port, every stream and every connection; do nothing if stopped.
 
-        Cancellation: takes effect when all is closed, after two :data:`FINISH_TIMEOUT` at most.
+        Cancellation: takes effect when all is closed, after twice :data:`FINISH_TIMEOUT` at most.
         """
-        opened, self._open = self._open, None
+        opened, self._open_port = self._open_port, None
         if opened is None:
             return
         self.streams.close()
@@ -136,57 +137,57 @@ class Site(Server):
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))
         for path, page in {"/": self._page, **self._pages}.items():
-            application.router.add_get(path, _served(page_html(page).encode(), "html"))
+            application.router.add_get(path, _file_handler(page_html(page).encode(), "html"))
         for name in self._files:
-            application.router.add_get(f"/{name}", _served(read_file(name), name))
+            application.router.add_get(f"/{name}", _file_handler(read_file(name), name))
         return application
 
 
 class OpenPort:
-    """A site's port while it is open.
+    """The open port of a site.
 
-    Not aiohttp's own, since that accepts any number of connections, and ``asyncio.Server`` fills
+    aiohttp's own class for it accepts any number of connections, and its ``asyncio.Server`` fills
     the log if there are too many.
     """
 
     def __init__(self, runner: web.AppRunner, listener: socket.socket) -> None:
         if runner.server is None:
             raise RuntimeError("the runner is not set up")
-        self._visitors = Visitors(runner.server)
-        self.places = self._visitors.places
+        self._connections = SiteConnections(runner.server)
+        self.places = self._connections.places
         self._runner = runner
         self._listener = listener
         self.port: int = listener.getsockname()[1]
-        self._visitors.acceptor.open(listener)
+        self._connections.acceptor.open(listener)
 
     async def close(self) -> None:
-        """Close port and connections."""
-        self._visitors.closed = True
-        self._visitors.acceptor.close()
+        """Close the port and all connections."""
+        self._connections.closed = True
+        self._connections.acceptor.close()
         self._listener.close()
-        await self._visitors.acceptor.wait_closed()
+        await self._connections.acceptor.wait_closed()
         await self._runner.cleanup()
 
 
-class _Calm(logging.LoggerAdapter[logging.Logger]):
-    """Lowers aiohttp's log entries, which are about bad requests, to INFO."""
+class _InfoLogger(logging.LoggerAdapter[logging.Logger]):
+    """Logs aiohttp's messages at INFO at most: they are only about bad requests."""
 
     def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
         """Log a message at INFO at most."""
         super().log(min(level, logging.INFO), msg, *args, **kwargs)
 
 
-def calm(logger: logging.Logger) -> logging.Logger:
-    """Return a logger for aiohttp that writes to ``logger``."""
-    return cast("logging.Logger", _Calm(logger))
+def at_info_level(logger: logging.Logger) -> logging.Logger:
+    """Return a logger for aiohttp that logs to ``logger`` at INFO at most."""
+    return cast("logging.Logger", _InfoLogger(logger))
 
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
     response.headers.update(HEADERS)
 
 
-def _served(body: bytes, name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
-    """Return a handler that serves a file; the end of ``name`` gives its type."""
+def _file_handler(body: bytes, name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
+    """Return a handler that answers with a file; the type follows from the end of ``name``."""
     content_type = _TYPES[name.rpartition(".")[2]]
 
     async def serve(_request: web.Request) -> web.Response:
@@ -198,10 +199,11 @@ def _served(body: bytes, name: str) -> Callable[[web.Request], Awaitable[web.Res
 async def open_port(
     application: web.Application, host: str, port: int, *, local: bool = False
 ) -> OpenPort:
-    """Return the port on which an application is served from now on.
+    """Serve an application on a port from now on; return the open port.
 
     Raises:
-        OSError, ValueError, OverflowError: the address is not available, or is not ``local``.
+        OSError, ValueError, OverflowError: the address is not available, or is not local although
+            ``local`` is set.
 
     Cancellation: leaves nothing open.
     """
@@ -210,7 +212,7 @@ async def open_port(
         access_log=None,
         shutdown_timeout=FINISH_TIMEOUT,
         keepalive_timeout=KEEP_ALIVE_TIMEOUT,
-        logger=calm(_log),
+        logger=at_info_level(_log),
     )
     listener = await listening(host, port, local=local)
     try:

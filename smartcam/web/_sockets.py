@@ -1,4 +1,4 @@
-"""A WebSocket with one message on its way: the next is sent when the page has shown the last."""
+"""Serve WebSockets on which a message is sent when the page has shown the message before."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from smartcam.exceptions import LinkError
-from smartcam.web._errors import RefusedError, shown
+from smartcam.web._errors import RefusedError, short_repr
 from smartcam.web._site import FINISH_TIMEOUT
 
 if TYPE_CHECKING:
@@ -19,23 +19,25 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_WORD_BYTES: Final = 64
-"""Largest number of bytes of a page's message, which asks for the next one."""
+"""Largest number of bytes of the message by which a page requests the next message."""
 
 
-def check_websocket(request: web.Request, protocol: str, viewers: int, most: int) -> None:
-    """Check that a request asks for a WebSocket of ``protocol``, and that there is room for it.
+def check_websocket(
+    request: web.Request, protocol: str, viewer_count: int, max_viewers: int
+) -> None:
+    """Check that a request is for a WebSocket of ``protocol``, and one more viewer is allowed.
 
     Raises:
-        RefusedError: 400, it asks for another; 503, there are ``most`` viewers already.
+        RefusedError: 400, it asks for something else; 503, there are ``max_viewers`` already.
     """
     headers = request.headers
-    asked = headers.get("Sec-WebSocket-Protocol", protocol)
-    offered = [offer.strip() for offer in asked.split(",")]
+    header = headers.get("Sec-WebSocket-Protocol", protocol)
+    offered = [offer.strip() for offer in header.split(",")]
     if headers.get("Upgrade", "").lower() != "websocket" or protocol not in offered:
-        received = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        received = f"Upgrade {short_repr(headers.get('Upgrade'))}, protocols {short_repr(offered)}"
         raise RefusedError(400, received, f"a WebSocket of {protocol}")
-    if viewers >= most:
-        raise RefusedError(503, f"viewer {most + 1}", f"{most} at one time")
+    if viewer_count >= max_viewers:
+        raise RefusedError(503, f"viewer {max_viewers + 1}", f"{max_viewers} at one time")
 
 
 class PageSocket(ABC):
@@ -44,9 +46,9 @@ class PageSocket(ABC):
     Args:
         request: request that asks for the WebSocket.
         protocol: subprotocol of the WebSocket.
-        subject: word for the shown messages, for the log.
-        heartbeat: seconds between pings, by which a vanished page is noticed; None: no pings.
-        longest: largest number of bytes of a message from the page.
+        subject: word for what the messages show, for the log.
+        heartbeat: seconds between pings, which detect a page that is gone; None: no pings.
+        max_message_bytes: largest number of bytes of a message from the page.
     """
 
     def __init__(
@@ -56,32 +58,34 @@ class PageSocket(ABC):
         subject: str,
         *,
         heartbeat: float | None = None,
-        longest: int = MAX_WORD_BYTES,
+        max_message_bytes: int = MAX_WORD_BYTES,
     ) -> None:
         self._request = request
         self._subject = subject
         self._socket = web.WebSocketResponse(
             protocols=(protocol,),
-            max_msg_size=longest,
+            max_msg_size=max_message_bytes,
             timeout=FINISH_TIMEOUT,
             compress=False,
             heartbeat=heartbeat,
         )
-        self._shown = asyncio.Event()  # the page has shown the last message
-        self._ending = asyncio.Event()
+        self._was_shown = asyncio.Event()  # set when the page has shown the last message
+        self._end_requested = asyncio.Event()
 
     def end(self) -> None:
-        """End the socket."""
-        self._ending.set()
+        """Make :meth:`serve` end."""
+        self._end_requested.set()
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show messages until the page goes, is too slow, or :meth:`end` is called.
+        """Send messages until the page is closed, is too slow, or :meth:`end` is called.
 
         Cancellation: ends the socket.
         """
         try:
             await self._socket.prepare(self._request)
-            await _first(self._listen(), self._show(), self._ending.wait())
+            await _run_until_first_end(
+                self._listen(), self._send_messages(), self._end_requested.wait()
+            )
             async with asyncio.timeout(2 * FINISH_TIMEOUT):
                 await self._socket.close(code=WSCloseCode.GOING_AWAY)
         except TimeoutError:
@@ -99,27 +103,27 @@ class PageSocket(ABC):
         return self._socket
 
     @abstractmethod
-    async def _show(self) -> None:
-        """Send messages one by one; TimeoutError: the page does not accept or show one."""
+    async def _send_messages(self) -> None:
+        """Send messages one by one; TimeoutError: the page does not accept or show a message."""
 
     async def _listen(self) -> None:
-        """Receive that messages were shown, until the page goes or sends another message."""
+        """Receive messages of the page, until it is closed or sends an unknown message."""
         while True:
             message = await self._socket.receive()
             if message.type is not WSMsgType.TEXT:
                 return
             if message.data == "next":
-                self._shown.set()
-            elif not self._receive(message.data):
+                self._was_shown.set()
+            elif not self._handle_message(message.data):
                 return
 
-    def _receive(self, _message: str) -> bool:
-        """Handle another message; return False if it has no meaning, which ends the socket."""
+    def _handle_message(self, _message: str) -> bool:
+        """Handle a message other than ``next``; return False if it is unknown: the socket ends."""
         return False
 
 
-async def _first(*jobs: Coroutine[object, object, object]) -> None:
-    """Run jobs until one ends, and raise its error."""
+async def _run_until_first_end(*jobs: Coroutine[object, object, object]) -> None:
+    """Run jobs until one of them ends; cancel the others, and raise its error."""
     tasks = [asyncio.create_task(job) for job in jobs]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

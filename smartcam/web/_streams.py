@@ -1,7 +1,7 @@
-"""Event streams: news as server-sent events, for any number of readers.
+"""Serve streams of server-sent events to any number of readers.
 
-A stream looks for news ten times per second and writes them. Nothing waits for it: it does not look
-while its reader is slow, and a reader that accepts nothing is disconnected.
+A stream looks for events ten times per second, and writes them. It does not look for events while
+its reader is slow, and disconnects a reader that accepts nothing. So nothing waits for a reader.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_STREAMS = 16
-"""Largest number of event streams at one time; each looks for news by itself."""
+"""Largest number of event streams at the same time; each of them looks for events."""
 
 PERIOD = 0.1
-"""Seconds between two looks for news."""
+"""Seconds between two looks for events."""
 
 SHOW_TIMEOUT = 10.0
 """Seconds that a reader has to accept written events; then its stream ends."""
 
 
-class News(NamedTuple):
-    """One event."""
+class StreamEvent(NamedTuple):
+    """One server-sent event."""
 
     kind: str  # the event's name
-    data: Any  # event, sent as JSON
+    data: Any  # values for JSON
     serial: int | None = None  # id of the event; None without one
 
     def as_text(self) -> str:
         """Return the event in the stream's format."""
-        mark = "" if self.serial is None else f"id: {self.serial}\n"
-        return f"event: {self.kind}\n{mark}data: {json.dumps(jsonable(self.data))}\n\n"
+        id_line = "" if self.serial is None else f"id: {self.serial}\n"
+        return f"event: {self.kind}\n{id_line}data: {json.dumps(jsonable(self.data))}\n\n"
 
 
 class Streams:
@@ -57,11 +57,11 @@ class Streams:
         return self._count
 
     async def serve(
-        self, request: web.Request, look: Callable[[], Iterable[News]]
+        self, request: web.Request, find_events: Callable[[], Iterable[StreamEvent]]
     ) -> web.StreamResponse:
-        """Write news until the reader goes, is too slow, or :meth:`close` is called.
+        """Write events until the reader is gone, is too slow, or :meth:`close` is called.
 
-        ``look`` is called every :data:`PERIOD` and returns the news.
+        ``find_events`` is called every :data:`PERIOD`, and returns the events to write.
 
         Raises:
             RefusedError: 503, there are :data:`MAX_STREAMS` already.
@@ -75,15 +75,15 @@ class Streams:
         try:
             await response.prepare(request)
             while not self._closing.is_set() and is_open(request):
-                await _write(response, "".join(news.as_text() for news in look()))
-                await self.pause(PERIOD)
+                await _write(response, "".join(event.as_text() for event in find_events()))
+                await self.wait_closing(PERIOD)
             if is_open(request):
                 await _write(response, None)
         except TimeoutError:
             _log.info("= %s: event stream ended, its reader is too slow", request.remote)
             if request.transport is not None:
                 request.transport.abort()
-        except LinkError:  # a ConnectionError, but of the camera that has the news
+        except LinkError:  # a ConnectionError, but of the camera
             raise
         except ConnectionError:
             pass  # the reader is gone
@@ -95,8 +95,8 @@ class Streams:
         """End all streams, and refuse new ones."""
         self._closing.set()
 
-    async def pause(self, seconds: float) -> bool:
-        """Wait for some time; return True at once if all streams have to end."""
+    async def wait_closing(self, seconds: float) -> bool:
+        """Wait for some time; return True as soon as all streams have to end, otherwise False."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._closing.wait()
@@ -104,13 +104,13 @@ class Streams:
 
 
 def is_open(request: web.Request) -> bool:
-    """Return True while the client is still there."""
+    """Return True while the client is connected."""
     transport = request.transport
     return transport is not None and not transport.is_closing()
 
 
 async def _write(response: web.StreamResponse, text: str | None) -> None:
-    """Write some text, or the end for None."""
+    """Write a text; None: end the stream."""
     async with asyncio.timeout(SHOW_TIMEOUT):
         if text is None:
             await response.write_eof()

@@ -1,4 +1,4 @@
-"""The site on which an application is taught: pictures, regions, tools, and their results."""
+"""Serve the site on which an application is taught: pictures, regions, tools, their results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._inside import Teaching
 
 MAX_PICTURES: Final = 200
-"""Largest number of pictures on the page; the oldest picture of a source makes room."""
+"""Largest number of pictures on the page. When a new one is taken, the oldest is dropped."""
 
 MAX_TOOLS: Final = 32
 """Largest number of tools that the page may try at once."""
@@ -56,7 +56,7 @@ class NamedPicture:
     Args:
         name: name of the picture for people.
         picture: pixels of the picture.
-        file: path of its file for the cell file; "" without a file.
+        file: path by which a cell file names its file; "" without a file.
     """
 
     def __init__(self, name: str, picture: Picture, file: str = "") -> None:
@@ -103,13 +103,14 @@ class TeachSite(ThreadedSite):
         if len(paths) > MAX_PICTURES:
             raise ConfigurationError(f"teach: expected {MAX_PICTURES} pictures at most")
         folder = teaching.path.parent
-        made = [
-            NamedPicture(path.name, Picture.read(path), _beside(path, folder)) for path in paths
+        named = [
+            NamedPicture(path.name, Picture.read(path), _path_in_cell_file(path, folder))
+            for path in paths
         ]
-        self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
-        self._number = len(made)
-        # results of the last tools that were tried, by picture
-        self._tried: dict[int, Inspection] = {}
+        self.pictures: dict[int, NamedPicture] = dict(enumerate(named, start=1))
+        self._number = len(named)  # number of the newest picture
+        # what the tools found when they were last tried, by the picture's number
+        self._last_inspections: dict[int, Inspection] = {}
 
     async def work(self, what: Callable[..., T], *args: object) -> T:
         """Run a function in the thread.
@@ -154,56 +155,54 @@ class TeachSite(ThreadedSite):
             raise RefusedError(404, f"picture {number:.20}", "one of those that are listed")
         return named
 
-    def try_tools(self, given: dict[str, dict[str, str]]) -> dict[str, Any]:
-        """Return the verdicts and values of every picture; call it in a thread.
-
-        Also return the tools' templates.
+    def try_tools(self, tools: dict[str, dict[str, str]]) -> dict[str, Any]:
+        """Return the tools' findings in every picture, and remarks; call it in a thread.
 
         Raises:
             ConfigurationError: a tool or setting is wrong.
         """
-        program = self.teaching.program(read_settings(given))
+        program = self.teaching.program(read_settings(tools))
         results: list[dict[str, Any]] = []
-        tried: dict[int, Inspection] = {}
+        inspections: dict[int, Inspection] = {}
         for number, named in list(self.pictures.items()):
             try:
-                seen = tried[number] = program.inspect(named.picture)
+                inspection = inspections[number] = program.inspect(named.picture)
             except SmartCamError as exc:
                 results.append({"picture": number, "ok": False, "reason": str(exc), "marks": []})
                 continue
             results.append(
                 {
                     "picture": number,
-                    "ok": seen.ok,
-                    "reason": seen.reason,
-                    "values": jsonable(seen.value),
-                    "milliseconds": 1e3 * sum(seen.seconds.values()),
-                    "marks": _marks(seen),
+                    "ok": inspection.ok,
+                    "reason": inspection.reason,
+                    "values": jsonable(inspection.value),
+                    "milliseconds": 1e3 * sum(inspection.seconds.values()),
+                    "marks": _marks(inspection),
                 }
             )
-        self._tried = tried
+        self._last_inspections = inspections
         remarks = [text for step in program.steps for text in step.tool.remarks]
         return {"found": results, "remarks": remarks}
 
-    def learn(self, given: dict[str, dict[str, str]], good: list[int]) -> dict[str, Any]:
-        """Return settings, as texts, for which the good pictures pass, and their reasons.
+    def learn(self, tools: dict[str, dict[str, str]], good: list[int]) -> dict[str, Any]:
+        """Return settings, as texts, with which the good pictures pass, and remarks about them.
 
         Raises:
             ConfigurationError: a tool or setting is wrong.
         """
-        self.try_tools(given)
-        seen = {
-            f"{number}: {self.pictures[number].name}": self._tried[number]
+        self.try_tools(tools)
+        inspections = {
+            f"{number}: {self.pictures[number].name}": self._last_inspections[number]
             for number in good
-            if number in self._tried
+            if number in self._last_inspections
         }
-        if not seen:
+        if not inspections:
             raise ConfigurationError("expected good pictures to learn from, got none")
-        lesson = learn_tolerances(read_settings(given), seen)
+        lesson = learn_tolerances(read_settings(tools), inspections)
         return {"tools": texts_of(lesson.tools), "learned": lesson.remarks}
 
     def state(self) -> dict[str, Any]:
-        """Return the first state of the page, as values for JSON."""
+        """Return the state with which the page begins, as values for JSON."""
         teaching = self.teaching
         return {
             "file": str(teaching.path),
@@ -220,8 +219,8 @@ class TeachSite(ThreadedSite):
         }
 
 
-def _beside(path: Path, folder: Path) -> str:
-    """Return the path of a picture as a file in a folder names it."""
+def _path_in_cell_file(path: Path, folder: Path) -> str:
+    """Return the path by which a cell file in ``folder`` names a picture."""
     path, folder = path.resolve(), folder.resolve()
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
@@ -234,16 +233,16 @@ def texts_of(tools: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
     }
 
 
-def _marks(seen: Inspection) -> list[dict[str, Any]]:
+def _marks(inspection: Inspection) -> list[dict[str, Any]]:
     """Return the marks of the tools, as values for JSON."""
-    drawn = [drawing for finding in seen.findings.values() for drawing in finding.drawings]
+    drawn = [drawing for finding in inspection.findings.values() for drawing in finding.drawings]
     return [_mark(drawing) for drawing in drawn[:MAX_MARKS]]
 
 
 def _mark(drawing: Drawing) -> dict[str, Any]:
     points = [[round(x, 2), round(y, 2)] for x, y in drawing.points[:MAX_POINTS]]
-    words = {"kind": drawing.kind, "role": drawing.role, "text": drawing.text}
-    return {**words, "points": jsonable(points)}
+    texts = {"kind": drawing.kind, "role": drawing.role, "text": drawing.text}
+    return {**texts, "points": jsonable(points)}
 
 
 def _png(picture: Picture) -> bytes:

@@ -1,4 +1,4 @@
-"""A web site with threads of its own for long work."""
+"""Give a web site its own threads for slow functions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class ThreadedSite(Site):
-    """A site with a few threads, which live as long as its port is open."""
+    """A site with a few threads, which run as long as its port is open."""
 
     thread_count: ClassVar[int] = 1
 
@@ -30,7 +30,7 @@ class ThreadedSite(Site):
         await super().start()
 
     async def stop(self) -> None:
-        """Close the port, and end the threads; waiting work is not begun."""
+        """Close the port, and end the threads; cancel functions that wait for a thread."""
         try:
             await super().stop()
         finally:

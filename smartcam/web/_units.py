@@ -1,4 +1,4 @@
-"""Units in which a page shows values instead of SI."""
+"""Choose the units in which a page shows values instead of SI units."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PRACTICAL_UNITS = ("mm", "deg")
-"""Names of the units that a page's switch shows by default."""
+"""Names of the units that a page's switch offers by default."""
 
 
 class PageUnits:
-    """The units that a page's switch shows, and whether the page begins with them.
+    """The units that a page's switch offers instead of SI, and whether the page begins with them.
 
     Args:
         names: names of the units with which the page begins; None: the page begins with SI, and
-            its switch shows :data:`PRACTICAL_UNITS`.
+            its switch offers :data:`PRACTICAL_UNITS`.
 
     Attributes:
-        shown: units that the switch shows.
-        first: whether the page begins with these units.
+        shown: units that the switch offers.
+        first: whether the page begins with these units; else with SI.
 
     Raises:
-        ConfigurationError: a name is no unit, or two are of the same quantity.
+        ConfigurationError: a name is no unit, or two units are of the same quantity.
     """
 
     def __init__(self, names: Sequence[str] | None = None) -> None:
@@ -33,9 +33,9 @@ class PageUnits:
         self.first: bool = names is not None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the units for the page: name and factor, by the SI unit that each replaces."""
+        """Return the units for the page: name and factor of each, by the SI unit it replaces."""
         units = {symbol: self.shown.of(symbol) for symbol in SI_SYMBOLS.values()}
         return {
             "first": self.first,
-            "instead": {key: [*unit] for key, unit in units.items() if unit.name != key},
+            "instead": {si: [*unit] for si, unit in units.items() if unit.name != si},
         }

@@ -1,4 +1,4 @@
-"""Pass and fail: judge a result by the names of its truth values."""
+"""Decide whether a result passed or failed, by the names of its truth values."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from smartcam._meanings import meaning
 from smartcam.models import Localization, jsonable
 
 MAX_JUDGED: Final = 200
-"""Largest number of records of a result that are judged."""
+"""Largest number of records of a result whose truth values are looked at."""
 
 Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
 """Outcome of a result; a result without a verdict is "other"."""
 
 
 def verdicts(value: Any) -> list[dict[str, Any]]:
-    """Return a value's truth values: ``name``, ``true``, ``of`` and ``verdict``.
+    """Return the truth values of a record or a list of records, with their verdicts.
 
-    For a list of records, the number of true ones, and of all.
+    ``true`` is the number of records in which the value is true, ``of`` the number of all records.
     """
     rows: list[Any] = value if isinstance(value, list) else [value]
     if not (rows and all(isinstance(row, dict) for row in rows)):
@@ -28,16 +28,22 @@ def verdicts(value: Any) -> list[dict[str, Any]]:
 
 
 def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
-    good = meaning(name)
-    verdict = None if good is None else "pass" if all(value is good for value in values) else "fail"
+    good_value = meaning(name)
+    verdict = (
+        None
+        if good_value is None
+        else "pass"
+        if all(value is good_value for value in values)
+        else "fail"
+    )
     return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
 
 
 _meaning = functools.lru_cache(maxsize=4096)(meaning)
 
 
-def judged(value: Any) -> Outcome:
-    """Return the outcome of a result, judged by the names of its truth values."""
+def outcome_of(value: Any) -> Outcome:
+    """Return the outcome of a result, by the names of its truth values."""
     rows = value if isinstance(value, list) else [value]
     verdict: Outcome = "other"
     for row in rows[:MAX_JUDGED]:
@@ -45,21 +51,21 @@ def judged(value: Any) -> Outcome:
             return "other"
         for name, field in row._asdict().items():
             if field is True or field is False:
-                good = _meaning(name)
-                if good is not None and field is not good:
+                good_value = _meaning(name)
+                if good_value is not None and field is not good_value:
                     return "failed"
-                if good is not None:
+                if good_value is not None:
                     verdict = "passed"
     return verdict
 
 
-def failing(value: Any) -> str:
-    """Return the truth values that are wrong, in words; "" without any."""
-    bad = [row for row in verdicts(jsonable(value)) if row["verdict"] == "fail"]
+def describe_failures(value: Any) -> str:
+    """Return a text about the truth values that are wrong; "" if none is."""
+    failures = [row for row in verdicts(jsonable(value)) if row["verdict"] == "fail"]
     texts = []
-    for row in bad:
+    for row in failures:
         wanted = "true" if meaning(row["name"]) else "false"
-        of = "" if row["of"] == 1 else f" in {row['true']} of {row['of']} records"
+        records = "" if row["of"] == 1 else f" in {row['true']} of {row['of']} records"
         actual = {"true": "false", "false": "true"}[wanted] if row["of"] == 1 else "true"
-        texts.append(f"{row['name']} is {actual}{of}, expected {wanted}")
+        texts.append(f"{row['name']} is {actual}{records}, expected {wanted}")
     return "; ".join(texts)

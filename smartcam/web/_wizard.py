@@ -1,4 +1,4 @@
-"""The wizard's site: a page that shows its steps, and HTTP calls for the services."""
+"""Define the wizard's site: a page that shows its steps, and HTTP calls for the services."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class WizardSite(Site):
     """A page and HTTP calls that drive the wizards of calibrations.
 
-    It runs in the event loop of the service's actions. Users at the same time share one
-    sequence: a token names the step of a call.
+    It runs in the event loop of the service's actions. Users at the same time share one sequence
+    of steps: each call names its step by a token.
 
     ::
 
@@ -108,12 +108,12 @@ _STATUS = {
     Code.IN_USE: 409,
     Code.NOT_WRITTEN: 500,
 }
-"""HTTP status by the code of a refusal; 422 for all others."""
+"""HTTP status by the code of a refusal; 422 for codes that are not listed."""
 
 
 def _refused_error(error: CalibrationError) -> RefusedError:
     cause, expected = [*re.split(r"[;:] expected ", str(error), maxsplit=1), ""][:2]
-    status = next((code for kind, code in _STATUS.items() if kind == error.code), 422)
+    status = next((status for code, status in _STATUS.items() if code == error.code), 422)
     field = {"field": "code", "came": error.code, "expected": ""}
     return RefusedError(
         status, cause, expected or "what the folder and its wizard can do", (field,)
@@ -125,16 +125,16 @@ CALLS: Calls[WizardSite] = Calls()
 
 
 def _call(
-    method: Literal["GET", "POST"], path: str, *, writes: str = "folder", **takes: Any
+    method: Literal["GET", "POST"], path: str, *, writes: str = "folder", **options: Any
 ) -> Callable[[Handler], Handler]:
     """Make the decorated function a call's handler, which gets the service and the body.
 
-    ``path`` follows the prefix of all calls; ``writes`` names the file or folder written to; for
-    ``takes`` see :meth:`~smartcam.web._routes.Calls.add`.
+    ``path`` follows the prefix of all calls; ``writes`` names the file or folder that the call
+    writes; for ``options`` see :meth:`~smartcam.web._routes.Calls.add`.
     """
 
     def declare(handler: Handler) -> Handler:
-        @CALLS.add(method, f"{API}{path}", **takes)
+        @CALLS.add(method, f"{API}{path}", **options)
         @functools.wraps(handler)
         async def answer(site: WizardSite, call: CallRequest) -> object:
             try:

@@ -170,7 +170,7 @@ def _web(port: int, places: Places[Any], path: str, headers: dict[str, str]) -> 
 async def page() -> AsyncIterator[Stage]:
     headers = {"Authorization": f"Bearer {TOKEN}"}
     async with EmulatedCamera() as camera, EmulatorSite({"c": camera}, token=TOKEN) as site:
-        opened = site._open
+        opened = site._open_port
         assert opened is not None
         stage = _web(site.port, opened.places, "/api", headers)
 
@@ -197,7 +197,7 @@ async def operations() -> AsyncIterator[Stage]:
     async with EmulatedCamera() as camera:
         server = FleetServer(file({"c": camera.url}), bus=MemoryBus().end())
         async with OperationsSite(server) as site, server:
-            opened = site._open
+            opened = site._open_port
             assert opened is not None
             yield _web(site.port, opened.places, "/healthz", {})
 

@@ -12,7 +12,7 @@ from smartcam.fleet._inside import meets, read_identity
 from tests.budgets.inputs import JSON
 from tests.budgets.parser import Make, Parser, fill, fill_text, grown
 from tests.fleet.inside import CERTIFICATE_FILES, decode_bundle, decode_part, request_fields
-from tests.fleet.inside import _read as read_summary
+from tests.fleet.inside import _read_cameras as read_summary
 from tests.fleet.inside import wire as _wire
 
 

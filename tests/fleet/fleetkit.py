@@ -15,7 +15,7 @@ from smartcam.fleet import FleetCamera, MemoryBus
 from smartcam.fleet._inside import Bus, Keys, ZenohEnd
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
-from tests.fleet.inside import Agent, Carrier, FramesOf, MemoryEnd, Program
+from tests.fleet.inside import Agent, AgentInterpretation, FrameSupply, MemoryEnd, Program
 from tests.processes import free_place
 
 FLEET = "plant"
@@ -123,7 +123,7 @@ class Plant:
         else:
             self.end = self.bus.end()
         settings = CameraSettings.make(self.box.url, None, self.session)
-        frames = {} if self._frames is None else {NAME: FramesOf(self._frames, "scripted")}
+        frames = {} if self._frames is None else {NAME: FrameSupply(self._frames, "scripted")}
         self.agent = Agent(
             name,
             Keys(FLEET),
@@ -167,7 +167,7 @@ class Plant:
 
 def trigger_request() -> TriggerRequest:
     """Return a program's request that nobody has numbered."""
-    return TriggerRequest(Carrier(), None, 1, True)
+    return TriggerRequest(AgentInterpretation(), None, 1, True)
 
 
 def end_of(camera: FleetCamera[Any]) -> MemoryEnd:

@@ -71,7 +71,7 @@ class FramePlant(Plant):
         await until(
             lambda: (
                 self.driver.sink is not None
-                and any(one.busy for one in self.shared._viewers.values())
+                and any(one.busy for one in self.shared._streams.values())
             )
         )
 

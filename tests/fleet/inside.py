@@ -5,9 +5,9 @@ from __future__ import annotations
 from smartcam.fleet._agent import agent
 from smartcam.fleet._agent.agent import Agent, CallNumbers
 from smartcam.fleet._agent.bundle import AgentBundle, decode_bundle
-from smartcam.fleet._agent.gate import Change, Gate, InLine
-from smartcam.fleet._agent.shared import Carrier
-from smartcam.fleet._agent.summary import _read
+from smartcam.fleet._agent.gate import Change, Gate, GateRequest
+from smartcam.fleet._agent.shared import AgentInterpretation
+from smartcam.fleet._agent.summary import _read_cameras
 from smartcam.fleet._bus import wire, zenoh
 from smartcam.fleet._bus.address import CERTIFICATE_FILES, check_name, check_pattern
 from smartcam.fleet._bus.bus import BusQuestion, Data, Handle, MemoryEnd, Publisher, never
@@ -31,8 +31,8 @@ from smartcam.fleet._bus.wire import (
 from smartcam.fleet._file.fleet_file import FramesEntry
 from smartcam.fleet._file.standby import Standby
 from smartcam.fleet._frames import camera_frames, collector
-from smartcam.fleet._frames.camera_frames import FramesOf, SharedFrames
-from smartcam.fleet._frames.collector import FrameCollector, Incoming
+from smartcam.fleet._frames.camera_frames import FrameSupply, SharedFrames
+from smartcam.fleet._frames.collector import FrameCollector, IncomingFrame
 from smartcam.fleet._frames.wire import (
     MAX_FRAME_BYTES,
     FramePart,
@@ -48,10 +48,10 @@ from smartcam.fleet._operations import metric_families
 from smartcam.fleet._operations.metric_families import _SUMS
 from smartcam.fleet._operations.trigger_counts import OUTCOMES, outcome_of
 from smartcam.fleet._program import fleet
-from smartcam.fleet._program.caller import Caller, Lease, Met
+from smartcam.fleet._program.caller import Caller, Lease, MetAgent
 from smartcam.fleet._program.program import Program
-from smartcam.fleet._program.program_name import ProgramName, in_words, names_of
+from smartcam.fleet._program.program_name import ProgramName, in_words, names_pattern
 from smartcam.fleet._security import door, renewal
 from smartcam.fleet._security.access import RIGHTS, access_control, ros_rights
-from smartcam.fleet._security.certificates import MAX_BYTES, ROLES, context
-from smartcam.fleet._security.door import Door
+from smartcam.fleet._security.certificates import MAX_BYTES, ROLES, tls_context
+from smartcam.fleet._security.door import ConnectionFilter

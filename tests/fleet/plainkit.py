@@ -148,7 +148,11 @@ class OverZenoh(Client):
         """Return what the server says things with that a pattern means."""
         own = self._server.hosts[NAME].topics
         if pattern.startswith("topic/"):
-            return [one for kind, one in own._topics._any.items() if kind == pattern.split("/")[1]]
+            return [
+                one
+                for kind, one in own._topics._kind_publishers.items()
+                if kind == pattern.split("/")[1]
+            ]
         results = None if own.results_out is None else own.results_out.publisher
         return [one for one in (own.status_out, results) if one is not None]
 

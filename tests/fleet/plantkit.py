@@ -13,7 +13,7 @@ from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetFile
 from smartcam.fleet._inside import ZenohEnd, make_certificates
 from tests.fleet.fleetkit import PATIENCE
-from tests.fleet.inside import Door, access_control
+from tests.fleet.inside import ConnectionFilter, access_control
 from tests.processes import free_port
 
 NAMES = {
@@ -86,7 +86,7 @@ async def router_end(place: str, certificates: str) -> AsyncIterator[None]:
     """Be the router at a place, with a door."""
     end = ZenohEnd(BusLink((place,), (), certificates), {"access_control": access_control()})
     await end.open(PATIENCE)
-    door = Door(frozenset({int(place.rpartition(":")[2])}), end.linked)
+    door = ConnectionFilter(frozenset({int(place.rpartition(":")[2])}), end.connected_addresses)
     door.open()
     try:
         yield

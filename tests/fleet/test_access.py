@@ -268,8 +268,8 @@ async def test_certificate_without_a_role_may_nothing(plant: Path, tmp_path: Pat
     folder = tmp_path / "plant"
     folder.mkdir()
     (folder / "authority").symlink_to(plant / "authority")
-    authority = _authority._Authority.of(folder)
-    authority.make("visitor", "somebody", [], _authority.LIFETIME)
+    authority = _authority._Authority.open_or_create(folder)
+    authority.make_certificate("visitor", "somebody", [], _authority.LIFETIME)
     async with (
         guarded(plant) as (guard, place),
         joined(place, folder / "somebody") as end,

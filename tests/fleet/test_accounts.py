@@ -238,7 +238,7 @@ async def test_who_does_not_read_harms_nobody() -> None:
         assert sender.sent > 0.8 * RATE * 3
         assert most[0] <= history[0] + 10
         assert most[1] <= history[0] + 10
-        assert not host._fresh
+        assert not host._unsent_runs
         for reader in readers:
             assert check(reader.stream, sender.sent).missed == 0
             assert reader.numbers == [*range(1, sender.sent + 1)]
@@ -291,7 +291,7 @@ async def test_what_a_program_holds_back_is_bounded() -> None:
         reader = Reader(camera)
         await asyncio.sleep(0.1)
         feed = camera._receiver._results
-        feed._most_held = 1000
+        feed._max_held_bytes = 1000
         lost = iter([True])
         bus.fate = lambda key, _: (
             () if "/ask/" in key or ("/results/" in key and next(lost, False)) else (0.0,)

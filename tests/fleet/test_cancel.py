@@ -140,12 +140,12 @@ async def check_camera(
     assert camera.active_application in homes
     await until(lambda: not plant.agent._programs[camera._program.name].tasks)
     gate = host.gate
-    assert (gate.holder, len(gate._line), len(gate._active)) == (None, 0, 0)
+    assert (gate.holder, len(gate._queue), len(gate._running_commands)) == (None, 0, 0)
     assert plant.agent._programs[camera._program.name].entered == {}
-    await until(lambda: not camera._caller._insisting)
-    assert camera._program._pending == {}
-    assert camera._watching == set()
-    assert camera._receiver.own_calls == {}
+    await until(lambda: not camera._caller._resending_tasks)
+    assert camera._program._pending_calls == {}
+    assert camera._change_queues == set()
+    assert camera._receiver.own_triggers == {}
     assert host.outcomes == {}
 
 
@@ -214,7 +214,7 @@ async def fleet_trigger_cancelled(steps: int) -> bool:
         over = await cancelled_after(steps, plant.trigger("**", timeout=10.0))
         outcomes = await plant.trigger("**", timeout=10.0)
         assert [one for one in outcomes.values() if isinstance(one, SmartCamError)] == []
-        await until(lambda: not plant._program._pending)
+        await until(lambda: not plant._program._pending_calls)
     await until(lambda: asyncio.all_tasks() == tasks)
     return over
 

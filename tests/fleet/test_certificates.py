@@ -17,7 +17,7 @@ from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, FleetServer, load_fleet
 from smartcam.fleet._inside import MadeCertificate, ZenohEnd, make_certificates, read_identity
-from tests.fleet.inside import CERTIFICATE_FILES, MAX_BYTES, context
+from tests.fleet.inside import CERTIFICATE_FILES, MAX_BYTES, tls_context
 
 YEAR = timedelta(days=365)
 
@@ -43,7 +43,7 @@ def test_first_time_and_again(tmp_path: Path) -> None:
         found = read_identity(folder / name)
         assert (found.role, found.name) == (role, name)
         assert str(found) == f"{role} {name}"
-        context(folder / name)
+        tls_context(folder / name)
     keys = [*folder.rglob("key.pem")]
     assert len(keys) == 4
     if os.name == "posix":

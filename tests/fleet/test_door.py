@@ -17,7 +17,7 @@ import smartcam
 import smartcam.fleet
 from smartcam.fleet._agent import server as _server
 from tests.fleet.fleetkit import PATIENCE, until
-from tests.fleet.inside import Door
+from tests.fleet.inside import ConnectionFilter
 from tests.fleet.inside import door as _door
 from tests.fleet.inside import zenoh as _zenoh
 from tests.fleet.plantkit import certified, plant_file, url_of
@@ -97,16 +97,16 @@ async def test_door_is_shut_while_few_descriptors_are_left(
     few: None, strangers: list[socket.socket]
 ) -> None:
     with Port() as port:
-        door = Door(frozenset({port.place[1]}))
+        door = ConnectionFilter(frozenset({port.place[1]}))
         door.open()
         try:
             first = knock(port.place, strangers)
             await until(lambda: is_in(first))
-            assert not door.shut
-            while not door.shut:  # each is a descriptor of this process at both ends
+            assert not door.refuses_all
+            while not door.refuses_all:  # each is a descriptor of this process at both ends
                 assert len(strangers) < FEW
                 knock(port.place, strangers)
-                await asyncio.sleep(2 * _door.LOOK_EVERY_IF_CALM)
+                await asyncio.sleep(2 * _door.CALM_CHECK_INTERVAL)
             await until(lambda: all(is_in(one) for one in strangers))
             before = len(port.taken)
             late = knock(port.place, strangers)
@@ -119,7 +119,7 @@ async def test_door_is_shut_while_few_descriptors_are_left(
                 assert await loop.sock_recv(first, 100) == b"still there"
             for one in (*port.taken[1:], *strangers[1:-1]):
                 one.close()
-            await until(lambda: not door.shut)
+            await until(lambda: not door.refuses_all)
             await until(lambda: is_in(late))  # it asks again by itself
         finally:
             door.close()
@@ -130,12 +130,12 @@ async def test_door_is_open_when_nobody_looks_any_more(
 ) -> None:
     hardly_any(monkeypatch)
     with Port() as port:
-        door = Door(frozenset({port.place[1]}))
+        door = ConnectionFilter(frozenset({port.place[1]}))
         door.open()
-        assert door.shut
+        assert door.refuses_all
         door.close()
         door.close()
-        assert not door.shut
+        assert not door.refuses_all
         one = knock(port.place, strangers)
         await until(lambda: is_in(one))
 
@@ -144,16 +144,16 @@ async def test_port_that_is_opened_anew_is_shut_too(
     few: None, monkeypatch: pytest.MonkeyPatch, strangers: list[socket.socket]
 ) -> None:
     """The engine does so when it has taken renewed certificates."""
-    monkeypatch.setattr(_door, "CHECK_AFTER", 2)
+    monkeypatch.setattr(_door, "CHECKS_PER_SEARCH", 2)
     with Port() as old:
-        door = Door(frozenset({old.place[1]}))
+        door = ConnectionFilter(frozenset({old.place[1]}))
         door.open()
         try:
             old.listener.close()
             with socket.create_server(old.place, backlog=1024) as anew:
                 await until(lambda: anew.fileno() in door._listeners)
                 hardly_any(monkeypatch)
-                await until(lambda: door.shut)
+                await until(lambda: door.refuses_all)
                 late = knock(old.place, strangers)
                 await asyncio.sleep(0.3)
                 assert not is_in(late)
@@ -166,8 +166,8 @@ def test_limit_of_descriptors_is_raised_as_far_as_it_may(monkeypatch: pytest.Mon
     monkeypatch.setattr(resource, "setrlimit", lambda _, limits: said.append(limits))
     for soft, hard, wanted in (
         (1024, 4096, [(4096, 4096)]),
-        (1024, 1 << 20, [(_door.MAX_WANTED, 1 << 20)]),
-        (1024, resource.RLIM_INFINITY, [(_door.MAX_WANTED, resource.RLIM_INFINITY)]),
+        (1024, 1 << 20, [(_door.MAX_DESCRIPTORS, 1 << 20)]),
+        (1024, resource.RLIM_INFINITY, [(_door.MAX_DESCRIPTORS, resource.RLIM_INFINITY)]),
         (4096, 4096, []),
         (1 << 20, 1 << 20, []),
     ):
@@ -186,8 +186,8 @@ class KnownPort(Port):
     def __init__(self) -> None:
         self.known: set[tuple[str, int]] | None = set()
 
-    def door(self) -> Door:
-        return Door(frozenset({self.place[1]}), lambda: self.known)
+    def door(self) -> ConnectionFilter:
+        return ConnectionFilter(frozenset({self.place[1]}), lambda: self.known)
 
 
 async def test_address_with_many_connections_half_open_gets_no_more(
@@ -233,7 +233,7 @@ async def test_connections_that_have_come_in_count_for_nothing(
             assert not door.blocked
             port.known = None  # there is no session: nobody can tell
             knock(port.place, strangers)
-            await asyncio.sleep(2 * _door.LOOK_EVERY_IF_CALM)
+            await asyncio.sleep(2 * _door.CALM_CHECK_INTERVAL)
             assert not door.blocked
         finally:
             door.close()
@@ -255,7 +255,7 @@ def test_filter_drops_what_comes_from_addresses_that_it_names(
     family: int, host: str, blocked: list[str], strangers: list[socket.socket]
 ) -> None:
     with socket.create_server((host, 0), family=family) as listener:
-        _door.attach(listener, _door.packet_filter(shut=False, blocked=blocked))
+        _door.set_filter(listener, _door.packet_filter(refuse_all=False, blocked=blocked))
         one = socket.socket(family)
         strangers.append(one)
         one.settimeout(0.3)
@@ -270,7 +270,7 @@ def test_filter_sees_ipv4_within_ipv6(strangers: list[socket.socket]) -> None:
     with socket.create_server(("::", 0), family=socket.AF_INET6, dualstack_ipv6=True) as listener:
         blocked = [_door.plain_host("::ffff:127.0.0.9")]
         assert blocked == ["127.0.0.9"]
-        _door.attach(listener, _door.packet_filter(shut=False, blocked=blocked))
+        _door.set_filter(listener, _door.packet_filter(refuse_all=False, blocked=blocked))
         for host, comes in (("127.0.0.9", False), ("127.0.0.8", True)):
             one = knock(("127.0.0.1", listener.getsockname()[1]), strangers, host)
             assert is_in(one) == comes
@@ -279,7 +279,7 @@ def test_filter_sees_ipv4_within_ipv6(strangers: list[socket.socket]) -> None:
 def test_filter_has_room_for_as_many_addresses_as_it_may_name() -> None:
     most = [f"2001:db8::{number:x}" for number in range(1, _door.MAX_BLOCKED_ADDRESSES + 1)]
     with socket.create_server(("::", 0), family=socket.AF_INET6) as listener:
-        _door.attach(listener, _door.packet_filter(shut=False, blocked=most))
+        _door.set_filter(listener, _door.packet_filter(refuse_all=False, blocked=most))
 
 
 async def test_strangers_at_the_port_of_an_agent_keep_only_their_own_address_out(
@@ -288,13 +288,13 @@ async def test_strangers_at_the_port_of_an_agent_keep_only_their_own_address_out
     """Over Zenoh and TLS: the engine itself has no bound."""
     pytest.importorskip("zenoh")
     keys = await certified(tmp_path)
-    made: list[Door] = []
+    made: list[ConnectionFilter] = []
 
-    def make(*given: Any) -> Door:
-        made.append(Door(*given))
+    def make(*given: Any) -> ConnectionFilter:
+        made.append(ConnectionFilter(*given))
         return made[-1]
 
-    monkeypatch.setattr(_server, "Door", make)
+    monkeypatch.setattr(_server, "ConnectionFilter", make)
     async with smartcam.fleet.serve(plant_file(keys)) as server:
         await server.wait_first_attempts()
         port = server.address.port
@@ -325,12 +325,12 @@ async def test_strangers_at_the_port_of_an_agent_keep_only_their_own_address_out
 def test_places_of_who_has_come_in_are_read_as_the_system_has_them(
     said: str, found: tuple[str, int] | None
 ) -> None:
-    assert _zenoh.place_of(said) == found
+    assert _zenoh.parse_link_address(said) == found
 
 
 async def test_many_that_knock_are_looked_at_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """A look costs what an agent of thousands of cameras has: it is done a part of the time."""
-    door = Door(frozenset({1}), set)
+    door = ConnectionFilter(frozenset({1}), set)
     looks = 0
     loop = asyncio.get_running_loop()
     now = [loop.time()]
@@ -342,13 +342,13 @@ async def test_many_that_knock_are_looked_at_together(monkeypatch: pytest.Monkey
         now[0] += 0.02
         return set()
 
-    monkeypatch.setattr(door, "_connected", look)
-    door._look_who_comes()
+    monkeypatch.setattr(door, "_peer_addresses", look)
+    door._check_half_open()
     for _ in range(100):
-        door._on_knock()
+        door._on_connection()
         now[0] += 0.0001
     await asyncio.sleep(0)
     assert looks == 1
     now[0] += _door.CHECK_PAUSE_FACTOR * 0.02
     await until(lambda: looks == 2)
-    door._expect_look(None)
+    door._schedule_check(None)

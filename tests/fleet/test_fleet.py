@@ -271,7 +271,7 @@ async def test_agent_that_dies_during_a_trigger_is_named_at_once() -> None:
         async with FleetServer(file(slow, agent="two"), bus=end):
             await until(lambda: len(fleet) == 2 and fleet["b"].connected)
             waiting = asyncio.create_task(fleet.trigger(timeout=60.0))
-            await until(lambda: len(fleet["b"]._program._pending) >= 2)
+            await until(lambda: len(fleet["b"]._program._pending_calls) >= 2)
             before = asyncio.get_running_loop().time()
             end.detach()
             outcomes = await waiting
@@ -286,7 +286,7 @@ async def test_cancelled_trigger_is_cancelled_at_every_agent() -> None:
         for camera in fleet:
             await camera.switch_application(9)  # runs free: a trigger has no result
         task = asyncio.create_task(fleet.trigger(timeout=60.0))
-        await until(lambda: len(fleet["press"]._program._pending) == 4)
+        await until(lambda: len(fleet["press"]._program._pending_calls) == 4)
         await cancelled(task)
         for camera in fleet:
             await camera.switch_application(21)

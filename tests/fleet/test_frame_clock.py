@@ -53,7 +53,7 @@ async def test_bounds_hold_the_truth(
     def agent(at: float) -> float:
         return at * (1 + drift / 2) + ahead
 
-    one._ahead, one._measured = -math.inf, loop.time()
+    one._min_clock_lead, one._min_lead_at = -math.inf, loop.time()
     for there, held, back, pause in calls:
         said = loop.time()
         await asyncio.sleep(there)
@@ -61,14 +61,14 @@ async def test_bounds_hold_the_truth(
         await asyncio.sleep(held)
         spoke = agent(loop.time())
         await asyncio.sleep(back)
-        one.bound(came, said)
-        one.sample(spoke)
+        one.bound_clock(came, said)
+        one.sample_clock(spoke)
         await asyncio.sleep(pause)
     await asyncio.sleep(since)
     now = loop.time()
-    earliest, latest = one.here(agent(now))
+    earliest, latest = one.local_times(agent(now))
     assert earliest - 1e-6 <= now <= latest + 1e-6
-    assert -one.here(0.0)[0] >= agent(now) - now - 1e-6  # as clock_at_most() has it
+    assert -one.local_times(0.0)[0] >= agent(now) - now - 1e-6  # as clock_at_most() has it
     assert latest - earliest <= min(there + held + back for there, held, back, _ in calls) + 1.0
 
 
@@ -76,7 +76,7 @@ async def test_exact_where_all_is_in_one_process() -> None:
     one = caller()
     one.program.bus.local = True
     try:
-        assert one.here(12.5) == (12.5, 12.5)
+        assert one.local_times(12.5) == (12.5, 12.5)
     finally:
         one.program.bus.local = False
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from smartcam.fleet._frames.pace import (
     MAX_WAIT_PERIODS,
     MAX_WAIT_SHARE,
-    MIN_WAIT_SECONDS,
+    MIN_ALLOWED_WAIT,
     FramePace,
 )
 from smartcam.frames import FrameSource
@@ -35,7 +35,7 @@ def follow(
     went: list[tuple[float, float]] = []
     while len(went) < frames:
         newest = min(math.floor(now / period), stops)
-        since, until = pace.window(now, newest * period, rest)
+        since, until = pace.choose_window(now, newest * period, rest)
         # the first one that came since, and is new to it; or at the end whichever is newest
         number = max(given_to + 1, math.ceil(since / period - 1e-9), newest)
         at = max(now, number * period)
@@ -59,7 +59,7 @@ def test_frame_has_hardly_waited_and_the_link_is_used(period: float, way: float)
     went = follow(period, way)[3:]
     assert len(went) == 37
     for came, at in went:
-        assert at - came <= max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way) + 1e-6
+        assert at - came <= max(MIN_ALLOWED_WAIT, MAX_WAIT_SHARE * way) + 1e-6
     for (_, one), (_, other) in itertools.pairwise(went):
         assert other - one <= way + period + 1e-6
 
@@ -78,7 +78,7 @@ def test_rest_is_held_on_average(rest: float) -> None:
     went = follow(1 / 30, 0.005, rest=rest, frames=60)[2:]
     took = (went[-1][1] - went[0][1]) / (len(went) - 1)
     assert abs(took - rest) <= 0.034 / 20
-    assert all(at - came <= MIN_WAIT_SECONDS + 1e-6 for came, at in went)
+    assert all(at - came <= MIN_ALLOWED_WAIT + 1e-6 for came, at in went)
 
 
 async def test_reader_waits_past_what_has_waited() -> None:

@@ -15,10 +15,10 @@ import smartcam
 from smartcam.exceptions import RemoteProtocolError
 from smartcam.fleet._frames.features import feature_fields, read_feature
 from smartcam.fleet._frames.sender import (
+    CONFIRMATION_TIMEOUT,
     MAX_UNCOUNTED_BYTES,
     MAX_WAITING_BYTES,
     PART_BYTES,
-    STALE_AFTER,
     WINDOW_BYTES,
     FrameSender,
 )
@@ -32,7 +32,7 @@ from tests.fleet.inside import (
     Data,
     FrameCollector,
     FramePart,
-    Incoming,
+    IncomingFrame,
     MemoryEnd,
     decode_part,
     encode_part,
@@ -87,7 +87,7 @@ async def test_no_more_is_under_way_than_the_window() -> None:
         assert (part.call, part.total) == (1, len(data))
         assert said == data[part.offset : part.offset + len(said)]
         taken += 1
-        sender.come("one", 1, part.offset + len(said))
+        sender.confirm("one", 1, part.offset + len(said))
     assert b"".join(said for _, said in wire.said["one"]) == data
     assert not sender._windows
 
@@ -99,10 +99,10 @@ async def test_program_that_takes_nothing_holds_up_no_other() -> None:
     for call in range(200):
         sender.send("dead", call, data)
     assert wire.bytes_of("dead") <= WINDOW_BYTES
-    assert sender._windows["dead"].waiting <= MAX_WAITING_BYTES + 2 * WINDOW_BYTES
+    assert sender._windows["dead"].waiting_bytes <= MAX_WAITING_BYTES + 2 * WINDOW_BYTES
     sender.send("other", 1, bytes(WINDOW_BYTES))
     assert wire.bytes_of("other") == WINDOW_BYTES
-    sender.forget("dead")
+    sender.forget_program("dead")
     assert "dead" not in sender._windows
 
 
@@ -112,7 +112,7 @@ async def test_frame_that_does_not_move_is_given_up() -> None:
     sender.send("one", 1, bytes(2 * WINDOW_BYTES))
     sender.send("one", 2, bytes(PART_BYTES))
     assert {part.call for part, _ in wire.said["one"]} == {1}
-    await asyncio.sleep(STALE_AFTER + 0.1)
+    await asyncio.sleep(CONFIRMATION_TIMEOUT + 0.1)
     sender.send("one", 3, bytes(PART_BYTES))
     assert wire.said["one"][-1][0].call == 3
 
@@ -122,11 +122,11 @@ async def test_frame_that_is_wanted_no_more_makes_room() -> None:
     sender = FrameSender(wire, Keys(FLEET))
     sender.send("one", 1, bytes(2 * WINDOW_BYTES))
     sender.send("one", 2, bytes(PART_BYTES))
-    sender.come("one", 1, None)
+    sender.confirm("one", 1, None)
     assert wire.said["one"][-1][0].call == 2
-    sender.come("one", 9, 5)  # one that nobody has
-    sender.come("two", 1, 5)
-    sender.come("one", 2, 1 << 60)  # more than was sent
+    sender.confirm("one", 9, 5)  # one that nobody has
+    sender.confirm("two", 1, 5)
+    sender.confirm("one", 2, 1 << 60)  # more than was sent
     assert not sender._windows
 
 
@@ -149,13 +149,13 @@ class Told:
         self.program: Any = type("P", (), {"bus": type("B", (), {"local": False})})
         self.come_to: list[int | None] = []
 
-    def come(self, number: int, offset: int | None) -> None:
+    def confirm_bytes(self, number: int, offset: int | None) -> None:
         self.come_to.append(offset)
 
 
-def incoming() -> tuple[Incoming, Told]:
+def incoming() -> tuple[IncomingFrame, Told]:
     told: Any = Told()
-    return Incoming(FrameCollector(_nobody()), told, 1), told
+    return IncomingFrame(FrameCollector(_nobody()), told, 1), told
 
 
 def _nobody() -> Any:
@@ -185,7 +185,7 @@ async def test_frame_comes_whole_or_not_at_all(size: int, each: int, fates: list
     one, _ = incoming()
     for part, said in came:
         if said or not data:
-            one.take(part, said)
+            one.add_part(part, said)
     assert await one.complete_data(size) in [None, data]
     if not fates or set(fates) == {"come"}:
         assert await one.complete_data(size) == data
@@ -195,7 +195,7 @@ async def test_frame_comes_whole_or_not_at_all(size: int, each: int, fates: list
 async def test_rest_that_does_not_come_is_given_up_and_told() -> None:
     data = bytes(2 * WINDOW_BYTES)
     one, told = incoming()
-    one.take(*parts(data, PART_BYTES)[0])
+    one.add_part(*parts(data, PART_BYTES)[0])
     begun = asyncio.get_running_loop().time()
     assert await one.complete_data(len(data)) is None
     waited = asyncio.get_running_loop().time() - begun
@@ -237,7 +237,7 @@ async def test_lost_parts_cost_frames_that_are_counted_and_no_frame_is_mixed() -
                 plant.driver.give(frame(number, **pictures[number % 4]))
                 given += 1
                 await asyncio.sleep(0)
-                await until(lambda: not plant.shared._asking or frames.statistics().waiting)
+                await until(lambda: not plant.shared._pending_calls or frames.statistics().waiting)
                 if frames.statistics().waiting:
                     got = await anext(frames)
                     assert bytes(got.data) == pictures[got.sequence % 4]["data"]
@@ -316,18 +316,18 @@ async def test_program_that_ends_without_a_word_stops_its_stream_and_no_other(nu
         plant.streaming(**large(1)),
         partner("viewer", plant.address.url) as viewer,
     ):
-        await until(lambda: len(plant.shared._viewers) == 1)
+        await until(lambda: len(plant.shared._streams) == 1)
         async with camera.frames(timeout=PATIENCE) as frames:
             await anext(frames)
-            await until(lambda: len(plant.shared._viewers) == 2)
+            await until(lambda: len(plant.shared._streams) == 2)
             viewer.signal(number)
             triggered = 0
-            while len(plant.shared._viewers) > 1:
+            while len(plant.shared._streams) > 1:
                 await anext(frames)  # as before
                 assert (await camera.trigger(timeout=PATIENCE)).value.run
                 triggered += 1
                 theirs = plant.agent._sender._windows.values()
-                assert all(one.under_way <= WINDOW_BYTES for one in theirs)
+                assert all(one.unconfirmed_bytes <= WINDOW_BYTES for one in theirs)
             assert triggered > 1 or number != signal.SIGSTOP  # none had to wait for its end
         await plant.driver.rests()
         viewer.signal(signal.SIGCONT)

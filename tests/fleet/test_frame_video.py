@@ -11,7 +11,7 @@ import pytest
 
 from smartcam import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.fleet import FleetFrame
-from smartcam.fleet._frames.video import KEY_EVERY, LATE_SECONDS, SharedVideo, VideoUnit
+from smartcam.fleet._frames.video import MAX_LAG, MIN_KEY_INTERVAL, SharedVideo, VideoUnit
 from smartcam.frames import Codecs, Frame, FrameSource, find_format
 from smartcam.frames._inside import entry_point, read_stamp
 from tests.client.clientkit import gone
@@ -91,7 +91,7 @@ async def test_pictures_of_h264_are_whole_and_one_encoder_is_for_all() -> None:
             account = one.statistics()
             assert account.offered == account.delivered + account.skipped + account.waiting
             assert account.lost == 0
-        await until(lambda: not videos(plant) and not plant.shared._viewers)
+        await until(lambda: not videos(plant) and not plant.shared._streams)
         await plant.driver.rests()
 
 
@@ -216,7 +216,7 @@ class Encoder:
 
 
 def has(units: list[VideoUnit]) -> list[tuple[int, bool]]:
-    return [(unit.frame.sequence, unit.key) for unit in units]
+    return [(unit.frame.sequence, unit.is_key_frame) for unit in units]
 
 
 async def test_who_is_too_late_gets_nothing_until_a_key_frame_which_are_few() -> None:
@@ -235,33 +235,33 @@ async def test_who_is_too_late_gets_nothing_until_a_key_frame_which_are_few() ->
 
         await driver.streams()
         await give()
-        first = await video.after(0)
+        first = await video.next_units(0)
         assert has(first) == [(1, True)]
         have = first[-1].number
         await give(3)
-        units = await video.after(have)  # all that came since, in order
+        units = await video.next_units(have)  # all that came since, in order
         assert has(units) == [(2, False), (3, False), (4, False)]
         have = units[-1].number
-        assert has(await video.after(0)) == [(1, True), (2, False), (3, False), (4, False)]
-        await give(round(LATE_SECONDS / 0.05) + 2)
-        late = asyncio.create_task(video.after(have))
+        assert has(await video.next_units(0)) == [(1, True), (2, False), (3, False), (4, False)]
+        await give(round(MAX_LAG / 0.05) + 2)
+        late = asyncio.create_task(video.next_units(have))
         await asyncio.sleep(0.01)
         assert not late.done()
         await give(30)
         units = await late
-        assert units[0].key
+        assert units[0].is_key_frame
         assert len(encoder.keys) == 2
         for _ in range(40):  # whoever asks, and however often
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(0.0):
-                    await video.after(5)
+                    await video.next_units(5)
             await give()
         assert len(encoder.keys) > 2
         between = np.diff(encoder.keys)
-        assert (between >= KEY_EVERY - 0.051).all()
-        assert loop.time() > encoder.keys[0] + 3 * KEY_EVERY
+        assert (between >= MIN_KEY_INTERVAL - 0.051).all()
+        assert loop.time() > encoder.keys[0] + 3 * MIN_KEY_INTERVAL
         await video.close()
-        assert isinstance(await gone(video.after(0)), FrameSourceError)
+        assert isinstance(await gone(video.next_units(0)), FrameSourceError)
 
 
 # ---------------------------------------------------------------------- what is held

@@ -104,7 +104,7 @@ async def test_frame_after_was_exposed_after_the_call_or_the_moment() -> None:
             plant.driver.give(frame(1))
             moment = time.monotonic() if given else None
             asking = asyncio.create_task(camera.frame_after(moment, timeout=PATIENCE))
-            await until(lambda: plant.shared._asking)
+            await until(lambda: plant.shared._pending_calls)
             # exposed before, or perhaps: both came after
             plant.driver.give(frame(2, duration=1000.0))
             plant.driver.give(frame(3, captured=time.monotonic() - 1000.0))
@@ -125,7 +125,7 @@ async def test_no_frame_in_time_is_told_by_the_agent() -> None:
             assert error.source == NAME
             if in_process():  # else the answer may come later than is waited for it
                 assert "waited 0.2 s for a frame" in str(error)
-        await until(lambda: not plant.shared._asking)
+        await until(lambda: not plant.shared._pending_calls)
 
 
 @pytest.mark.both_buses
@@ -205,8 +205,8 @@ async def test_program_that_is_gone_has_nothing_stream() -> None:
         await anext(frames)
         await camera._program.bus.close()  # as where it is killed: it says no more
         await plant.driver.rests()
-        assert not plant.shared._viewers
-        assert not plant.shared._asking
+        assert not plant.shared._streams
+        assert not plant.shared._pending_calls
 
 
 async def test_program_that_asks_no_more_has_nothing_stream() -> None:
@@ -215,14 +215,14 @@ async def test_program_that_asks_no_more_has_nothing_stream() -> None:
         loop = asyncio.get_running_loop()
         arguments = {"stream": stream, "encoding": "raw", "quality": None}
         counts = _frame_caller.StreamCounts()
-        await camera.frame_caller.ask("next_frame", loop.time() + 1, arguments, counts)
+        await camera.frame_caller.request_frame("next_frame", loop.time() + 1, arguments, counts)
         await asyncio.sleep(_frame_stream.IDLE_TIMEOUT - 0.1)
         assert plant.driver.sink is not None
         await asyncio.sleep(0.2)
         assert plant.driver.sink is None
-        assert not plant.shared._viewers
+        assert not plant.shared._streams
         # and goes on as if it had been away
-        answer, got = await camera.frame_caller.ask(
+        answer, got = await camera.frame_caller.request_frame(
             "next_frame", loop.time() + 1, arguments, counts
         )
         assert got is not None
@@ -348,7 +348,7 @@ async def test_streams_and_calls_of_a_program_are_bounded(monkeypatch: pytest.Mo
             error = await gone(anext(third))
         assert "no more are possible" in str(error)
         waiting = asyncio.create_task(camera.newest_frame(timeout=60))
-        await until(lambda: sum(plant.shared._asking.values()) == 3)
+        await until(lambda: sum(plant.shared._pending_calls.values()) == 3)
         assert "under way" in str(await gone(camera.newest_frame()))
         async with plant.camera() as other, plant.streaming():
             await other.newest_frame()
@@ -411,7 +411,7 @@ async def test_device_that_is_none_is_told(monkeypatch: pytest.MonkeyPatch) -> N
     async def about(*_: object) -> dict[str, Any]:
         return {"format": "Mono8"}
 
-    monkeypatch.setattr(SharedFrames, "about", about)
+    monkeypatch.setattr(SharedFrames, "format_fields", about)
     async with looking() as (_, camera):
         error = await gone(camera.frames().__aenter__())
         assert isinstance(error, FrameSourceError)
@@ -434,7 +434,7 @@ async def test_what_fails_in_a_stream_ends_it(
 
 async def test_one_stream_asks_once_at_a_time() -> None:
     async with looking() as (_, camera):
-        ask, loop = camera.frame_caller.ask, asyncio.get_running_loop()
+        ask, loop = camera.frame_caller.request_frame, asyncio.get_running_loop()
         arguments = {"stream": 1, "encoding": "raw", "quality": None}
         counts = _frame_caller.StreamCounts()
         asked = [ask("next_frame", loop.time() + 1, arguments, counts) for _ in range(2)]
@@ -489,6 +489,6 @@ async def test_call_may_be_cancelled_at_any_step(what: str) -> None:
             if steps % 10 == 0:
                 assert (await camera.frame_after()).sequence
         assert steps > 10
-        await until(lambda: not plant.shared._viewers and not plant.shared._asking)
+        await until(lambda: not plant.shared._streams and not plant.shared._pending_calls)
         await plant.driver.rests()
         assert not plant.agent._sender._windows

@@ -72,7 +72,7 @@ class Work:
         """See that nothing is left."""
         gate = self.gate
         assert gate.holder is None
-        assert (len(gate._active), len(gate._line), len(gate._reservations)) == (0, 0, 0)
+        assert (len(gate._running_commands), len(gate._queue), len(gate._reservations)) == (0, 0, 0)
 
 
 @pytest.fixture
@@ -172,7 +172,7 @@ async def test_forgotten_program_has_no_reservation_any_more(work: Work) -> None
     assert work.order == ["ra", "ra2", "ca"]
     for task in gone:  # as the agent does
         task.cancel()
-    work.gate.forget("a")
+    work.gate.lose_program("a")
     await asyncio.wait(gone)
     await steps(5)
     assert work.gate.holder is None
@@ -185,7 +185,7 @@ async def test_program_that_is_gone_while_it_waits_gets_nothing(work: Work) -> N
     work.command("c", "cc")
     await steps(5)
     waiting.cancel()
-    work.gate.forget("b")
+    work.gate.lose_program("b")
     assert work.gate.holder == "a"
     await work.end("ra")
     assert work.order == ["ra", "cc"]
@@ -258,4 +258,4 @@ async def test_nobody_is_between_whatever_happens(seed: int) -> None:
     assert [end for end in odd if end is not None] == []
     assert done[0] > 20
     assert inside
-    assert (gate.holder, len(gate._active), len(gate._line)) == (None, 0, 0)
+    assert (gate.holder, len(gate._running_commands), len(gate._queue)) == (None, 0, 0)

@@ -59,9 +59,9 @@ async def add_anew(scene: Scene) -> None:
     """As a reload does without the camera, and one with it again."""
     agent = scene.plant.agent
     settings = agent.hosts[NAME].settings
-    await agent.drop(NAME, "a test")
+    await agent.remove_camera(NAME, "a test")
     await asyncio.sleep(0.1)
-    await agent.want(NAME, settings)
+    await agent.add_camera(NAME, settings)
 
 
 async def take_over(scene: Scene) -> None:
@@ -269,7 +269,7 @@ async def test_program_that_was_forgotten_is_told_of_its_reservation() -> None:
 
         async def block() -> None:
             async with robot.reserve(timeout=5.0):
-                plant.agent._forget(robot._program.name)
+                plant.agent._forget_program(robot._program.name)
                 error = await gone(robot.trigger(timeout=5.0))
                 assert isinstance(error, ReservationLostError)
                 assert "was not done" in str(error)
@@ -318,14 +318,14 @@ async def test_call_without_the_word_of_a_reservation_is_a_call() -> None:
     """Older programs, and those that have none, say nothing of it; nonsense is no call."""
     async with Plant() as plant, plant.cameras(1) as (robot,):
         fields = {"program": robot._program.name, "do": "start", "arguments": {}}
-        key = robot._caller._key("agent", "start")
+        key = robot._caller._key_of_call("agent", "start")
         guest = plant.agent._programs[robot._program.name]
         for call, reservation in enumerate(("x", [], {}), start=10_000):
             robot._program.bus.put(
                 key, encode({**fields, "call": call, "reservation": reservation})
             )
         await asyncio.sleep(0.1)
-        assert guest.commands.last < 10_000
+        assert guest.commands.last_call < 10_000
         await robot.start(timeout=5.0)
 
 
@@ -341,7 +341,7 @@ async def test_loss_is_an_event_of_the_camera(way: Callable[[Scene], Awaitable[N
                     told.append(event)
 
         hearing = asyncio.create_task(hear())
-        name = in_words(ProgramName.of(robot._program.token).name)
+        name = in_words(ProgramName.from_token(robot._program.token).name)
 
         async def block() -> None:
             async with robot.reserve(timeout=5.0):
@@ -362,7 +362,7 @@ async def test_loss_of_another_s_reservation_is_an_event_too() -> None:
     async with Plant() as plant, plant.cameras(2) as (robot, other):
         await other.query_application()
         seen, own = other.events(), robot.events()
-        name = in_words(ProgramName.of(robot._program.token).name)
+        name = in_words(ProgramName.from_token(robot._program.token).name)
 
         async def block() -> None:
             async with robot.reserve(timeout=5.0):

@@ -41,7 +41,7 @@ class Things(NamedTuple):
 
 def kept(log: AgentLog, first: int = 1, most_bytes: int = 1 << 20) -> list[int]:
     """Return the numbers that a part of a log has."""
-    part = log.part(first, most_bytes)
+    part = log.read_part(first, most_bytes)
     things = [Things.read(one) for one in part.data]
     return [number for one in things for number in range(one.number, one.next)]
 
@@ -88,7 +88,7 @@ def test_part_begins_where_it_is_asked_to_or_says_where(counts: list[int], first
     log = AgentLog(30, 1 << 20)
     for count in counts:
         add(log, count)
-    part = log.part(first, 1 << 20)
+    part = log.read_part(first, 1 << 20)
     numbers = kept(log, first)
     assert part.following == log.following
     assert part.first == max(first, log.first)
@@ -104,7 +104,7 @@ def test_part_is_as_much_as_fits_and_one_at_least(most_bytes: int, first: int) -
     log = AgentLog(100, 1 << 20)
     for _ in range(20):
         add(log, 1)
-    data = log.part(first, most_bytes).data
+    data = log.read_part(first, most_bytes).data
     assert len(data) == 1 or sum(map(len, data)) <= most_bytes
     asked, got = first, [*range(1, first)]
     while asked < log.following:  # in steps, everything comes
@@ -131,11 +131,13 @@ def test_first_since_a_time(clock: float, first: int) -> None:
 class Ear:
     """A feed, with all that it has to do with, by hand."""
 
-    def __init__(self, most_held: int = 1 << 20) -> None:
+    def __init__(self, max_held_bytes: int = 1 << 20) -> None:
         self.taken: list[tuple[int, int]] = []
         self.missed = 0
         self.asked = 0
-        self.feed: Feed[Things] = Feed(self.take, self.miss, self.lack, most_held=most_held)
+        self.feed: Feed[Things] = Feed(
+            self.take, self.miss, self.lack, max_held_bytes=max_held_bytes
+        )
 
     def take(self, things: Things) -> None:
         self.taken += [(things.epoch, number) for number in range(things.number, things.next)]
@@ -162,7 +164,7 @@ def test_feed_takes_nothing_before_it_is_said_where_to_begin() -> None:
     ear.feed.receive(1, 8, said(5, 6, 7))
     assert ear.taken == []
     ear.feed.begin(1, 6, 8)
-    assert (ear.numbers, ear.feed.lacking, ear.missed) == ([6, 7], False, 0)
+    assert (ear.numbers, ear.feed.has_gap, ear.missed) == ([6, 7], False, 0)
 
 
 def test_gap_is_filled_in_order() -> None:
@@ -170,9 +172,9 @@ def test_gap_is_filled_in_order() -> None:
     ear.feed.begin(1, 1, 1)
     ear.feed.receive(1, 4, said(3))
     ear.feed.receive(1, 5, said(4))
-    assert (ear.taken, ear.feed.lacking, ear.asked) == ([], True, 1)
+    assert (ear.taken, ear.feed.has_gap, ear.asked) == ([], True, 1)
     ear.feed.fill(1, 1, 5, said(1, 2))
-    assert (ear.numbers, ear.feed.lacking, ear.missed) == ([1, 2, 3, 4], False, 0)
+    assert (ear.numbers, ear.feed.has_gap, ear.missed) == ([1, 2, 3, 4], False, 0)
 
 
 def test_what_the_agent_no_longer_has_was_missed() -> None:
@@ -180,7 +182,7 @@ def test_what_the_agent_no_longer_has_was_missed() -> None:
     ear.feed.begin(1, 1, 1)
     ear.feed.receive(1, 11, [])
     ear.feed.fill(1, 8, 11, said(8, 9, 10))
-    assert (ear.numbers, ear.missed, ear.feed.lacking) == ([8, 9, 10], 7, False)
+    assert (ear.numbers, ear.missed, ear.feed.has_gap) == ([8, 9, 10], 7, False)
 
 
 def test_agent_that_has_nothing_to_show_is_not_asked_for_ever() -> None:
@@ -188,14 +190,14 @@ def test_agent_that_has_nothing_to_show_is_not_asked_for_ever() -> None:
     ear.feed.begin(1, 1, 1)
     ear.feed.receive(1, 5, [])
     ear.feed.fill(1, 1, 5, [])
-    assert (ear.missed, ear.feed.expected, ear.feed.lacking) == (4, 5, False)
+    assert (ear.missed, ear.feed.expected, ear.feed.has_gap) == (4, 5, False)
 
 
 def test_last_one_is_missed_when_its_number_is_told_again() -> None:
     ear = Ear()
     ear.feed.begin(1, 1, 1)
     ear.feed.receive(1, 2, [])  # the reminder
-    assert ear.feed.lacking
+    assert ear.feed.has_gap
 
 
 def test_new_epoch_waits_for_its_beginning_and_the_old_one_is_over() -> None:
@@ -212,13 +214,13 @@ def test_new_epoch_waits_for_its_beginning_and_the_old_one_is_over() -> None:
 
 
 def test_what_waits_is_bounded_and_comes_all_the_same() -> None:
-    ear = Ear(most_held=100)
+    ear = Ear(max_held_bytes=100)
     ear.feed.begin(1, 1, 1)
     for number in range(2, 1000):
         ear.feed.receive(1, number + 1, said(number))
         assert len(ear.feed._held) <= 10
     ear.feed.fill(1, 1, 1000, said(1))
-    assert ear.feed.lacking
+    assert ear.feed.has_gap
     ear.feed.fill(1, ear.feed.expected, 1000, said(*range(ear.feed.expected, 1000)))
     assert (ear.numbers, ear.missed) == ([*range(1, 1000)], 0)
 
@@ -229,13 +231,13 @@ def test_stopped_feed_takes_nothing() -> None:
     ear.feed.receive(1, 4, said(3))
     ear.feed.stop()
     ear.feed.fill(1, 1, 5, said(1, 2))
-    assert (ear.taken, ear.missed, ear.feed.lacking) == ([], 0, False)
+    assert (ear.taken, ear.missed, ear.feed.has_gap) == ([], 0, False)
 
 
 def alternating() -> Ear:
     """An ear for agents that have a camera by turns."""
     ear = Ear()
-    ear.feed = Feed(ear.take, ear.miss, ear.lack, returns=True)
+    ear.feed = Feed(ear.take, ear.miss, ear.lack, resumes_epochs=True)
     return ear
 
 
@@ -260,7 +262,7 @@ def test_what_an_agent_had_said_is_missed_when_another_goes_on() -> None:
     assert ear.taken == [(1, 1), (1, 4), (1, 5)]
     assert ear.missed == 2 + 3
     ear.feed.begin(1, 1, 9)
-    assert not ear.feed.lacking
+    assert not ear.feed.has_gap
 
 
 def test_what_is_said_before_an_agent_s_turn_is_asked_for() -> None:
@@ -268,7 +270,7 @@ def test_what_is_said_before_an_agent_s_turn_is_asked_for() -> None:
     ear.feed.begin(2, 1, 1)
     ear.feed.receive(1, 7, said(5, 6))  # by one that was started before
     ear.feed.begin(1, 5, 5)  # as it had answered before that
-    assert ear.feed.lacking
+    assert ear.feed.has_gap
     ear.feed.fill(1, 5, 7, said(5, 6))
     assert (ear.taken, ear.missed) == ([(1, 5), (1, 6)], 0)
 
@@ -281,7 +283,7 @@ class Hearing(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.ear = Ear(most_held=120)
+        self.ear = Ear(max_held_bytes=120)
         self.epoch = 1
         self.log = AgentLog(12, 1 << 20)
         self.way: list[tuple[int, int, list[Things]]] = []  # said, and not heard yet
@@ -314,8 +316,8 @@ class Hearing(RuleBasedStateMachine):
     @rule()
     def ask(self) -> None:
         feed = self.ear.feed
-        if feed.lacking and feed.expected and feed.epoch == self.epoch:
-            part = self.log.part(feed.expected, 25)
+        if feed.has_gap and feed.expected and feed.epoch == self.epoch:
+            part = self.log.read_part(feed.expected, 25)
             things = [Things.read(one) for one in part.data]
             self.answers.append((self.epoch, part.first, part.following, things))
 
@@ -362,11 +364,11 @@ class Hearing(RuleBasedStateMachine):
         self.settle_epoch()
         feed.receive(self.epoch, self.log.following, [])
         for _ in range(1000):
-            if not feed.lacking:
+            if not feed.has_gap:
                 break
-            part = self.log.part(feed.expected, 25)
+            part = self.log.read_part(feed.expected, 25)
             feed.fill(self.epoch, part.first, part.following, [*map(Things.read, part.data)])
-        assert (feed.lacking, feed.expected) == (False, self.log.following)
+        assert (feed.has_gap, feed.expected) == (False, self.log.following)
         self.nothing_is_lost_unseen()
         self.each_once_and_in_order()
 

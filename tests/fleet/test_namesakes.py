@@ -78,7 +78,7 @@ async def test_of_two_that_meet_after_a_split_the_earlier_start_stays(
         assert ["started before this one" in str(one) for one in made.told] == [True]
         assert made.agents[0].retired_by is None
         with pytest.raises(ConfigurationError, match="an agent named south"):
-            await made.agents[1].want("other", made.agents[0].hosts[NAME].settings)
+            await made.agents[1].add_camera("other", made.agents[0].hosts[NAME].settings)
 
 
 @pytest.mark.parametrize("standby", [None, STANDS_BY], ids=["alone", "standby"])

@@ -242,7 +242,7 @@ def as_started_anew(plant: Plant) -> None:
     host.epoch += 1
     host.results, host.states = AgentLog(100, 1 << 20), AgentLog(100, 1 << 20)
     for program in [*agent._programs]:
-        agent._forget(program)
+        agent._forget_program(program)
     agent._last_calls.clear()
 
 

@@ -135,7 +135,7 @@ async def test_a_page_shows_accounts_and_what_failed(tmp_path: Path) -> None:
 
     async with plant(tmp_path) as (_, fleet), FleetSite(fleet) as site:
         await triggered(fleet, 2)
-        site.outlets._at = -10.0
+        site.outlets._asked_at = -10.0
         async with aiohttp.ClientSession() as session:
 
             async def get(path: str, **query: str) -> Any:

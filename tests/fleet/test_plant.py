@@ -160,7 +160,7 @@ async def test_who_hears_a_few_hears_no_bundles(monkeypatch: Any) -> None:
         results = fleet.results("a")
         await fleet.meet("a")
         await asyncio.sleep(0.1)
-        assert "results" not in fleet._exchange._covers
+        assert "results" not in fleet._exchange._common_handles
         result = await fleet["a"].trigger(timeout=5.0)
         assert (await anext(results)).number == result.number
 
@@ -170,11 +170,11 @@ async def test_nobody_who_hears_is_no_bundle(monkeypatch: Any) -> None:
         results = fleet.results()
         await fleet.meet()
         results.close()
-        await until(lambda: "results" in fleet._exchange._covers)
+        await until(lambda: "results" in fleet._exchange._common_handles)
         said: list[str] = []
         monkeypatch.setattr(AgentBundle, "add", lambda *_: said.append(""))
         await triggered(fleet, 3)
-        assert "results" not in fleet._exchange._covers
+        assert "results" not in fleet._exchange._common_handles
         said.clear()
         await triggered(fleet, 1)
         assert not said

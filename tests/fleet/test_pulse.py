@@ -38,14 +38,14 @@ async def test_what_comes_behind_a_stop_may_have_waited_as_long(
     pulse.open()
     try:
         await asyncio.sleep(10.0)
-        assert pulse.waited() == 0.0
+        assert pulse.max_wait() == 0.0
         hold_up(STOPPED, monkeypatch)
-        first = pulse.waited()
+        first = pulse.max_wait()
         assert STOPPED <= first <= STOPPED + _pulse.BEAT_INTERVAL
-        await asyncio.sleep(_pulse.SETTLE_TIME / 2)  # it comes out of the system's buffers yet
-        assert pulse.waited() == pytest.approx(first + _pulse.SETTLE_TIME / 2, abs=0.01)
-        await asyncio.sleep(_pulse.SETTLE_TIME)
-        assert pulse.waited() == 0.0
+        await asyncio.sleep(_pulse.BACKLOG_TIME / 2)  # it comes out of the system's buffers yet
+        assert pulse.max_wait() == pytest.approx(first + _pulse.BACKLOG_TIME / 2, abs=0.01)
+        await asyncio.sleep(_pulse.BACKLOG_TIME)
+        assert pulse.max_wait() == 0.0
     finally:
         pulse.close()
         pulse.close()
@@ -58,10 +58,10 @@ async def test_second_stop_counts_from_the_first_while_that_is_not_settled(
     pulse.open()
     try:
         hold_up(STOPPED, monkeypatch)
-        pulse.waited()
-        await asyncio.sleep(_pulse.SETTLE_TIME / 2)
+        pulse.max_wait()
+        await asyncio.sleep(_pulse.BACKLOG_TIME / 2)
         hold_up(STOPPED, monkeypatch)
-        assert pulse.waited() >= 2 * STOPPED + _pulse.SETTLE_TIME / 2
+        assert pulse.max_wait() >= 2 * STOPPED + _pulse.BACKLOG_TIME / 2
     finally:
         pulse.close()
 
@@ -71,7 +71,7 @@ async def test_command_that_waited_longer_than_its_timeout_is_not_done(
 ) -> None:
     async with plant() as place:
         pulse = place.server._agent._plain._pulse  # type: ignore[union-attr]
-        monkeypatch.setattr(pulse, "waited", lambda: STOPPED)
+        monkeypatch.setattr(pulse, "max_wait", lambda: STOPPED)
         for answer in (
             await place.client.call("trigger", timeout=0.5),
             await place.client.call("stop", timeout=STOPPED),
@@ -116,7 +116,7 @@ async def test_command_behind_a_stopped_agent_is_not_done_when_it_goes_on() -> N
             ((answer,),) = await asyncio.gather(patient)
             assert answer["error"] == ""
             assert box.runs == runs + 1
-            await asyncio.sleep(_pulse.SETTLE_TIME + _pulse.STOPPED_AFTER)
+            await asyncio.sleep(_pulse.BACKLOG_TIME + _pulse.STOPPED_AFTER)
             assert (await asyncio.to_thread(ask, 5.0))[0]["error"] == ""
         finally:
             await asyncio.to_thread(session.close)
@@ -152,7 +152,7 @@ async def test_worker_that_waits_begins_its_work_at_once() -> None:
         said.append(f"{name} ends")
 
     def begin(name: str) -> None:
-        pool.take().do(partial(work, name))
+        pool.get_worker().start_work(partial(work, name))
         said.append(f"{name} was given")
 
     await in_the_loop(partial(begin, "first"))
@@ -169,24 +169,24 @@ async def test_worker_that_waits_begins_its_work_at_once() -> None:
 async def test_worker_that_is_cancelled_at_its_work_does_no_more() -> None:
     pool = Workers()
     never = asyncio.Event()
-    first = pool.take()
-    first.do(partial(wait, never))
+    first = pool.get_worker()
+    first.start_work(partial(wait, never))
     await turns()
     first.task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await first.task
-    second = pool.take()
+    second = pool.get_worker()
     assert second is not first
-    second.do(partial(asyncio.sleep, 0))
+    second.start_work(partial(asyncio.sleep, 0))
     await turns()
-    assert pool.take() is second
+    assert pool.get_worker() is second
     second.task.cancel()
     await asyncio.gather(second.task, return_exceptions=True)
 
 
 async def test_worker_that_is_cancelled_as_its_work_ends_gets_no_other_work() -> None:
     pool, done = Workers(), list[str]()
-    first = pool.take()
+    first = pool.get_worker()
 
     async def cancel_itself() -> None:
         first.task.cancel()  # as a program's cancellation does that comes while the reply is sent
@@ -194,16 +194,16 @@ async def test_worker_that_is_cancelled_as_its_work_ends_gets_no_other_work() ->
     async def work() -> None:
         done.append("second")
 
-    first.do(cancel_itself)
+    first.start_work(cancel_itself)
     await turns(1)
-    pool.take().do(work)  # the first one waits, and has not noticed yet
+    pool.get_worker().start_work(work)  # the first one waits, and has not noticed yet
     await turns()
     assert done == ["second"]
     await asyncio.gather(first.task, return_exceptions=True)
-    third = pool.take()
+    third = pool.get_worker()
     third.task.cancel()
     await asyncio.gather(third.task, return_exceptions=True)
-    pool.take().do(work)
+    pool.get_worker().start_work(work)
     await turns()
     assert done == ["second", "second"]
     await asyncio.gather(*pool.close(), return_exceptions=True)
@@ -216,9 +216,9 @@ async def wait(event: asyncio.Event) -> None:
 async def test_no_more_workers_are_kept_than_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "MAX_IDLE_WORKERS", 2)
     pool, go = Workers(), asyncio.Event()
-    begun = [pool.take() for _ in range(5)]
+    begun = [pool.get_worker() for _ in range(5)]
     for one in begun:
-        one.do(partial(wait, go))
+        one.start_work(partial(wait, go))
     await turns()
     go.set()
     await turns(6)
@@ -231,8 +231,8 @@ async def test_no_more_workers_are_kept_than_bounded(monkeypatch: pytest.MonkeyP
 
 async def test_closed_workers_end_with_the_work_under_way() -> None:
     pool, go = Workers(), asyncio.Event()
-    one = pool.take()
-    one.do(partial(wait, go))
+    one = pool.get_worker()
+    one.start_work(partial(wait, go))
     await turns()
     assert pool.close() == []
     go.set()

@@ -19,7 +19,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.fleet import Fleet, FleetFile, FleetServer, MemoryBus
-from smartcam.fleet._agent.reload import FleetChanges, LoadedFleet, changes_of, loaded
+from smartcam.fleet._agent.reload import FleetChanges, LoadedFleet, changes_of, load_cameras
 from smartcam.models import Disconnected
 from smartcam.protocols import messages as m
 from smartcam.settings import CameraSettings, parse_address
@@ -222,7 +222,7 @@ async def test_an_emulated_camera_that_cannot_start_leaves_all_as_it_was(tmp_pat
         scenario = tmp_path / "scenario.yaml"
         scenario.write_text(SCENARIO, "utf-8")
         made: list[str] = []
-        source = one.server._source
+        source = one.server._start_source
 
         async def fails_third(planned: Any, folder: Path) -> Any:
             made.append(planned.name)
@@ -230,7 +230,7 @@ async def test_an_emulated_camera_that_cannot_start_leaves_all_as_it_was(tmp_pat
                 raise ConfigurationError("no port is left")
             return await source(planned, folder)
 
-        one.server.reloads._make = fails_third
+        one.server.reloads._start_source = fails_third
         cameras = {"one": {"url": one.boxes["one"].url}, "e/**": {"emulated": {"count": 3}}}
         one.path.write_text(yaml.safe_dump({"agent": "a1", "cameras": cameras}), "utf-8")
         with pytest.raises(ConfigurationError, match="no port is left"):
@@ -369,7 +369,7 @@ def test_how_a_camera_is_seen_in_ros_wants_a_restart() -> None:
         said = {} if frame is None else {"ros2": {"frame_id": frame}}
         cameras = {name: {"url": f"bvs://{name}", **said} for name in ("one", *more)}
         top = {"agent": "a1", "cameras": cameras, **({"ros2": {}} if ros else {})}
-        return loaded(FleetFile.model_validate(top), Path())
+        return load_cameras(FleetFile.model_validate(top), Path())
 
     with pytest.raises(ConfigurationError, match=r"cameras\.one\.ros2: it was changed"):
         changes_of(file("base", True), file("table", True), "a1")

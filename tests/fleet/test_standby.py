@@ -191,12 +191,12 @@ async def test_agent_takes_no_camera_that_another_has_under_another_name(how: st
             if how == "reload":
                 await south.open(PATIENCE)
             with pytest.raises(ConfigurationError, match=f"is the camera {NAME} of the agent"):
-                await (south.open(PATIENCE) if first else south.want("thief", settings))
+                await (south.open(PATIENCE) if first else south.add_camera("thief", settings))
             assert not south.hosts
             assert pair.having() == ["north"]
             if how == "reload":
                 await north.close()
-                await south.want("thief", settings)  # it is free now
+                await south.add_camera("thief", settings)  # it is free now
                 assert [*south.hosts] == ["thief"]
         finally:
             await south.close()
@@ -216,7 +216,7 @@ async def test_camera_is_not_taken_over_while_another_name_has_it() -> None:
             await asyncio.sleep(SOON)
             assert third.hosts["thief"].connected
             assert pair.sharing() == ["north"]  # which is closed
-            await third.drop("thief", "a test")
+            await third.remove_camera("thief", "a test")
             await until(lambda: "south" in pair.having())
         finally:
             await third.close()
@@ -378,7 +378,7 @@ async def test_session_that_begins_while_another_agent_is_asked_is_seen(
                 return heard
 
             monkeypatch.setattr(camera._caller, "_greet_agent", slowly)
-            await pair.agents["south"].drop(NAME, "it is told to")
+            await pair.agents["south"].remove_camera(NAME, "it is told to")
             await until(lambda: pair.having() == ["north"])
             await camera.wait_connected(timeout=PATIENCE)
             assert (await camera.trigger(2)).value.run == 1

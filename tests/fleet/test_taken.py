@@ -33,7 +33,7 @@ class Shop:
             await until(lambda: self.host.connected)
             async with smartcam.connect(self.box.url):
                 await until(lambda: not self.host.connected)
-        await until(lambda: self.host.camera.taken)
+        await until(lambda: self.host.camera.is_taken)
 
 
 @contextlib.asynccontextmanager
@@ -64,7 +64,7 @@ async def test_camera_that_was_taken_is_told_and_comes_back_by_itself() -> None:
             await made.camera.trigger(2)
         with pytest.raises(ResponseTimeoutError, match="another client has the camera"):
             await made.camera.wait_connected(1.0)
-        assert made.host.state()["over"] is False
+        assert made.host.state_fields()["over"] is False
         await made.camera.wait_connected(30.0 + PATIENCE)
         assert (await made.camera.trigger(2)).value.run == 1
 
@@ -76,10 +76,10 @@ async def test_camera_that_is_taken_again_and_again_is_tried_ever_more_seldom() 
         pauses: list[float] = []
         for _ in range(7):
             pauses.append(supervisor._pause_of_taken)
-            made.host.camera.take_again()
+            made.host.camera.try_take_back()
             await until(lambda: made.host.connected)
             async with smartcam.connect(made.box.url):
-                await until(lambda: made.host.camera.taken)  # at the first loss already
+                await until(lambda: made.host.camera.is_taken)  # at the first loss already
         assert pauses == [60.0, 120.0, 240.0, 480.0, *[600.0] * 3]
 
 

@@ -146,7 +146,7 @@ async def test_cancelling_under_the_name_of_another() -> None:
         plant.camera() as spy,
     ):
         own = robot._program
-        number = own._calls + 1
+        number = own._call_count + 1
         key = own.keys.ask(own.role, "agent", NAME)
 
         def cancel() -> None:
@@ -160,7 +160,7 @@ async def test_cancelling_under_the_name_of_another() -> None:
         await until(lambda: (True, number) in plant.agent._programs[own.name].tasks)
         cancel()  # while it is under way
         assert (await triggering).number == 1
-        number = own._calls + 1
+        number = own._call_count + 1
         async with robot.reserve():
             cancel()
             await spy.query_application()

@@ -33,7 +33,7 @@ from tests.fleet.inside import (
     encode,
     encode_order,
     in_words,
-    names_of,
+    names_pattern,
 )
 from tests.fleet.inside import agent as _agent
 from tests.fleet.inside import camera_frames as _frames
@@ -131,18 +131,18 @@ def test_viewer_asks_agents_only_what_changes_nothing() -> None:
 
 def test_name_is_that_of_who_knows_its_secret() -> None:
     one, other = ProgramName.new("operator"), ProgramName.new("operator")
-    assert one.genuine
-    assert ProgramName.of(one.token) == one
-    assert meets(names_of("operator"), one.name)
-    assert not meets(names_of("viewer"), one.token)
+    assert one.is_genuine
+    assert ProgramName.from_token(one.token) == one
+    assert meets(names_pattern("operator"), one.name)
+    assert not meets(names_pattern("viewer"), one.token)
     for forged in (
         ProgramName(one.name, other.secret),
         ProgramName(one.name, ""),
         ProgramName(one.name.replace("operator", "admin", 1), one.secret),
-        ProgramName.of(one.name),
-        ProgramName.of(""),
+        ProgramName.from_token(one.name),
+        ProgramName.from_token(""),
     ):
-        assert not forged.genuine
+        assert not forged.is_genuine
     assert ProgramName.new("of somebody else's authority").role == "anyone"
 
 
@@ -199,7 +199,7 @@ async def stranger(plant: Plant, role: str = "viewer", who: ProgramName | None =
 
 
 def who_of(camera: FleetCamera[Any]) -> ProgramName:
-    return ProgramName.of(camera._program.token)
+    return ProgramName.from_token(camera._program.token)
 
 
 async def test_name_of_another_gets_nothing_and_changes_nothing() -> None:
@@ -210,10 +210,10 @@ async def test_name_of_another_gets_nothing_and_changes_nothing() -> None:
         guest = agent._programs[name]
         for who in (ProgramName(name, "0" * 16), ProgramName(name, "")):
             forger = await stranger(plant, who=who)
-            following = robot._program._calls + 1
+            following = robot._program._call_count + 1
             async with robot.reserve():
                 triggering = asyncio.ensure_future(robot.trigger())
-                await until(lambda: guest.under_way[True])
+                await until(lambda: guest.running_counts[True])
                 for number in range(1, following + 20):
                     for call in (number, FIRST_CALL + number):
                         forger.ask("query_application", role="anyone", call=call)
@@ -280,7 +280,7 @@ async def test_program_without_presence_is_forgotten_and_so_is_what_it_has() -> 
         begun = asyncio.get_running_loop().time()
         await robot.trigger(timeout=60.0)
         waited = asyncio.get_running_loop().time() - begun
-        assert waited <= _agent.PRESENCE_WITHIN + 1.0  # of the loop's time, which no machine's is
+        assert waited <= _agent.PRESENCE_TIMEOUT + 1.0  # of the loop's time, which no machine's is
         assert [*plant.agent._programs] == [who_of(robot).name]
 
 
@@ -289,9 +289,9 @@ async def test_program_whose_presence_comes_late_stays() -> None:
         one = await stranger(plant, "operator")
         one.ask("hello")
         await one.answers(1)
-        await asyncio.sleep(_agent.PRESENCE_WITHIN / 2)
+        await asyncio.sleep(_agent.PRESENCE_TIMEOUT / 2)
         token = one.bus.be_present(KEYS.program(one.who.token))
-        await asyncio.sleep(_agent.PRESENCE_WITHIN * 2)
+        await asyncio.sleep(_agent.PRESENCE_TIMEOUT * 2)
         assert [*plant.agent._programs] == [one.who.name]
         token.close()
         await until(lambda: not plant.agent._programs)
@@ -455,4 +455,4 @@ def test_name_of_a_program_is_told_in_words() -> None:
         == f"robot-1 on {socket.gethostname().partition('.')[0].lower()}, pid {os.getpid()}"
     )
     assert in_words("cell.4") == "cell.4"  # of a program without smartcam
-    assert ProgramName.of(ProgramName.new("operator").token).genuine
+    assert ProgramName.from_token(ProgramName.new("operator").token).is_genuine

@@ -304,7 +304,7 @@ async def test_reservation_of_a_silent_program_ends_with_the_lease() -> None:
 async def until_waits(plant: Plant) -> None:
     gate = plant.agent.hosts[NAME].gate
     async with asyncio.timeout(PATIENCE):
-        while not gate._line:  # noqa: ASYNC110 - another process
+        while not gate._queue:  # noqa: ASYNC110 - another process
             await asyncio.sleep(0.005)
 
 
@@ -433,8 +433,10 @@ async def test_what_is_said_while_a_link_stands_still_arrives_in_order(urgent: b
                 assert slowest < LOOP_MAY_WAIT
                 relay.flows.set()
                 await heard.come_all(payloads)
-                await until(lambda says=says: not says._behind)  # the loop says it again itself
-                assert (says._doubtful, says.waiting_bytes) == (0, 0)
+                await until(
+                    lambda says=says: not says._waiting_in_threads
+                )  # the loop says it again itself
+                assert (says._uncertain_count, says.waiting_bytes) == (0, 0)
                 results.close()
         finally:
             await connects.close()
@@ -543,7 +545,7 @@ async def test_keys_that_are_used_again_have_publishers_within_a_bound(
     idle: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zenoh, "MAX_FREQUENT_KEYS", 2)
-    monkeypatch.setattr(zenoh, "IDLE_KEY_TIME", idle)
+    monkeypatch.setattr(zenoh, "IDLE_KEY_TIMEOUT", idle)
     async with two_ends() as (hears, says):
         heard = await heard_by(says, hears)
         before, sent = len(says._declared), list[bytes]()
@@ -552,9 +554,11 @@ async def test_keys_that_are_used_again_have_publishers_within_a_bound(
             says.put(f"test/{number // 4 % 5}", sent[-1])
             await asyncio.sleep(0.011)  # each by itself
         await heard.come_all(sent)
-        assert set(says._frequent) == ({"test/3", "test/4"} if idle == 0 else {"test/0", "test/1"})
+        assert set(says._frequent_keys) == (
+            {"test/3", "test/4"} if idle == 0 else {"test/0", "test/1"}
+        )
         assert len(says._declared) == before + 2
-        assert all(one.used(0.0) is not None for one in says._frequent.values())
+        assert all(one.use_publisher(0.0) is not None for one in says._frequent_keys.values())
 
 
 async def test_end_that_is_closed_says_and_hears_nothing_and_can_be_closed_again() -> None:

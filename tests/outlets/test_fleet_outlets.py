@@ -59,7 +59,7 @@ async def test_results_of_an_agents_triggers_are_rows_by_the_layout(tmp_path: Pa
             await camera.trigger(timeout=20)
         await until(lambda: outlets.states["store"].account.delivered >= 5)
         numbers = await read_numbers(server)
-        text, _ = await exposition(numbers, each=False)
+        text, _ = await exposition(numbers, per_camera=False)
     assert b'smartcam_outlet_results_total{agent="' in text
     assert b'outlet="store"} 5.0' in text
     (count,) = rows(tmp_path, "SELECT COUNT(*) FROM results WHERE kind = 'result'")
@@ -105,7 +105,7 @@ async def test_results_of_a_software_camera_are_typed_and_those_that_failed_are_
     units = dict(rows(tmp_path, "SELECT column_name, unit FROM fields WHERE unit != ''"))
     assert units["measure_place"] == units["present_x"] == "px"
     made = FleetOutlets(FleetServer(tmp_path / "fleet.yaml", bus=MemoryBus().end()))
-    read = made.reading("line1/cam1")  # what waits may be delivered before there is a camera
+    read = made.interpretation("line1/cam1")  # what waits may be delivered before there is a camera
     assert read is not None
     layout: Any = getattr(read.interpreter(7), "layout", None)
     assert layout.text.startswith("ok: bool, reason: string[80], present_ok: bool")

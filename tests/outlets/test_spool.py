@@ -39,7 +39,7 @@ def gaps(spool: Spool) -> list[tuple[str, int, int]]:
 def test_what_is_added_is_there_in_order_after_a_restart(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.add([entry(n, spool) for n in range(1, 11)])
-    spool.done(spool.head(3))
+    spool.remove_delivered(spool.head(3))
     first = spool.epoch
     spool.close()
     again = opened(tmp_path)
@@ -86,8 +86,8 @@ def test_the_gap_of_a_crash_has_another_id_than_that_of_a_refused_entry(tmp_path
     spool = opened(tmp_path, 2 * (ROW_BYTES + 2), "drop_newest")
     spool.add([entry(n, spool) for n in range(1, 4)])
     first = spool.head(10).entries
-    spool.done(spool.head(10))
-    spool.close(ended=False)  # as if it was killed
+    spool.remove_delivered(spool.head(10))
+    spool.close(all_written=False)  # as if it was killed
     again = opened(tmp_path, 2 * (ROW_BYTES + 2), "drop_newest")
     second = [one for one in again.head(10).entries if one.camera]
     assert [one.number for one in first + second] == [1, 2, 3, 4]
@@ -143,8 +143,8 @@ def test_what_was_in_flight_when_a_spool_began_anew_comes_again(tmp_path: Path) 
     spool = opened(tmp_path)
     spool.add([entry(n, spool) for n in range(1, 6)])
     waiting = spool.head(2)
-    spool.renew("as a test says")
-    spool.done(waiting)
+    spool.replace_damaged("as a test says")
+    spool.remove_delivered(waiting)
     head = [one.number for one in spool.head(10).entries if one.kind == "result"]
     assert head == [1, 2, 3, 4, 5]
     assert spool.account == OutletAccount(5, 0, 5, {})
@@ -156,7 +156,7 @@ def test_what_is_being_delivered_is_not_dropped(tmp_path: Path) -> None:
     spool.add([entry(n, spool) for n in range(1, 11)])
     waiting = spool.head(5)
     spool.add([entry(n, spool) for n in range(11, 21)])
-    spool.done(waiting)
+    spool.remove_delivered(waiting)
     account = spool.account
     assert account.balanced
     assert account.delivered == 5
@@ -197,7 +197,7 @@ def test_the_account_balances_whatever_is_done(tmp_path: Path, seed: int) -> Non
             waiting = spool.head(dice.randrange(1, 10))
         elif what == 4 and waiting is not None and waiting.places:
             refused = "no" if dice.random() < 0.3 else ""
-            spool.done(waiting, dice.randrange(len(waiting.places)), refused)
+            spool.remove_delivered(waiting, dice.randrange(len(waiting.places)), refused)
             waiting = None
         elif what == 5:
             spool.close()
@@ -240,7 +240,7 @@ for n in range(1, 10_000_000):
     print(n, flush=True)
     if n % 7 == 0:
         waiting = spool.head(3)
-        spool.done(waiting)
+        spool.remove_delivered(waiting)
 """
 
 
@@ -343,7 +343,7 @@ def test_a_spool_whose_version_is_damaged_is_put_aside(tmp_path: Path, place: in
 def test_a_damaged_spool_is_put_aside_and_a_gap_tells_of_it(tmp_path: Path, seed: int) -> None:
     spool = opened(tmp_path)
     spool.add([entry(n, spool, body="x" * 500) for n in range(1, 101)])
-    spool.done(spool.head(20))
+    spool.remove_delivered(spool.head(20))
     before = spool.epoch
     spool.close()
     path, dice = tmp_path / "a.spool", random.Random(seed)  # noqa: S311

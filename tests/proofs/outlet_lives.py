@@ -227,7 +227,7 @@ async def _wait(outlets: Outlets) -> bool:
     """Return True while results or gaps wait for the far end."""
     (pump,) = outlets._pumps.values()
     query = "SELECT COUNT(*) FROM entries"
-    left = await pump._run(lambda: pump.spool._open_database.execute(query).fetchone()[0])
+    left = await pump._run_in_thread(lambda: pump.spool._open_database.execute(query).fetchone()[0])
     return bool(left or pump.account.spooled)
 
 

@@ -349,7 +349,7 @@ async def test_closing_waits_for_what_is_being_opened() -> None:
 async def test_a_camera_of_a_fleet_whose_agent_goes_and_comes() -> None:
     async with Plant() as plant, plant.camera() as camera:
         node = NotedNode()
-        options = CameraNodeOptions(is_agent_alive=lambda: camera._caller.met is not None)
+        options = CameraNodeOptions(is_agent_alive=lambda: camera._caller.agent is not None)
         async with CameraNode(camera, node, options=options) as made:
             await until(lambda: made.lifecycle.active)
             assert node.last("~/status").ready

@@ -470,7 +470,7 @@ async def test_camera_of_a_fleet_is_served_as_any() -> None:
             place = {"con_address": "127.0.0.1", "port": str(box.port)}
             assert (await node.call("SmartcameraSetup", **place)).error == ""
             assert (await node.call("SmartcameraSetup", con_address="192.0.2.1")).error
-            own._about.pop("url")  # as before its agent has answered
+            own._agent_facts.pop("url")  # as before its agent has answered
             reply = await node.call("SmartcameraSetup", con_address="127.0.0.1")
             assert "expected con_address and camera_model_name to be empty" in reply.error
             async with other.reserve():

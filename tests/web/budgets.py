@@ -6,7 +6,14 @@ from typing import Any
 
 from tests.budgets.inputs import JSON
 from tests.budgets.parser import Make, Parser, fill, fill_text, streamed
-from tests.web.inside import CallBody, RefusedError, Visitor, Visitors, _parsed, _validate
+from tests.web.inside import (
+    CallBody,
+    RefusedError,
+    SiteConnection,
+    SiteConnections,
+    _parse_json,
+    _validate,
+)
 
 
 class _Item(CallBody):
@@ -19,7 +26,9 @@ class _Body(CallBody):
 
 
 def _body(data: bytes | str) -> None:
-    _validate(_Body, _parsed("application/json", data.encode() if isinstance(data, str) else data))
+    _validate(
+        _Body, _parse_json("application/json", data.encode() if isinstance(data, str) else data)
+    )
 
 
 _BODIES: dict[str, Make] = {
@@ -46,7 +55,7 @@ def _heads(pieces: list[bytes]) -> None:
     import asyncio
 
     async def come() -> None:
-        visitor = Visitor(Visitors(asyncio.Protocol))
+        visitor = SiteConnection(SiteConnections(asyncio.Protocol))
         visitor.connection_made(_Transport())  # type: ignore[arg-type]
         for piece in pieces:
             visitor.data_received(piece)

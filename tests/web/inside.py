@@ -13,8 +13,13 @@ from smartcam.web import (
     _serialize,
     _streams,
 )
-from smartcam.web._clouds import MAX_VIEWERS, PROTOCOL, SHOW_TIMEOUT, packed, thinned
-from smartcam.web._connections import MAX_CONNECTIONS, MAX_HEAD_BYTES, Visitor, Visitors
+from smartcam.web._clouds import MAX_VIEWERS, PROTOCOL, SHOW_TIMEOUT, pack_cloud, thin_cloud
+from smartcam.web._connections import (
+    MAX_CONNECTIONS,
+    MAX_HEAD_BYTES,
+    SiteConnection,
+    SiteConnections,
+)
 from smartcam.web._emulator import CALLS as EMULATOR_CALLS
 from smartcam.web._emulator import MAX_PARTS as EMULATOR_MAX_PARTS
 from smartcam.web._emulator import MAX_WAITING_CHANGES
@@ -42,14 +47,14 @@ from smartcam.web._live_view import (
     MAX_SHOWN_RAW_BYTES,
     MAX_VALUE_CHARACTERS,
     ShownResult,
-    shown_value,
+    value_fields,
 )
 from smartcam.web._pictures import MAX_VIEWERS as PICTURES_MAX_VIEWERS
 from smartcam.web._pictures import PROTOCOL as PICTURES_PROTOCOL
-from smartcam.web._pictures import Press
-from smartcam.web._routes import MAX_BODY_BYTES, CallBody, _parsed, _validate
+from smartcam.web._pictures import JpegMaker
+from smartcam.web._routes import MAX_BODY_BYTES, CallBody, _parse_json, _validate
 from smartcam.web._serialize import MAX_HEX_BYTES, MAX_REPLY_BYTES, MAX_VALUES_BYTES
 from smartcam.web._site import Site
-from smartcam.web._streams import MAX_STREAMS, News, Streams
+from smartcam.web._streams import MAX_STREAMS, StreamEvent, Streams
 from smartcam.web._streams import SHOW_TIMEOUT as STREAMS_SHOW_TIMEOUT
-from smartcam.web._verdicts import judged, verdicts
+from smartcam.web._verdicts import outcome_of, verdicts

@@ -17,7 +17,7 @@ from smartcam.depth import Cloud, voxel_grid
 from smartcam.exceptions import ConfigurationError
 from smartcam.web import CloudSite
 from tests.handmade import until
-from tests.web.inside import MAX_VIEWERS, PROTOCOL, SHOW_TIMEOUT, packed, thinned
+from tests.web.inside import MAX_VIEWERS, PROTOCOL, SHOW_TIMEOUT, pack_cloud, thin_cloud
 from tests.web.inside import _clouds as clouds_module
 from tests.web.sitekit import TOKEN, Caller
 
@@ -116,9 +116,9 @@ async def test_cloud_is_packed_once_and_in_a_thread(monkeypatch: pytest.MonkeyPa
 
     def counted(cloud: Cloud) -> Any:
         made.append(threading.current_thread().name)
-        return packed(cloud)
+        return pack_cloud(cloud)
 
-    monkeypatch.setattr(clouds_module, "packed", counted)
+    monkeypatch.setattr(clouds_module, "pack_cloud", counted)
     async with world(line(3)) as one, one.looking() as looker, one.looking() as other:
         await looker.cloud()
         await other.cloud()
@@ -134,7 +134,7 @@ async def test_cloud_that_cannot_be_packed_is_reported(monkeypatch: pytest.Monke
     async with world(line(3)) as one, one.looking() as looker:
         await looker.cloud()
         with monkeypatch.context() as patch:
-            patch.setattr(clouds_module, "thinned", fails)
+            patch.setattr(clouds_module, "thin_cloud", fails)
             one.site.show(line(4))
             await looker.next()
             told = json.loads(await looker.socket.receive_str())
@@ -144,20 +144,20 @@ async def test_cloud_that_cannot_be_packed_is_reported(monkeypatch: pytest.Monke
         assert (await looker.cloud())[0]["points"] == 5
 
 
-def test_large_cloud_is_thinned() -> None:
+def test_large_cloud_is_thin_cloud() -> None:
     rng = np.random.default_rng(1)
     cloud = Cloud(rng.random((20_000, 3)) * [1, 2, 0.001])
-    thin, size = thinned(cloud, 5000)
+    thin, size = thin_cloud(cloud, 5000)
     assert size is not None
     assert 2000 < len(thin) <= 5000
     assert np.array_equal(thin.points, voxel_grid(cloud, size).points)
-    assert thinned(cloud, 20_000) == (cloud, None)
+    assert thin_cloud(cloud, 20_000) == (cloud, None)
     for odd in (
         np.full((100, 3), 1e7),  # all at one place, far off
         np.concatenate([rng.random((99, 3)), [[3e38, 0, 0]]]),
         np.concatenate([rng.random((99, 3)) * 1e-30, [[-3e38, 3e38, 0]]]),
     ):
-        assert 0 < len(thinned(Cloud(odd), 50)[0]) <= 50
+        assert 0 < len(thin_cloud(Cloud(odd), 50)[0]) <= 50
 
 
 async def test_thinned_cloud_is_said_to_be_so(monkeypatch: pytest.MonkeyPatch) -> None:

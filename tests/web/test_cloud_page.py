@@ -227,7 +227,7 @@ async def test_newer_cloud_takes_the_place(page: Page, monkeypatch: pytest.Monke
         assert await page.inner_text("#points") == f"{len(SCENE):,}"
         assert await page.locator("#alarm").is_hidden()
         with monkeypatch.context() as patched:
-            patched.setattr(clouds_module, "thinned", refuse)
+            patched.setattr(clouds_module, "thin_cloud", refuse)
             site.show(SCENE)
             await page.locator("#alarm").filter(has_text="cannot be shown: too much").wait_for()
         site.show(Cloud(np.empty((0, 3))))

@@ -19,7 +19,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import ColourSite
 from smartcam.web import _colours as colours_module
-from smartcam.web._colours import CALLS, MAX_LOOKS, MAX_VIEWERS_KEPT, PICTURES_PER_VIEWER
+from smartcam.web._colours import CALLS, MAX_VIEWERS_KEPT, MAX_WAITING_REQUESTS, PICTURES_PER_VIEWER
 from tests import ROOT
 from tests.cli.commandline import run
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
@@ -176,8 +176,8 @@ async def test_pictures_of_few_are_kept_and_two_of_each() -> None:
 
 
 async def test_those_who_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(colours_module, "MAX_LOOKS", 1)
-    assert MAX_LOOKS >= 8
+    monkeypatch.setattr(colours_module, "MAX_WAITING_REQUESTS", 1)
+    assert MAX_WAITING_REQUESTS >= 8
     async with world() as all_of:
         asking = asyncio.create_task(all_of.ask())
         await all_of.driver.streams()
@@ -269,7 +269,7 @@ def test_document_has_every_bound() -> None:
     page = (ROOT / "docs" / "tower.md").read_text(encoding="utf-8")
     assert PICTURES_PER_VIEWER == 2
     assert f"two pictures are kept for each of the last {MAX_VIEWERS_KEPT}" in page
-    assert f"At most {MAX_LOOKS} calls may wait" in page
+    assert f"At most {MAX_WAITING_REQUESTS} calls may wait" in page
 
 
 # ---------------------------------------------------------------------- the command

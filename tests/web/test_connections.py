@@ -23,7 +23,7 @@ from tests.web.inside import (
     MAX_HEAD_BYTES,
     MAX_STREAMS,
     MAX_WAITING_CHANGES,
-    Visitor,
+    SiteConnection,
 )
 from tests.web.inside import _connections as connections
 from tests.web.inside import _emulator as emulator
@@ -34,8 +34,8 @@ HALF = b"GET /api HTTP/1.1\r\nHost: localhost\r\nX-Slow: "
 UNFINISHED = b"POST /api HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
 
 
-def places_of(world: World) -> Places[Visitor]:
-    opened = world.site._open
+def places_of(world: World) -> Places[SiteConnection]:
+    opened = world.site._open_port
     assert opened is not None
     return opened.places
 
@@ -79,7 +79,7 @@ async def test_place_of_a_request_that_is_answered_is_safe(
     async with served() as world, contextlib.AsyncExitStack() as stack, world.events() as events:
         await events.next("clock")
         waiting = asyncio.create_task(world.caller.get("log?wait=30"))
-        await until(lambda: world.site._waiting == 1)
+        await until(lambda: world.site._waiting_count == 1)
         with caplog.at_level(logging.INFO, logger="smartcam.web"):
             await flooded(world, stack, 2 * MAX_CONNECTIONS, HALF)
             await until(lambda: places_of(world).crowded_out >= MAX_CONNECTIONS)
@@ -107,13 +107,13 @@ async def test_streams_and_calls_that_wait_leave_places_free() -> None:
         waiting = [
             asyncio.create_task(world.caller.get("log?wait=30")) for _ in range(MAX_WAITING_CHANGES)
         ]
-        await until(lambda: world.site._waiting == MAX_WAITING_CHANGES)
+        await until(lambda: world.site._waiting_count == MAX_WAITING_CHANGES)
         answer = await world.caller.call("GET", "log?wait=30")
         assert (answer.status, answer.value["expected"]) == (503, "16 at one time")
         assert (await world.caller.get("log"))["entries"] == []
         await world.site.stop()
         await asyncio.gather(*waiting, return_exceptions=True)
-        assert world.site._waiting == 0
+        assert world.site._waiting_count == 0
 
 
 async def test_where_every_place_is_taken_the_newcomer_is_reported(
@@ -236,8 +236,8 @@ async def test_call_that_waits_ends_with_its_client() -> None:
             raw.writer.write(
                 b"GET /api/cameras/camera/log?wait=30 HTTP/1.1\r\nHost: localhost\r\n\r\n"
             )
-            await until(lambda: world.site._waiting == 1)
-        await until(lambda: world.site._waiting == 0)
+            await until(lambda: world.site._waiting_count == 1)
+        await until(lambda: world.site._waiting_count == 0)
 
 
 async def test_client_that_goes_in_the_middle_of_its_body_is_no_error(

@@ -26,8 +26,8 @@ from tests.web.inside import (
     MAX_KEPT_BYTES,
     MAX_QUEUE,
     MAX_ROWS,
-    judged,
     line_of,
+    outcome_of,
 )
 from tests.web.inside import FLEET_MAX_VIEWERS as MAX_VIEWERS
 from tests.web.inside import FLEET_SOCKET_PROTOCOL as PROTOCOL
@@ -327,7 +327,7 @@ async def test_more_events_than_are_kept_are_made_good(monkeypatch: pytest.Monke
     async with served(6) as world:
         monkeypatch.setattr(view_module, "MAX_EVENTS", 50)
         world.fleet.join("x", "a")
-        await world.site.view._begin()
+        await world.site.view._read_fleet()
         world.fleet.leave("line01/cam001")
         world.fleet.agent.pop("line01/cam002")  # whose going is not heard
         for number in range(60):
@@ -368,7 +368,7 @@ async def test_cameras_that_are_gone_are_bounded(monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_outcome(value: Any, outcome: str) -> None:
-    assert judged(value) == outcome
+    assert outcome_of(value) == outcome
 
 
 async def test_every_result_has_one_outcome(monkeypatch: pytest.MonkeyPatch) -> None:

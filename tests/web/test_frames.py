@@ -20,13 +20,13 @@ from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import FramesSite, _jpeg
 from smartcam.web._frames import CALLS
 from smartcam.web._inside import is_whole_jpeg, picture
-from smartcam.web._jpeg import TABLES, jpeg
+from smartcam.web._jpeg import HUFFMAN_TABLES, jpeg
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.handmade import until
 from tests.web.inside import PICTURES_MAX_VIEWERS as MAX_VIEWERS
 from tests.web.inside import PICTURES_PROTOCOL as PROTOCOL
 from tests.web.inside import STREAMS_SHOW_TIMEOUT as SHOW_TIMEOUT
-from tests.web.inside import Press
+from tests.web.inside import JpegMaker
 from tests.web.inside import _pictures as pictures_module
 from tests.web.sitekit import TOKEN, Caller, Raw
 
@@ -400,7 +400,7 @@ async def test_picture_of_a_source_without_frames_reports_it() -> None:
 # ---------------------------------------------------------------------- JPEGs
 
 
-async def test_press_makes_a_frame_once_for_all_and_a_cancelled_one_spoils_nothing(
+async def test_jpeg_is_made_once_for_all_callers_and_a_cancelled_one_spoils_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made: list[int] = []
@@ -413,8 +413,8 @@ async def test_press_makes_a_frame_once_for_all_and_a_cancelled_one_spoils_nothi
 
     monkeypatch.setattr(_jpeg, "jpeg", slow)
     with ThreadPoolExecutor(1) as threads:
-        press, one = Press(threads, 80), plain(1)
-        waiting = [asyncio.create_task(press.jpeg(one)) for _ in range(3)]
+        maker, one = JpegMaker(threads, 80), plain(1)
+        waiting = [asyncio.create_task(maker.jpeg(one)) for _ in range(3)]
         await asyncio.sleep(0)
         waiting[0].cancel()
         gate.set()
@@ -431,13 +431,13 @@ def test_jpeg_of_a_camera_stays_as_it_came() -> None:
 
 def test_jpeg_that_browsers_cannot_read_is_made_anew() -> None:
     data = jpeg(plain(1, 100), 60)
-    begin = data.index(TABLES)
+    begin = data.index(HUFFMAN_TABLES)
     end = data.index(b"\xff\xda")
     bare = data[:begin] + data[end:]  # as webcams send it
     mjpeg = plain(1, data=bare, format=find_format("MJPEG"), stride=0)
     assert not is_whole_jpeg(mjpeg)
     made = jpeg(mjpeg, 90)
-    assert TABLES in made
+    assert HUFFMAN_TABLES in made
     assert abs(int(simplejpeg.decode_jpeg(made, colorspace="GRAY").mean()) - 100) <= 2
 
 

@@ -33,7 +33,7 @@ from tests.web.inside import (
     SLOT_SECONDS,
     ShiftHistory,
     ShownResult,
-    shown_value,
+    value_fields,
     verdicts,
 )
 from tests.web.inside import LIVE_CALLS as CALLS
@@ -444,7 +444,7 @@ def test_what_is_kept_is_bounded() -> None:
     history = ShiftHistory()
     for number in range(2 * MAX_BARS):
         history.add(shift_result(number, ok=False, seconds=BAR_SECONDS * number))
-        history.attach(history.last_failure, b"BM" + bytes([number]))
+        history.attach_picture(history.last_failure, b"BM" + bytes([number]))
         history.add(shift_result(number, ok=True, seconds=BAR_SECONDS * number))
     found = history.as_json()
     assert (len(found["bars"]), len(found["failures"])) == (MAX_BARS, MAX_FAILURES)
@@ -468,7 +468,7 @@ def test_picture_belongs_to_no_failure_once_anything_came_after_it() -> None:
     assert history.wants_picture
     history.add(shift_result(2, ok=False)._replace(value=b"no verdict"))
     assert not history.wants_picture
-    history.attach(history.last_failure, b"BM of another part")
+    history.attach_picture(history.last_failure, b"BM of another part")
     assert history.as_json()["failures"][0]["picture"] is False
 
 
@@ -497,9 +497,9 @@ def test_short_trend_tells_how_many_of_ten_were_bad() -> None:
 
 def test_a_text_is_shown_as_text_and_not_as_hex() -> None:
     cells = b'{"A2": 12.5, "B2": "bolt"}'
-    assert shown_value(cells)["value"] == cells.decode()
-    assert shown_value(b"\x00\x01")["value"] == "0001"
-    assert shown_value(b"")["value"] == ""
+    assert value_fields(cells)["value"] == cells.decode()
+    assert value_fields(b"\x00\x01")["value"] == "0001"
+    assert value_fields(b"")["value"] == ""
 
 
 async def test_page_of_a_camera_tells_its_failures() -> None:

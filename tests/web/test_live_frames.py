@@ -97,7 +97,7 @@ async def test_two_who_look_are_one_stream_of_the_agent() -> None:
             plant.driver.give(frame(9))
             for socket in (one, other):
                 assert (await next_picture(socket))[0]["sequence"] == 9
-            assert len(plant.shared._viewers) == 1
+            assert len(plant.shared._streams) == 1
 
 
 async def test_camera_without_frames_is_not_asked_for_any() -> None:

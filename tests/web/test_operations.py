@@ -188,7 +188,7 @@ async def test_camera_that_another_client_took_is_in_the_numbers() -> None:
             await until(lambda: host.connected)
             async with smartcam.connect(boxes["one"].url):
                 await until(lambda: not host.connected)
-        await until(lambda: host.camera.taken)
+        await until(lambda: host.camera.is_taken)
         found = samples((await ask(site, "/metrics"))[1])
         assert (found["smartcam_connected", "a1", "one"], found["smartcam_taken", "a1", "one"]) == (
             0,
@@ -228,7 +228,7 @@ async def test_the_text_grows_by_a_few_lines_for_a_camera_and_by_no_labels_of_ot
 
     async def lines(count: int) -> int:
         cameras = [numbers.cameras[0]._replace(name=f"line/cam{n}") for n in range(count)]
-        text, _ = await exposition(numbers._replace(cameras=cameras), each=False)
+        text, _ = await exposition(numbers._replace(cameras=cameras), per_camera=False)
         assert text.count(b"# TYPE smartcam_connected ") == 1
         assert (
             len([one for one in samples(text.decode()) if one[0] == "smartcam_connected"]) == count
@@ -265,8 +265,8 @@ async def test_nothing_else_is_there_and_connections_are_bounded() -> None:
             for _ in range(MAX_CONNECTIONS + 10)
         ]
         assert await ask(site, "/healthz") == (200, "ok\n")  # the idle ones made room
-        assert site._open is not None
-        assert len(site._open.places) <= MAX_CONNECTIONS
+        assert site._open_port is not None
+        assert len(site._open_port.places) <= MAX_CONNECTIONS
         for _, writer in many:
             writer.close()
 

@@ -449,13 +449,13 @@ async def test_log_waits_for_the_first_entry() -> None:
 
 async def test_log_that_waits_ends_with_the_site(monkeypatch: pytest.MonkeyPatch) -> None:
     waits = asyncio.Event()
-    pause = Streams.pause
+    wait_closing = Streams.wait_closing
 
     def told(streams: Streams, seconds: float) -> Coroutine[Any, Any, bool]:
         waits.set()
-        return pause(streams, seconds)
+        return wait_closing(streams, seconds)
 
-    monkeypatch.setattr(Streams, "pause", told)
+    monkeypatch.setattr(Streams, "wait_closing", told)
     async with served() as world:
         waiting = asyncio.create_task(world.caller.get("log?wait=30"))
         async with asyncio.timeout(60):

@@ -11,9 +11,9 @@ import pytest
 import smartcam
 from smartcam.emulator import EmulatedCamera
 from smartcam.models import Status
-from smartcam.web._feed import MAX_LOG_NEWS, Watcher
+from smartcam.web._feed import MAX_LOG_NEWS, EmulatorWatcher
 from tests.handmade import until
-from tests.web.inside import MAX_STREAMS, News
+from tests.web.inside import MAX_STREAMS, StreamEvent
 from tests.web.inside import _streams as streams
 from tests.web.sitekit import Raw, World, served
 
@@ -108,7 +108,9 @@ async def stuffed(raw: Raw, world: World) -> None:
 def flood(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make each look of a stream give a lot of news."""
     monkeypatch.setattr(streams, "PERIOD", 0.0)
-    monkeypatch.setattr(Watcher, "look", lambda _self: [News("log", "x" * 500_000)])
+    monkeypatch.setattr(
+        EmulatorWatcher, "find_events", lambda _self: [StreamEvent("log", "x" * 500_000)]
+    )
 
 
 async def test_slow_reader_is_disconnected(flood: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,8 +136,8 @@ async def test_slow_reader_holds_up_neither_emulator_nor_stop(flood: None) -> No
 # ---------------------------------------------------------------------- looking for news
 
 
-def log_news(watcher: Watcher) -> list[News]:
-    return [one for one in watcher.look() if one.kind == "log"]
+def log_news(watcher: EmulatorWatcher) -> list[StreamEvent]:
+    return [one for one in watcher.find_events() if one.kind == "log"]
 
 
 async def filled(emulator: EmulatedCamera, count: int) -> None:
@@ -146,7 +148,7 @@ async def filled(emulator: EmulatedCamera, count: int) -> None:
 
 async def test_watcher_catches_up_in_pieces() -> None:
     async with served() as world, smartcam.connect(world.emulator.url):
-        watcher = Watcher("camera", world.emulator)
+        watcher = EmulatorWatcher("camera", world.emulator)
         await filled(world.emulator, MAX_LOG_NEWS + 50)
         pieces = [news.data for _ in range(3) for news in log_news(watcher)]
     assert [len(one["entries"]) for one in pieces] == [MAX_LOG_NEWS, 49]
@@ -155,7 +157,7 @@ async def test_watcher_catches_up_in_pieces() -> None:
 
 async def test_watcher_tells_what_it_missed() -> None:
     async with served() as world, smartcam.connect(world.emulator.url):
-        watcher = Watcher("camera", world.emulator)
+        watcher = EmulatorWatcher("camera", world.emulator)
         await filled(world.emulator, 11)
         for _ in range(len(world.emulator.log) - 3):
             world.emulator.log.popleft()
@@ -167,7 +169,7 @@ async def test_watcher_tells_what_it_missed() -> None:
 
 async def test_watcher_with_a_serial_of_another_time_begins_with_the_next() -> None:
     async with served() as world, smartcam.connect(world.emulator.url):
-        watcher = Watcher("camera", world.emulator, 1_000_000)
+        watcher = EmulatorWatcher("camera", world.emulator, 1_000_000)
         assert log_news(watcher) == []
         world.emulator.device.set_endian(1)
         assert len(log_news(watcher)) == 1

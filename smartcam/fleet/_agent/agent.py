@@ -1,4 +1,4 @@
-"""An agent: it has the sessions with its cameras, and carries out programs' calls.
+"""Run an agent, which has the sessions with its cameras and carries out programs' calls.
 
 Each call has a number of its program, and is carried out once even if it arrives twice; a call that
 comes after its deadline is not carried out. Every call is a task of the agent, which ends with its
@@ -29,13 +29,13 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.fleet._agent.bundle import AgentBundle
-from smartcam.fleet._agent.calls import ACTIONS, PASSES_GATE, ProgramCall, now
+from smartcam.fleet._agent.calls import ACTIONS, GATED_COMMANDS, ProgramCall, agent_clock
 from smartcam.fleet._agent.claims import Claims
 from smartcam.fleet._agent.host import Host
 from smartcam.fleet._agent.shared import Owner
 from smartcam.fleet._agent.summary import Summaries
 from smartcam.fleet._agent.workers import Workers
-from smartcam.fleet._bus.errors import late, to_fields
+from smartcam.fleet._bus.errors import late_call_error, to_fields
 from smartcam.fleet._bus.keys import COMMANDS
 from smartcam.fleet._bus.wire import (
     BusMessage,
@@ -44,12 +44,12 @@ from smartcam.fleet._bus.wire import (
     decode_order,
     encode,
     encode_outcome,
-    grace,
+    reply_grace,
 )
-from smartcam.fleet._frames.camera_frames import NO_FRAMES, SharedFrames
+from smartcam.fleet._frames.camera_frames import NO_FRAME_SUPPLY, SharedFrames
 from smartcam.fleet._frames.encoding import FrameEncoder
 from smartcam.fleet._frames.sender import FrameSender
-from smartcam.fleet._json.plain import Plain
+from smartcam.fleet._json.plain import PlainServices
 from smartcam.fleet._operations.trigger_counts import RESULT, Totals, outcome_of
 from smartcam.fleet._program.program_name import ROLES_OF_NAMES, ProgramName
 from smartcam.fleet._security.certificates import VIEWER
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Bus, Handle
     from smartcam.fleet._bus.keys import Keys
     from smartcam.fleet._file.standby import Standby
-    from smartcam.fleet._frames.camera_frames import FramesOf
+    from smartcam.fleet._frames.camera_frames import FrameSupply
     from smartcam.models import CameraEvent
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
@@ -73,30 +73,30 @@ MAX_PROGRAMS_PER_ROLE = 4096
 """Largest number of programs of each role at a time, so that one role cannot keep the others
 out."""
 
-PRESENCE_WITHIN = 10.0
-"""Seconds after its first call within which a program's presence must be seen, since the call may
-come before it. A program without presence is forgotten, since its end would not be noticed."""
+PRESENCE_TIMEOUT = 10.0
+"""Seconds after a program's first call in which its presence must be seen. A program without
+presence is forgotten then, since its end would not be noticed."""
 
 MAX_CALLS_PER_PROGRAM = 256
-"""Largest number of running calls of one program for each camera of the agent; of questions and
-commands each."""
+"""Largest number of running questions of one program, and of its running commands, for each camera
+of the agent."""
 
 MAX_QUESTIONS_PER_ROLE = 16 * MAX_CALLS_PER_PROGRAM
 """Largest number of running questions of all programs of one role, for each camera."""
 
-KNOWN_CALLS = 4096
-"""Number of remembered calls for each program; older calls are not carried out any more."""
+MAX_REMEMBERED_CALLS = 4096
+"""Largest number of remembered calls of each program; an older call is not carried out."""
 
-KNOWN_CAMERAS = 1000
-"""Largest number of unshared cameras whose numbers would continue if they came back."""
+MAX_REMEMBERED_CAMERAS = 1000
+"""Largest number of cameras that are no longer shared, whose next numbers are remembered."""
 
 FIRST_ATTEMPT_TIMEOUT = 30.0
-"""Seconds of the timeout at the start for the first attempt to connect to a camera."""
+"""Seconds to wait at the start for the first attempts to connect to the cameras."""
 
 
 END_NOTICE_DELAY = 0.02
-"""Seconds between the last message about a camera and the end of its presence, which would
-overtake the message in the engine."""
+"""Seconds to wait between the last message about a camera and the end of its presence. Without this
+wait the end of the presence may arrive first."""
 
 
 class CallNumbers:
@@ -111,17 +111,17 @@ class CallNumbers:
         self._known_calls: set[int] = set()
 
     @property
-    def last(self) -> int:
+    def last_call(self) -> int:
         """The highest received number."""
         return max(self._known_calls, default=self.floor)
 
-    def is_new(self, call: int) -> bool:
-        """Return True if a call is received for the first time, and remember it."""
+    def add_if_new(self, call: int) -> bool:
+        """Remember a call; return True if it is received for the first time."""
         if call <= self.floor or call in self._known_calls:
             return False
         self._known_calls.add(call)
-        if len(self._known_calls) > KNOWN_CALLS:
-            newest = sorted(self._known_calls)[KNOWN_CALLS // 2 :]
+        if len(self._known_calls) > MAX_REMEMBERED_CALLS:
+            newest = sorted(self._known_calls)[MAX_REMEMBERED_CALLS // 2 :]
             self.floor = newest[0] - 1
             self._known_calls = set(newest)
         return True
@@ -136,45 +136,45 @@ class Guest:
     Attributes:
         program: name and secret of the program.
         number: number of the program in the results of its triggers.
-        present: whether the program's presence was seen.
-        questions, commands: numbers of its calls of each kind.
+        is_present: whether the program's presence was seen.
+        questions, commands: numbers of its received calls, of each kind.
         tasks: running calls, by kind (True: a command) and number.
-        under_way: counts of questions and of commands among ``tasks``.
-        entered: applications to go back to after the program's temporary switches.
+        running_counts: numbers of running questions and commands, by kind.
+        entered: state to restore after each temporary switch of the application.
         last_state: number of the last state in the program's replies, by camera.
     """
 
     program: ProgramName
     number: int
-    present: bool
+    is_present: bool
     questions: CallNumbers = field(default_factory=CallNumbers)
     commands: CallNumbers = field(default_factory=CallNumbers)
     tasks: dict[tuple[bool, int], asyncio.Task[None]] = field(
         default_factory=dict[tuple[bool, int], "asyncio.Task[None]"]
     )
-    under_way: list[int] = field(default_factory=lambda: [0, 0])
+    running_counts: list[int] = field(default_factory=lambda: [0, 0])
     entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
     last_state: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
-    def last(self) -> int:
+    def last_call(self) -> int:
         """The highest received number of a call."""
-        return max(self.questions.last, self.commands.last)
+        return max(self.questions.last_call, self.commands.last_call)
 
-    def is_new(self, call: int, command: bool) -> bool:
-        """Return True if a call is received for the first time, and remember it."""
-        return (self.commands if command else self.questions).is_new(call)
+    def add_if_new(self, call: int, command: bool) -> bool:
+        """Remember a call; return True if it is received for the first time."""
+        return (self.commands if command else self.questions).add_if_new(call)
 
-    def begin(self, command: bool, call: int, task: asyncio.Task[None]) -> None:
+    def begin_call(self, command: bool, call: int, task: asyncio.Task[None]) -> None:
         """Count a call as running."""
         self.tasks[command, call] = task
-        self.under_way[command] += 1
+        self.running_counts[command] += 1
 
-    def end(self, command: bool, call: int) -> asyncio.Task[None] | None:
-        """Count a call as ended; return its task, None if it has ended before."""
+    def end_call(self, command: bool, call: int) -> asyncio.Task[None] | None:
+        """Count a call as ended; return its task, or None if it had ended before."""
         task = self.tasks.pop((command, call), None)
         if task is not None:
-            self.under_way[command] -= 1
+            self.running_counts[command] -= 1
         return task
 
 
@@ -190,12 +190,13 @@ class Agent:
         on_event: callback for events of the cameras.
         frames: sources of frames, by camera's name, for the cameras with frames.
         observers: observers of all sessions.
-        standby: settings of standing by for other agents' cameras; None: it does not stand by.
-        on_retired: callback for the end of all cameras, since another agent has the name.
+        standby: settings of a standby agent, which takes over cameras of agents that are lost;
+            None: this agent is no standby agent.
+        on_retired: callback for the case that the agent ends because another one has its name.
         calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Attributes:
-        retired_by: reason why the agent has no cameras any more.
+        retired_by: reason why the agent has ended, as another one has its name; None while it runs.
     """
 
     def __init__(
@@ -207,7 +208,7 @@ class Agent:
         *,
         history: tuple[int, int] = (10_000, 1 << 24),
         on_event: Callable[[CameraEvent], None] = lambda _: None,
-        frames: Mapping[str, FramesOf] | None = None,
+        frames: Mapping[str, FrameSupply] | None = None,
         observers: Iterable[Observer] = (),
         standby: Standby | None = None,
         on_retired: Callable[[ConfigurationError], None] = lambda _: None,
@@ -228,22 +229,23 @@ class Agent:
         # their last call
         self._present = collections.defaultdict[str, set[str]](set)
         self._last_calls = collections.defaultdict[str, dict[str, int]](dict)
-        self._of_role: collections.Counter[str] = collections.Counter()  # number of programs
+        self._role_counts: collections.Counter[str] = collections.Counter()  # number of programs
         # running questions, by program
-        self._questions: collections.Counter[str] = collections.Counter()
-        self._numbers = 0
+        self._question_counts: collections.Counter[str] = collections.Counter()
+        self._last_program_number = 0
         self._workers = Workers()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._declared: list[Handle] = []
-        self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
-        # numbers of cameras that were shared before
-        self._numbers_at: dict[str, tuple[int, ...]] = {}
-        self._plain = Plain(self, keys, bus, calibrations)
-        self.leaving: set[Host] = set()  # hosts that are being closed
-        self.past: Totals = Totals()  # counts of cameras that are no longer shared
+        self._handles: list[Handle] = []
+        # presence of each shared camera, and the task of its session
+        self._sharing: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
+        # next numbers of cameras that were shared before
+        self._remembered_numbers: dict[str, tuple[int, ...]] = {}
+        self._plain = PlainServices(self, keys, bus, calibrations)
+        self.closing_hosts: set[Host] = set()  # hosts that are being closed
+        self.past_totals: Totals = Totals()  # counts of cameras that are no longer shared
         self._summaries = Summaries(self, keys, bus)
         self._bundle = AgentBundle(name, self.epoch, keys, bus)
-        self.stands_by: bool = standby is not None
+        self.is_standby: bool = standby is not None
         self._claims = Claims(self, keys, bus, standby)
 
     # ------------------------------------------------------------------ life
@@ -253,22 +255,22 @@ class Agent:
 
         Raises:
             ConnectFailedError: there is no bus within ``timeout`` seconds.
-            ConfigurationError: an option of a camera is wrong, or another agent has the camera and
-                neither stands by; or another agent has this one's name.
+            ConfigurationError: an option of a camera is wrong, another agent has this agent's name,
+                or another agent has a camera and neither is a standby agent.
         """
         await self._bus.open(timeout)
-        keys, bus, declared = self._keys, self._bus, self._declared
+        keys, bus, handles = self._keys, self._bus, self._handles
         try:
             await self._claims.refuse_namesake(timeout)
-            declared.append(bus.watch(keys.program("*"), self._on_program))
+            handles.append(bus.watch(keys.program("*"), self._on_program))
             for role in (None, *ROLES_OF_NAMES):
-                pattern, on_call = self._calls_of(role, "**"), self._call_handler(role)
-                declared.append(bus.subscribe(pattern, on_call, patient=role == VIEWER))
+                pattern, on_call = self._calls_key(role, "**"), self._call_handler(role)
+                handles.append(bus.subscribe(pattern, on_call, patient=role == VIEWER))
             self._plain.open()
             self._summaries.open()
             self._bundle.open()
             await self._claims.claim_name(timeout)
-            declared.append(bus.be_present(keys.agent(self.name)))
+            handles.append(bus.be_present(keys.agent(self.name)))
             await self._claims.open(self._cameras, timeout)
         except BaseException:
             await self.close()
@@ -280,14 +282,14 @@ class Agent:
 
         Cancellation: the sessions' links are dropped at once; the bus is still left.
         """
-        declared, self._declared = self._declared, []
+        handles, self._handles = self._handles, []
         self._claims.close()
         self._plain.close()
         self._summaries.close()
-        for handle in (*declared, *(token for token, _ in self._shared.values())):
+        for handle in (*handles, *(token for token, _ in self._sharing.values())):
             handle.close()
         for program in [*self._programs]:
-            self._forget(program, going_back=False)
+            self._forget_program(program, restore_applications=False)
         for task in self._workers.close():
             self._add_task(task)
         for task in tuple(self._tasks):
@@ -305,19 +307,19 @@ class Agent:
             await self._bus.close()
 
     def retire(self, why: ConfigurationError) -> None:
-        """End the sessions and the agent, since another agent has this name."""
+        """Start to end the sessions and the agent, since another agent has its name."""
         if self.retired_by is not None:
             return
         logger.error("%s ! %s", self.name, why)
         self.retired_by = why
-        self.begin(self._retire(why), "smartcam.fleet.retire")
+        self.start_task(self._retire(why), "smartcam.fleet.retire")
 
     async def _retire(self, why: ConfigurationError) -> None:
-        declared, self._declared = self._declared, []
+        handles, self._handles = self._handles, []
         self._claims.close()
         self._plain.close()
         self._summaries.close()
-        for handle in declared:
+        for handle in handles:
             handle.close()
         reason = "another agent has its name"
         try:
@@ -327,7 +329,9 @@ class Agent:
         finally:
             self._on_retired(why)
 
-    def share(self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None) -> Host:
+    def share(
+        self, name: str, settings: CameraSettings, frames_of: FrameSupply | None = None
+    ) -> Host:
         """Start a session with a camera, and share the camera.
 
         Args:
@@ -341,12 +345,12 @@ class Agent:
         bus, keys, topics = self._bus, self._keys, self._plain.topics
         if frames_of is not None:
             self._frames[name] = frames_of
-        source = self._frames.get(name, NO_FRAMES)
+        source = self._frames.get(name, NO_FRAME_SUPPLY)
         reporter = source.reporter
         frames = SharedFrames(
             name, source.make, self._sender, self._encoder, source.url, reporter is not None
         )
-        events = self._on_camera_event
+        on_event = self._on_camera_event
         host = Host(
             name,
             settings,
@@ -354,23 +358,23 @@ class Agent:
             keys,
             self.epoch,
             self._history,
-            events,
+            on_event,
             topics,
             frames,
             self._bundle,
             self._observers if reporter is None else (reporter, *self._observers),
         )
-        host.numbers = self._numbers_at.pop(name, host.numbers)
-        host.began, host.final = host.results.following, not self.stands_by
+        host.numbers = self._remembered_numbers.pop(name, host.numbers)
+        host.first_result, host.is_only_agent = host.results.following, not self.is_standby
         self.hosts[name] = host
-        running = self.begin(host.run(), f"smartcam.fleet.{name}")
-        self._shared[name] = bus.be_present(keys.camera(self.name, name)), running
+        session_task = self.start_task(host.run(), f"smartcam.fleet.{name}")
+        self._sharing[name] = bus.be_present(keys.camera(self.name, name)), session_task
         return host
 
-    async def want(
-        self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None
+    async def add_camera(
+        self, name: str, settings: CameraSettings, frames_of: FrameSupply | None = None
     ) -> None:
-        """Share a further camera, or stand by for it.
+        """Share a further camera, or stand by while another agent has it.
 
         Raises:
             ConfigurationError: an option of the camera is wrong; or another agent has it.
@@ -379,19 +383,19 @@ class Agent:
             raise self.retired_by.with_traceback(None)
         if frames_of is not None:
             self._frames[name] = frames_of
-        await self._claims.want(name, settings)
+        await self._claims.claim_camera(name, settings)
 
     async def refuse_taken(self, name: str, settings: CameraSettings) -> None:
         """Raise if the fleet has a camera already under another name.
 
         Raises:
-            ConfigurationError: the fleet has it; the text names the camera and its agent.
+            ConfigurationError: the fleet has this camera; the text names it and its agent.
         """
         await self._claims.refuse_taken({name: settings})
 
-    async def drop(self, name: str, why: str) -> None:
+    async def remove_camera(self, name: str, why: str) -> None:
         """Stop sharing a camera or standing by for it; bounded. Its programs get ``why``."""
-        self._claims.drop(name)
+        self._claims.drop_claim(name)
         if name in self.hosts:
             await self.unshare(name, why)
 
@@ -405,34 +409,34 @@ class Agent:
         Cancellation: takes effect at the end.
         """
         host = self.hosts.pop(name)
-        host.announce_removed(why)  # before its presence ends, which alone would mean a lost agent
-        self.leaving.add(host)
-        token, running = self._shared.pop(name)
+        host.announce_removed(why)  # first, as an end of the presence alone means a lost agent
+        self.closing_hosts.add(host)
+        token, session_task = self._sharing.pop(name)
         try:
             try:
                 if not self._bus.local:
                     await asyncio.sleep(END_NOTICE_DELAY)
             finally:
                 token.close()
-                running.cancel()
-            await asyncio.wait({running})
+                session_task.cancel()
+            await asyncio.wait({session_task})
         finally:
             try:
                 await host.close()
             finally:
-                self._numbers_at[name] = host.numbers
-                self.leaving.discard(host)
-                self.past.add([host.camera.statistics()])
-        if len(self._numbers_at) > KNOWN_CAMERAS:
-            del self._numbers_at[next(iter(self._numbers_at))]
+                self._remembered_numbers[name] = host.numbers
+                self.closing_hosts.discard(host)
+                self.past_totals.add([host.camera.statistics()])
+        if len(self._remembered_numbers) > MAX_REMEMBERED_CAMERAS:
+            del self._remembered_numbers[next(iter(self._remembered_numbers))]
 
     @property
-    def programs(self) -> int:
+    def program_count(self) -> int:
         """Number of programs that use the agent."""
         return len(self._programs)
 
     @property
-    def calls(self) -> int:
+    def call_count(self) -> int:
         """Number of running calls of programs."""
         return sum(len(guest.tasks) for guest in self._programs.values())
 
@@ -442,12 +446,12 @@ class Agent:
 
     async def wait_first_attempts(self) -> None:
         """Wait until the first attempt with each camera has ended; bounded."""
-        end = asyncio.get_running_loop().time() + FIRST_ATTEMPT_TIMEOUT
+        deadline = asyncio.get_running_loop().time() + FIRST_ATTEMPT_TIMEOUT
         for host in tuple(self.hosts.values()):
-            await host.tried(max(0.0, end - asyncio.get_running_loop().time()))
+            await host.wait_first_attempt(max(0.0, deadline - asyncio.get_running_loop().time()))
 
-    def begin(self, work: Any, name: str) -> asyncio.Task[None]:
-        """Run a coroutine in a task, which ends with the agent."""
+    def start_task(self, work: Any, name: str) -> asyncio.Task[None]:
+        """Run a coroutine in a task, which the agent cancels at its end."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self._add_task(task)
         return task
@@ -456,8 +460,8 @@ class Agent:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def _end(self, call: asyncio.Task[None]) -> None:
-        """Cancel a call's task, and keep the task until it has ended."""
+    def _cancel_task(self, call: asyncio.Task[None]) -> None:
+        """Cancel a call's task, and keep a reference to it until it has ended."""
         self._add_task(call)
         call.cancel()
 
@@ -474,8 +478,8 @@ class Agent:
 
     def _on_program(self, key: str, present: bool) -> None:
         token = self._keys.tail(key, "presence/program")[-1]
-        program = ProgramName.of(token)
-        if not program.genuine:
+        program = ProgramName.from_token(token)
+        if not program.is_genuine:
             return
         tokens, guest = self._present[program.role], self._programs.get(program.name)
         if not present:
@@ -484,69 +488,69 @@ class Agent:
             tokens.add(token)
         if guest is None or guest.program != program:
             return
-        guest.present = present
+        guest.is_present = present
         if not present:
-            self._forget(program.name)
+            self._forget_program(program.name)
 
-    def _forget(self, program: str, *, going_back: bool = True) -> None:
+    def _forget_program(self, program: str, *, restore_applications: bool = True) -> None:
         """End the calls and reservations of a lost program."""
         guest = self._programs.pop(program, None)
         if guest is None:
             return
         role = guest.program.role
-        self._of_role[role] -= 1
-        gone = self._last_calls[role]
-        gone[program] = guest.last
-        if len(gone) > MAX_PROGRAMS_PER_ROLE:
-            del gone[next(iter(gone))]
+        self._role_counts[role] -= 1
+        last_calls = self._last_calls[role]
+        last_calls[program] = guest.last_call
+        if len(last_calls) > MAX_PROGRAMS_PER_ROLE:
+            del last_calls[next(iter(last_calls))]
         for task in guest.tasks.values():
-            self._end(task)
-        self._sender.forget(program)
+            self._cancel_task(task)
+        self._sender.forget_program(program)
         for host in self.hosts.values():
-            host.gate.forget(program)
-            host.frames.forget(program)
-        if going_back:
+            host.gate.lose_program(program)
+            host.frames.forget_program(program)
+        if restore_applications:
             for camera, before in guest.entered.values():
-                camera.leave(before)
+                camera.leave_application(before)
 
     def _known_guest(self, program: ProgramName) -> Guest | None:
-        """Return a known program; None also if another one uses its name."""
+        """Return a known program; None if it is unknown, or another program uses its name."""
         guest = self._programs.get(program.name)
         return guest if guest is not None and guest.program == program else None
 
-    def _guest(self, program: ProgramName, call: int) -> Guest | None:
+    def _guest_of_hello(self, program: ProgramName, call: int) -> Guest | None:
         """Return the program that sent a hello; None if the program has left since then."""
         known, role = self._known_guest(program), program.role
-        left = self._last_calls[role].get(program.name, 0)
-        if known is None and call > left:
-            if self._of_role[role] >= MAX_PROGRAMS_PER_ROLE:
+        last_call = self._last_calls[role].get(program.name, 0)  # if the program had left
+        if known is None and call > last_call:
+            if self._role_counts[role] >= MAX_PROGRAMS_PER_ROLE:
                 raise LocalProtocolError(
                     f"{self.name}: {MAX_PROGRAMS_PER_ROLE} programs of role {role} are here already"
                 )
             present = program.token in self._present[role]
-            numbers = CallNumbers(left), CallNumbers(left)
-            known = Guest(program, self.next_program(), present, *numbers)
+            numbers = CallNumbers(last_call), CallNumbers(last_call)
+            known = Guest(program, self.new_program_number(), present, *numbers)
             self._programs[program.name] = known
-            self._of_role[role] += 1
+            self._role_counts[role] += 1
             if not present:
                 loop = asyncio.get_running_loop()
-                loop.call_later(PRESENCE_WITHIN, self._expect_present, known)
+                loop.call_later(PRESENCE_TIMEOUT, self._check_presence, known)
         return known
 
-    def _expect_present(self, guest: Guest) -> None:
+    def _check_presence(self, guest: Guest) -> None:
         """Forget a program whose presence was not seen in time."""
-        if not guest.present and self._programs.get(guest.program.name) is guest:
+        if not guest.is_present and self._programs.get(guest.program.name) is guest:
             logger.warning("%s ! %s is not present: forgotten", self.name, guest.program.name)
-            self._forget(guest.program.name)
+            self._forget_program(guest.program.name)
 
-    def next_program(self) -> int:
+    def new_program_number(self) -> int:
         """Return the number for a new program, which marks the results of its triggers."""
-        self._numbers += 1
-        return self._numbers
+        self._last_program_number += 1
+        return self._last_program_number
 
     # ------------------------------------------------------------------ calls
 
-    def _calls_of(self, role: str | None, camera: str) -> str:
+    def _calls_key(self, role: str | None, camera: str) -> str:
         """Return the key of the questions of a role; with None the key of commands."""
         keys = self._keys
         return (
@@ -555,7 +559,7 @@ class Agent:
 
     def _call_handler(self, role: str | None) -> Callable[[str, bytes], None]:
         """Return the callback for calls of one kind: a role's questions, or with None commands."""
-        root, command = self._calls_of(role, ""), role is None
+        root, command = self._calls_key(role, ""), role is None
 
         def on_call(key: str, payload: bytes) -> None:
             name = key.removeprefix(root)
@@ -564,7 +568,7 @@ class Agent:
                 if order is None:
                     self._on_call(host, decode(payload, "a call"), role)
                 elif command:
-                    self._on_order(host, *order)
+                    self._on_trigger_order(host, *order)
                 else:
                     raise ProtocolError(f"{name}: a trigger is no question")
             except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
@@ -572,23 +576,23 @@ class Agent:
 
         return on_call
 
-    def _caller(self, token: str, role: str | None) -> ProgramName:
-        """Return the name of the calling program.
+    def _check_caller(self, token: str, role: str | None) -> ProgramName:
+        """Check the token of the calling program, and return its name.
 
         Raises:
-            ProtocolError: the program uses another's name, or a key for another role than its own.
+            ProtocolError: the program uses another program's name, or the key of another role.
         """
-        program = ProgramName.of(token)
-        if not program.genuine or role not in {None, program.role}:
+        program = ProgramName.from_token(token)
+        if not program.is_genuine or role not in {None, program.role}:
             raise ProtocolError(f"{self.name}: a call as {program.name:.80}, by another program")
         return program
 
     def _on_call(self, host: Host, message: BusMessage, role: str | None) -> None:
         fields, command = message.fields, role is None
-        program, number = self._caller(str(fields["program"]), role), int(fields["call"])
+        program, number = self._check_caller(str(fields["program"]), role), int(fields["call"])
         name = program.name
         if "come" in fields:
-            self._sender.come(name, number, fields["come"])
+            self._sender.confirm(name, number, fields["come"])
             return
         if "cancel" in fields:
             self._cancel(host, name, int(fields["cancel"]), command)
@@ -597,41 +601,45 @@ class Agent:
         action, timeout = str(fields["do"]), fields.get("timeout", 1.0)
         deadline = fields.get("deadline")
         epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
-        guest = self._guest(program, number) if action == "hello" else self._known_guest(program)
+        guest = (
+            self._guest_of_hello(program, number)
+            if action == "hello"
+            else self._known_guest(program)
+        )
         reservation = fields.get("reservation")
         if reservation is not None:
             reservation = int(reservation)
-        left = self._admit(
+        remaining = self._admit_call(
             host, guest, name, number, epoch, action, deadline, timeout, command, reservation
         )
-        if guest is not None and left is not None:
+        if guest is not None and remaining is not None:
             owner = Owner(guest.number, number)
             blobs, entered = message.blobs, guest.entered
             call = ProgramCall(
-                host, name, owner, arguments, blobs, left, entered, None, reservation
+                host, name, owner, arguments, blobs, remaining, entered, None, reservation
             )
             self._start(action, call, guest, command)
 
-    def _on_order(self, host: Host, token: str, order: TriggerOrder) -> None:
+    def _on_trigger_order(self, host: Host, token: str, order: TriggerOrder) -> None:
         number, action = order.call, "trigger"
         program, _, secret = token.partition(".")
         guest = self._programs.get(program)
         if guest is None or guest.program.secret != secret:
-            guest, program = None, self._caller(token, None).name
+            guest, program = None, self._check_caller(token, None).name
         epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
         reservation = order.reservation
-        left = self._admit(
+        remaining = self._admit_call(
             host, guest, program, number, epoch, action, deadline, timeout, True, reservation
         )
-        if guest is not None and left is not None:
+        if guest is not None and remaining is not None:
             owner, entered = new_tuple(Owner, (guest.number, number)), guest.entered
-            fields: Any = (host, program, owner, {}, [], left, entered, order, reservation)
+            fields: Any = (host, program, owner, {}, [], remaining, entered, order, reservation)
             call: ProgramCall = new_tuple(ProgramCall, fields)
-            worker = self._workers.take()
-            guest.begin(True, number, worker.task)
-            worker.do(partial(self._do, action, call, guest, True))
+            worker = self._workers.get_worker()
+            guest.begin_call(True, number, worker.task)
+            worker.start_work(partial(self._carry_out, action, call, guest, True))
 
-    def _admit(
+    def _admit_call(
         self,
         host: Host,
         guest: Guest | None,
@@ -644,96 +652,108 @@ class Agent:
         command: bool,
         reservation: int | None,
     ) -> float | None:
-        """Return the seconds of a call's timeout; None if it is refused, or a repetition."""
+        """Return the seconds that a call may take; None if the call is refused, or a repetition."""
         if guest is None or epoch != self.epoch:
-            kind = ConnectionLostError if reservation is None else ReservationLostError
-            stranger = kind(
+            error_class = ConnectionLostError if reservation is None else ReservationLostError
+            stranger = error_class(
                 f"{host.name}: the agent {self.name} was restarted, or took this program for "
                 f"gone{'' if reservation is None else ', and lost its reservation'}; {action} was "
                 "not done"
             )
             self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
             return None
-        if not guest.is_new(number, command):
+        if not guest.add_if_new(number, command):
             return None  # a repetition of a call that runs or has ended
         error: SmartCamError | None = None
-        left = 1.0
+        remaining = 1.0
         try:
             timeout = check_seconds(timeout, "timeout", host.name)
             if deadline is not None:
-                left = check_moment(deadline, "deadline", host.name) + grace(timeout) / 2 - now()
+                remaining = (
+                    check_moment(deadline, "deadline", host.name)
+                    + reply_grace(timeout) / 2
+                    - agent_clock()
+                )
         except ConfigurationError as exc:
             error = exc
-        error = error or self._refusal(host, guest, action, left, command)
+        error = error or self._refusal_error(host, guest, action, remaining, command)
         if error is not None:
             if action == "trigger":
                 host.triggers[outcome_of(error)] += 1
             self._reply(program, number, {"error": to_fields(error)})
             return None
-        return min(timeout, left)
+        return min(timeout, remaining)
 
-    def _refusal(
-        self, host: Host, guest: Guest, action: str, left: float, command: bool
+    def _refusal_error(
+        self, host: Host, guest: Guest, action: str, remaining: float, command: bool
     ) -> SmartCamError | None:
-        """Return the error that refuses a call, None if it is accepted."""
+        """Return the error that refuses a call; None if the call is accepted."""
         if action not in ACTIONS or (action in COMMANDS) != command:
             return UnsupportedError(f"{host.name}: the agent {self.name} cannot {action!r:.40}")
-        if left < 0:
-            return late(action, f"{host.name}: {action} came after its deadline; it was not done")
+        if remaining < 0:
+            return late_call_error(
+                action, f"{host.name}: {action} came after its deadline; it was not done"
+            )
         cameras = len(self.hosts)
-        if not command and self._questions[guest.program.role] >= MAX_QUESTIONS_PER_ROLE * cameras:
+        if (
+            not command
+            and self._question_counts[guest.program.role] >= MAX_QUESTIONS_PER_ROLE * cameras
+        ):
             return LocalProtocolError(
                 f"{host.name}: too many questions of role {guest.program.role} are under way"
             )
-        if guest.under_way[command] >= MAX_CALLS_PER_PROGRAM * cameras:
+        if guest.running_counts[command] >= MAX_CALLS_PER_PROGRAM * cameras:
             kind = "commands" if command else "questions"
             return LocalProtocolError(
-                f"{host.name}: {guest.under_way[command]} {kind} of this program are under way"
+                f"{host.name}: {guest.running_counts[command]} {kind} of this program are under way"
             )
         return None
 
     def _start(self, action: str, call: ProgramCall, guest: Guest, command: bool) -> None:
         task = asyncio.get_running_loop().create_task(
-            self._do(action, call, guest, command), name=f"smartcam.fleet.{call.host.name}.{action}"
+            self._carry_out(action, call, guest, command),
+            name=f"smartcam.fleet.{call.host.name}.{action}",
         )
-        guest.begin(command, call.owner.call, task)
+        guest.begin_call(command, call.owner.call, task)
         if not command:
-            self._questions[guest.program.role] += 1
-            task.add_done_callback(partial(self._answered, guest.program.role))
+            self._question_counts[guest.program.role] += 1
+            task.add_done_callback(partial(self._on_question_done, guest.program.role))
 
-    def _answered(self, role: str, _: object) -> None:
-        self._questions[role] -= 1
+    def _on_question_done(self, role: str, _: object) -> None:
+        self._question_counts[role] -= 1
 
     def _cancel(self, host: Host, program: str, number: int, command: bool) -> None:
         guest = self._programs.get(program)
         if guest is None:
             return
-        guest.is_new(number, command)  # so that a late call is not carried out
-        task = guest.end(command, number)
+        guest.add_if_new(number, command)  # so that a late call is not carried out
+        task = guest.end_call(command, number)
         if task is not None:
-            self._end(task)
+            self._cancel_task(task)
         if not command:
-            self._sender.come(program, number, None)
+            self._sender.confirm(program, number, None)
             return
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
         if entered is not None:  # the call was carried out, which its program does not know
             camera, before = entered
-            camera.leave(before)
+            camera.leave_application(before)
 
-    async def _do(self, action: str, call: ProgramCall, guest: Guest, command: bool) -> None:
+    async def _carry_out(self, action: str, call: ProgramCall, guest: Guest, command: bool) -> None:
         """Carry out a call, and reply; a program that has cancelled gets no reply."""
         host = call.host
-        inside, outcome = False, "cancelled"
+        has_entered, outcome = False, "cancelled"
         try:
             if call.reservation is not None:
                 host.check_reserved((call.program, call.reservation), action)
-            if action in PASSES_GATE:
-                if not host.gate.goes_in(call.program):
-                    begun = now()
+            if action in GATED_COMMANDS:
+                if not host.gate.try_enter(call.program):
+                    waits_since = agent_clock()
                     await host.enter(call.program, action, call.timeout)
-                    call = call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
-                inside = True
+                    call = call._replace(
+                        timeout=max(0.0, call.timeout - (agent_clock() - waits_since))
+                    )
+                has_entered = True
             fields, blobs = await ACTIONS[action](call)
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
@@ -745,9 +765,9 @@ class Agent:
         finally:
             if action == "trigger":
                 host.triggers[outcome] += 1
-            if inside:
+            if has_entered:
                 host.gate.leave(call.program)
-            guest.end(command, call.owner.call)
+            guest.end_call(command, call.owner.call)
         if action == "trigger" and blobs:
             self._reply_to_trigger(call, guest, blobs[0])
             return
@@ -756,18 +776,18 @@ class Agent:
         self._reply(call.program, call.owner.call, reply, blobs)
 
     def _reply_to_trigger(self, call: ProgramCall, guest: Guest, runs: bytes) -> None:
-        """Reply, with the states that were not sent yet; other programs get them a little later."""
+        """Reply with the trigger's runs, and with states that the program does not have yet."""
         host, following = call.host, call.host.states.following
-        states = host.untold(guest.last_state.get(host.name, 0))
+        states = host.unsent_states(guest.last_state.get(host.name, 0))
         guest.last_state[host.name] = following
         host.flush(states=not states)
         if states and len(self._programs) == 1:
-            host.forget_fresh()
-        reply = encode_outcome(call.owner.call, self.epoch, now(), following, states, runs)
+            host.drop_unsent_states()
+        reply = encode_outcome(call.owner.call, self.epoch, agent_clock(), following, states, runs)
         self._bus.put(self._keys.reply(call.program), reply)
 
     def _reply(
         self, program: str, number: int, fields: dict[str, Any], blobs: list[bytes] | None = None
     ) -> None:
-        reply = {"call": number, "epoch": self.epoch, "clock": now(), **fields}
+        reply = {"call": number, "epoch": self.epoch, "clock": agent_clock(), **fields}
         self._bus.put(self._keys.reply(program), encode(reply, blobs or ()))

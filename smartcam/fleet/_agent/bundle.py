@@ -22,7 +22,7 @@ BUNDLE_INTERVAL = 0.005
 """Least seconds between two bundles."""
 
 FULL_BUNDLE_BYTES = 1 << 15
-"""Bytes of results with which a bundle is sent at once."""
+"""Number of bytes of results that are sent at once, without waiting for BUNDLE_INTERVAL."""
 
 REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
 """Delays, seconds, of the empty bundles after a bundle; each repeats the next bundle's number."""
@@ -32,12 +32,12 @@ _PART = struct.Struct("<HI")
 _MAGIC = b"scb1"
 
 
-class Bundled(NamedTuple):
-    """A bundle.
+class ResultBundle(NamedTuple):
+    """A decoded bundle.
 
     Attributes:
         epoch: number of the agent's start.
-        number: number of the bundle; an empty bundle has the number of the next one.
+        number: number of the bundle; an empty bundle has the number of the next full one.
         following: number of the next bundle.
         parts: cameras, and their results in the form of :func:`encode_runs`.
     """
@@ -48,7 +48,7 @@ class Bundled(NamedTuple):
     parts: list[tuple[str, bytes]]
 
 
-def decode_bundle(payload: bytes, label: str) -> Bundled:
+def decode_bundle(payload: bytes, label: str) -> ResultBundle:
     """Return the bundle in ``payload``.
 
     Raises:
@@ -58,19 +58,21 @@ def decode_bundle(payload: bytes, label: str) -> Bundled:
         magic, epoch, number, following, count = _HEAD.unpack_from(payload)
         if magic != _MAGIC:
             raise ValueError(f"it begins with {magic!r}, not {_MAGIC!r}")
-        place, parts = _HEAD.size, list[tuple[str, bytes]]()
+        position, parts = _HEAD.size, list[tuple[str, bytes]]()
         for _ in range(count):
-            name_size, size = _PART.unpack_from(payload, place)
-            begin = place + _PART.size + name_size
-            place = begin + size
-            if place > len(payload):
-                raise ValueError(f"{place} bytes were announced, {len(payload)} came")
-            parts.append((str(payload[begin - name_size : begin], "utf-8"), payload[begin:place]))
-        if place != len(payload):
-            raise ValueError(f"{len(payload) - place} bytes are left over")
+            name_size, size = _PART.unpack_from(payload, position)
+            start = position + _PART.size + name_size
+            position = start + size
+            if position > len(payload):
+                raise ValueError(f"{position} bytes were announced, {len(payload)} came")
+            parts.append(
+                (str(payload[start - name_size : start], "utf-8"), payload[start:position])
+            )
+        if position != len(payload):
+            raise ValueError(f"{len(payload) - position} bytes are left over")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
-    return Bundled(epoch, number, following, parts)
+    return ResultBundle(epoch, number, following, parts)
 
 
 class AgentBundle:
@@ -85,81 +87,83 @@ class AgentBundle:
 
     def __init__(self, agent: str, epoch: int, keys: Keys, bus: Bus) -> None:
         self._key, self._epoch, self._bus = keys.bundle(agent), epoch, bus
-        self._out: Publisher | None = None
-        self._fresh: list[bytes] = []
-        self._count, self._bytes, self._number = 0, 0, 1
+        self._publisher: Publisher | None = None
+        self._unsent_parts: list[bytes] = []
+        self._camera_count, self._unsent_bytes, self._next_number = 0, 0, 1
         self._sent_at = -math.inf
-        self._due: asyncio.Handle | None = None
+        self._flush_handle: asyncio.Handle | None = None
         self._reminder: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
         """Start to check for subscribers."""
-        self._out = self._bus.publisher(self._key, self._on_subscribers)
+        self._publisher = self._bus.publisher(self._key, self._on_subscribers)
 
     def close(self) -> None:
-        """Send the results that are left, and stop sending. Idempotent."""
+        """Send the results that were not sent yet, and stop sending. Idempotent."""
         self.flush()
-        out, self._out = self._out, None
-        self._end_reminding()
-        if out is not None:
-            out.close()
+        publisher, self._publisher = self._publisher, None
+        self._cancel_reminder()
+        if publisher is not None:
+            publisher.close()
 
     @property
     def has_subscribers(self) -> bool:
         """True if the bundles have a subscriber."""
-        return self._out is not None and self._out.has_subscribers
+        return self._publisher is not None and self._publisher.has_subscribers
 
     def add(self, camera: str, encoded_results: bytes) -> None:
         """Add a camera's results, which are sent soon with results of other cameras."""
         name = camera.encode()
-        self._fresh += (_PART.pack(len(name), len(encoded_results)), name, encoded_results)
-        self._count += 1
-        self._bytes += len(encoded_results)
-        if self._bytes >= FULL_BUNDLE_BYTES:
+        self._unsent_parts += (_PART.pack(len(name), len(encoded_results)), name, encoded_results)
+        self._camera_count += 1
+        self._unsent_bytes += len(encoded_results)
+        if self._unsent_bytes >= FULL_BUNDLE_BYTES:
             self.flush()
-        elif self._due is None:
+        elif self._flush_handle is None:
             loop = asyncio.get_running_loop()
-            at = self._sent_at + BUNDLE_INTERVAL
-            self._due = (
-                loop.call_at(at, self.flush) if at > loop.time() else loop.call_soon(self.flush)
+            send_at = self._sent_at + BUNDLE_INTERVAL
+            self._flush_handle = (
+                loop.call_at(send_at, self.flush)
+                if send_at > loop.time()
+                else loop.call_soon(self.flush)
             )
 
     def flush(self) -> None:
         """Send the results that were added and not sent yet."""
-        if self._due is not None:
-            self._due.cancel()
-            self._due = None
-        if self._fresh and self._out is not None:
+        if self._flush_handle is not None:
+            self._flush_handle.cancel()
+            self._flush_handle = None
+        if self._unsent_parts and self._publisher is not None:
             self._sent_at = asyncio.get_running_loop().time()
-            fresh, count = self._fresh, self._count
-            self._fresh, self._count, self._bytes = [], 0, 0
-            number, self._number = self._number, self._number + 1
-            self._put(number, count, fresh)
-            self._remind(0)
+            parts, count = self._unsent_parts, self._camera_count
+            self._unsent_parts, self._camera_count, self._unsent_bytes = [], 0, 0
+            number, self._next_number = self._next_number, self._next_number + 1
+            self._send_bundle(number, count, parts)
+            self._schedule_reminder(0)
 
-    def _put(self, number: int, count: int, parts: list[bytes]) -> None:
-        if self._out is not None:
-            head = _HEAD.pack(_MAGIC, self._epoch, number, self._number, count)
-            self._out.put(b"".join((head, *parts)))
+    def _send_bundle(self, number: int, count: int, parts: list[bytes]) -> None:
+        if self._publisher is not None:
+            head = _HEAD.pack(_MAGIC, self._epoch, number, self._next_number, count)
+            self._publisher.put(b"".join((head, *parts)))
 
     def _on_subscribers(self, has_subscribers: bool) -> None:
         if has_subscribers:
-            self._remind(0)
+            self._schedule_reminder(0)
 
-    def _end_reminding(self) -> None:
+    def _cancel_reminder(self) -> None:
         if self._reminder is not None:
             self._reminder.cancel()
             self._reminder = None
 
-    def _remind(self, step: int) -> None:
-        """Send the next number again later; stop after the last reminder."""
-        self._end_reminding()
+    def _schedule_reminder(self, step: int) -> None:
+        """Send the next number later; ``step``: number of reminders that were sent before."""
+        self._cancel_reminder()
         if step < len(REMINDER_DELAYS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_number, step + 1)
+            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_reminder, step + 1)
 
-    def _send_number(self, step: int) -> None:
+    def _send_reminder(self, step: int) -> None:
         self._reminder = None
         if self.has_subscribers:
-            self._put(self._number, 0, [])
-            self._remind(step)
+            self._send_bundle(self._next_number, 0, [])
+            self._schedule_reminder(step)

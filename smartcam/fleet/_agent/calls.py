@@ -21,7 +21,7 @@ from smartcam._arguments import (
 from smartcam._client._inside import TriggerRequest
 from smartcam.camera import MAX_RESULTS_PER_TRIGGER, MAX_SEQUENCE_NUMBER
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._agent.shared import Carrier, Owner
+from smartcam.fleet._agent.shared import AgentInterpretation, Owner
 from smartcam.fleet._bus.keys import COMMANDS
 from smartcam.fleet._bus.wire import TriggerOrder, encode_runs
 from smartcam.fleet._frames.stream import FrameOrder
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Answer = tuple[dict[str, Any], list[bytes]]
-NOTHING: Answer = ({}, [])
+EMPTY_ANSWER: Answer = ({}, [])
 MAX_REPLY_BYTES = 1 << 20
 """Largest number of bytes of results, or of states, in one reply."""
 
@@ -50,8 +50,8 @@ class ProgramCall(NamedTuple):
         arguments: arguments of the call, by name.
         blobs: byte strings that came with the call.
         timeout: seconds of the call's timeout.
-        entered: applications to go back to after this program's temporary switches, by call number.
-        order: a trigger in binary form, instead of arguments.
+        entered: state to restore after each temporary switch of the program, by camera and call.
+        order: the trigger, if the call came in binary form, without ``arguments``.
         reservation: number of the call that reserved the camera; None outside of a reservation.
     """
 
@@ -66,7 +66,7 @@ class ProgramCall(NamedTuple):
     reservation: int | None = None
 
     def argument(self, name: str, check: Callable[..., T], *bounds: Any) -> T | None:
-        """Return an argument; None if it is not given.
+        """Return a checked argument; None if the call does not have it.
 
         Args:
             name: name of the argument.
@@ -79,7 +79,7 @@ class ProgramCall(NamedTuple):
         value = self.arguments.get(name)
         return None if value is None else check(value, name, *bounds, owner=self.host.name)
 
-    def wanted(self, name: str, check: Callable[..., T], *bounds: Any) -> T:
+    def required(self, name: str, check: Callable[..., T], *bounds: Any) -> T:
         """Return a required argument."""
         value = self.argument(name, check, *bounds)
         if value is None:
@@ -88,7 +88,7 @@ class ProgramCall(NamedTuple):
 
 
 def _check_layouts(value: object, name: str, owner: str) -> Any:
-    """Return the layouts that have a number: one, or one for each application."""
+    """Return layouts with a sequence number: one for all applications, or one for each of them."""
     if not isinstance(value, dict):
         return check_text(value, name, owner)
     try:
@@ -100,44 +100,44 @@ def _check_layouts(value: object, name: str, owner: str) -> Any:
         raise wrong_argument(name, "layouts by application id", value, owner) from exc
 
 
-_PLAIN = Carrier()
+_CARRIER = AgentInterpretation()
 
 
 async def _trigger(call: ProgramCall) -> Answer:
     order = call.order
     layouts = None
     if order is not None:
-        data, wait, each = order.data, order.wait, order.by_application
+        data, wait, by_application = order.data, order.wait, order.by_application
         results: object = order.results
         application, expected = order.application, order.expected
     else:
         layouts = call.argument("layouts", _check_layouts)
         data = call.blobs[0] if call.blobs else None
-        results, wait = call.arguments.get("results"), call.wanted("wait", check_flag)
-        each = bool(call.argument("by_application", check_flag))
+        results, wait = call.arguments.get("results"), call.required("wait", check_flag)
+        by_application = bool(call.argument("by_application", check_flag))
         application, expected = call.arguments.get("application"), call.arguments.get("expected")
-    wanted = check_integer(results, "results", 1, MAX_RESULTS_PER_TRIGGER, call.host.name)
+    result_count = check_integer(results, "results", 1, MAX_RESULTS_PER_TRIGGER, call.host.name)
     if application is not None:
         application = check_application(application, "application", call.host.name)
     if expected is not None:  # below 0 if the camera does not report its application
         expected = check_integer(expected, "expected", -1, MAX_APPLICATION_ID, call.host.name)
-    if layouts is None and not each:
-        carrier = _PLAIN.of(call.owner)
+    if layouts is None and not by_application:
+        interpretation = _CARRIER.for_owner(call.owner)
     else:
-        carrier = Carrier(call.owner, layouts, by_application=each)
-    request = TriggerRequest(carrier, data, wanted, wait, expected)
-    runs = await outcomes(call.host, call.owner, request, application, call.timeout)
+        interpretation = AgentInterpretation(call.owner, layouts, by_application=by_application)
+    request = TriggerRequest(interpretation, data, result_count, wait, expected)
+    runs = await trigger_runs(call.host, call.owner, request, application, call.timeout)
     return {}, [encode_runs(0, call.host.results.following, runs)]
 
 
-async def outcomes(
+async def trigger_runs(
     host: Host,
     owner: Owner,
     request: TriggerRequest,
     application: int | None,
     timeout: float,
 ) -> list[bytes]:
-    """Trigger for a program, and return the trigger's runs.
+    """Trigger for a program, and return the trigger's runs as bytes.
 
     The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is the trigger's owner.
     """
@@ -153,43 +153,45 @@ async def outcomes(
 async def _switch_application(call: ProgramCall) -> Answer:
     camera = call.host.require()
     await camera.switch_application(
-        call.wanted("application", check_application_or_name), timeout=call.timeout
+        call.required("application", check_application_or_name), timeout=call.timeout
     )
     return {"application": camera.active_application}, []
 
 
 async def _ensure(call: ProgramCall) -> Answer:
-    await call.host.require().ensure(call.wanted("application", check_application), call.timeout)
-    return NOTHING
+    await call.host.require().ensure_application(
+        call.required("application", check_application), call.timeout
+    )
+    return EMPTY_ANSWER
 
 
 async def _enter(call: ProgramCall) -> Answer:
-    before = await call.host.require().enter(
-        call.wanted("application", check_application), call.timeout
+    before = await call.host.require().enter_application(
+        call.required("application", check_application), call.timeout
     )
     call.entered[call.host.name, call.owner.call] = (call.host.camera, before)
     return {"before": before.application, "wanted": before.wanted.application}, []
 
 
 async def _leave(call: ProgramCall) -> Answer:
-    entered = call.entered.pop((call.host.name, call.wanted("entered", check_integer, 0)), None)
+    entered = call.entered.pop((call.host.name, call.required("entered", check_integer, 0)), None)
     if entered is not None:
         camera, before = entered
         if call.argument("wait", check_flag) is False:
-            camera.leave(before)  # the next command reports a failure
+            camera.leave_application(before)  # the next command reports a failure
         else:
-            await camera.leave_and_wait(before)
-    return NOTHING
+            await camera.leave_application_and_wait(before)
+    return EMPTY_ANSWER
 
 
 async def _start(call: ProgramCall) -> Answer:
     await call.host.require().start(timeout=call.timeout)
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _stop(call: ProgramCall) -> Answer:
     await call.host.require().stop(timeout=call.timeout)
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _query_application(call: ProgramCall) -> Answer:
@@ -217,43 +219,43 @@ async def _get_clock(call: ProgramCall) -> Answer:
 
 
 async def _set_clock(call: ProgramCall) -> Answer:
-    text = call.wanted("when", check_text)
+    text = call.required("when", check_text)
     try:
         when = datetime.fromisoformat(text)
     except ValueError as exc:
         raise ConfigurationError(f"{call.host.name}: {text!r:.80} is no time") from exc
     await call.host.require().set_clock(when)
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _set_input(call: ProgramCall) -> Answer:
     await call.host.require().set_input(call.blobs[0] if call.blobs else b"")
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _set_sequence_number(call: ProgramCall) -> Answer:
     await call.host.require().set_sequence_number(
-        call.wanted("number", check_integer, 0, MAX_SEQUENCE_NUMBER)
+        call.required("number", check_integer, 0, MAX_SEQUENCE_NUMBER)
     )
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _reboot(call: ProgramCall) -> Answer:
     await call.host.require().reboot()
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _take_back(call: ProgramCall) -> Answer:
     """Try now to take back a camera from another client, and wait for the session."""
     camera = call.host.require()
-    camera.take_again()
+    camera.try_take_back()
     await camera.wait_connected(call.timeout)
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _request(call: ProgramCall) -> Answer:
     answer = await call.host.require().request(
-        call.wanted("message_id", check_message_id),
+        call.required("message_id", check_message_id),
         call.blobs[0] if call.blobs else b"",
         answered=call.argument("answered", check_flag),
         timeout=call.timeout,
@@ -279,7 +281,7 @@ def _frame_order(call: ProgramCall, *, stream: bool = False) -> FrameOrder:
 
 
 async def _frame(call: ProgramCall) -> Answer:
-    return await call.host.frames.frame(
+    return await call.host.frames.send_frame(
         _frame_order(call),
         max_age=call.argument("max_age", check_age),
         after=call.argument("after", check_moment),
@@ -288,23 +290,25 @@ async def _frame(call: ProgramCall) -> Answer:
 
 
 async def _next_frame(call: ProgramCall) -> Answer:
-    return await call.host.frames.next(
-        _frame_order(call, stream=True), call.wanted("stream", check_integer, 0)
+    return await call.host.frames.send_next_frames(
+        _frame_order(call, stream=True), call.required("stream", check_integer, 0)
     ), []
 
 
 async def _leave_frames(call: ProgramCall) -> Answer:
-    call.host.frames.leave(call.program, call.wanted("stream", check_integer, 0))
-    return NOTHING
+    call.host.frames.end_stream(call.program, call.required("stream", check_integer, 0))
+    return EMPTY_ANSWER
 
 
 async def _about_frames(call: ProgramCall) -> Answer:
-    return await call.host.frames.about(call.timeout), []
+    return await call.host.frames.format_fields(call.timeout), []
 
 
 async def _trigger_frame(call: ProgramCall) -> Answer:
     wait = call.argument("wait", check_flag)
-    return await call.host.frames.trigger(_frame_order(call), wait=wait is not False), []
+    return await call.host.frames.send_triggered_frame(
+        _frame_order(call), wait=wait is not False
+    ), []
 
 
 async def _features(call: ProgramCall) -> Answer:
@@ -317,53 +321,53 @@ async def _features(call: ProgramCall) -> Answer:
 
 
 async def _set_feature(call: ProgramCall) -> Answer:
-    name, value = call.wanted("name", check_text), call.arguments.get("value")
+    name, value = call.required("name", check_text), call.arguments.get("value")
     return await call.host.frames.set_feature(name, value, call.timeout), []
 
 
 async def _execute_feature(call: ProgramCall) -> Answer:
-    await call.host.frames.execute_feature(call.wanted("name", check_text), call.timeout)
-    return NOTHING
+    await call.host.frames.execute_feature(call.required("name", check_text), call.timeout)
+    return EMPTY_ANSWER
 
 
 async def _lens(call: ProgramCall) -> Answer:
-    return call.host.frames.lens(call.wanted("lens", check_integer, 0)), []
+    return call.host.frames.lens_fields(call.required("lens", check_integer, 0)), []
 
 
 async def _refresh(call: ProgramCall) -> Answer:
-    return {"asked": await call.host.require().refresh(call.timeout)}, []
+    return {"asked": await call.host.require().refresh_status(call.timeout)}, []
 
 
 async def _wait_connected(call: ProgramCall) -> Answer:
     await call.host.require().wait_connected(call.timeout)
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _reserve(call: ProgramCall) -> Answer:
     reservation = (call.program, call.owner.call)
     await call.host.reserve(call.program, reservation, call.timeout)
-    return NOTHING
+    return EMPTY_ANSWER
 
 
 async def _release(call: ProgramCall) -> Answer:
-    call.host.gate.release((call.program, call.wanted("reservation", check_integer, 0)))
-    return NOTHING
+    call.host.gate.release((call.program, call.required("reservation", check_integer, 0)))
+    return EMPTY_ANSWER
 
 
 async def _reserved(call: ProgramCall) -> Answer:
-    reservation = (call.program, call.wanted("reservation", check_integer, 0))
-    return {"reserved": await call.host.keeps(reservation, call.timeout)}, []
+    reservation = (call.program, call.required("reservation", check_integer, 0))
+    return {"reserved": await call.host.still_holds(reservation, call.timeout)}, []
 
 
 async def _hello(call: ProgramCall) -> Answer:
     host = call.host
     return {
-        **host.about(),
-        **host.state(),
+        **host.camera_fields(),
+        **host.state_fields(),
         "program": call.owner.program,
         "frames": host.frames.make is not None,
         "results": host.results.following,
-        "began": host.began,
+        "began": host.first_result,
         "states": host.states.following,
     }, []
 
@@ -371,19 +375,19 @@ async def _hello(call: ProgramCall) -> Answer:
 async def _find(call: ProgramCall) -> Answer:
     """Return the number of the first result since a time of the agent's clock."""
     results = call.host.results
-    since = call.wanted("since", check_moment)
+    since = call.required("since", check_moment)
     return {"first": results.first_since(since), "following": results.following}, []
 
 
 async def _results(call: ProgramCall) -> Answer:
-    part = call.host.results.part(call.wanted("first", check_integer, 0), MAX_REPLY_BYTES)
+    part = call.host.results.read_part(call.required("first", check_integer, 0), MAX_REPLY_BYTES)
     return {"first": part.first, "following": part.following}, [
         encode_runs(0, part.following, part.data)
     ]
 
 
 async def _states(call: ProgramCall) -> Answer:
-    part = call.host.states.part(call.wanted("first", check_integer, 0), MAX_REPLY_BYTES)
+    part = call.host.states.read_part(call.required("first", check_integer, 0), MAX_REPLY_BYTES)
     return {"first": part.first, "following": part.following}, part.data
 
 
@@ -428,10 +432,10 @@ ACTIONS: dict[str, Callable[[ProgramCall], Awaitable[Answer]]] = {
 }
 """The function of each call, by the call's name."""
 
-PASSES_GATE = COMMANDS - {"reserve", "release", "leave"}
-"""Commands that wait while another program has the camera reserved."""
+GATED_COMMANDS = COMMANDS - {"reserve", "release", "leave"}
+"""Commands that wait at the gate while another program has reserved the camera."""
 
 
-def now() -> float:
-    """Return the agent's clock: its event loop's, seconds; only differences have a meaning."""
+def agent_clock() -> float:
+    """Return the time of the agent's clock, which is its event loop's, seconds."""
     return asyncio.get_running_loop().time()

@@ -15,20 +15,20 @@ Change = Literal["Reserved", "Released", "ReservationLost"]
 
 
 @dataclass(eq=False, slots=True)
-class InLine:
-    """A command or reservation in the line.
+class GateRequest:
+    """A program's request to run a command, or to reserve the camera.
 
     Attributes:
         program: name of the waiting program.
         reservation: key of the reservation; None for a command.
-        granted: whether the turn has come.
-        wake: future that is done when the turn comes; None if no caller waits.
+        granted: whether the request was granted.
+        future: future that is done when the request is granted; None if no caller waits.
     """
 
     program: str
     reservation: Hashable | None
     granted: bool = False
-    wake: asyncio.Future[None] | None = None
+    future: asyncio.Future[None] | None = None
 
 
 def _report_nothing(change: Change, program: str) -> None:
@@ -41,14 +41,14 @@ class Gate:
 
     Attributes:
         on_change: callback for the start and the end of a program's reservation.
-        holder: program that has reserved the camera; None if none has.
+        holder: program that has reserved the camera; None if no program has.
     """
 
     on_change: Callable[[Change, str], None] = _report_nothing
     holder: str | None = None
     _reservations: set[Hashable] = field(default_factory=set["Hashable"])
-    _active: collections.Counter[str] = field(default_factory=collections.Counter[str])
-    _line: collections.deque[InLine] = field(default_factory=collections.deque["InLine"])
+    _running_commands: collections.Counter[str] = field(default_factory=collections.Counter[str])
+    _queue: collections.deque[GateRequest] = field(default_factory=collections.deque["GateRequest"])
 
     async def enter(self, program: str, timeout: float) -> None:
         """Wait for the turn of a command of ``program``, which ends with :meth:`leave`.
@@ -56,30 +56,30 @@ class Gate:
         Raises:
             TimeoutError: the turn did not come within ``timeout`` seconds.
         """
-        if not self.goes_in(program):
-            await self._pass(program, None, timeout)
+        if not self.try_enter(program):
+            await self._wait_turn(program, None, timeout)
 
-    def goes_in(self, program: str) -> bool:
-        """Begin a command if it need not wait; return whether it began."""
-        if self._line or (self.holder is not None and self.holder != program):
+    def try_enter(self, program: str) -> bool:
+        """Begin a command if it need not wait; return whether it has begun."""
+        if self._queue or (self.holder is not None and self.holder != program):
             return False
-        self._active[program] += 1
+        self._running_commands[program] += 1
         return True
 
     def leave(self, program: str) -> None:
         """Count a command of ``program`` as ended."""
-        left = self._active[program] - 1
-        if left:
-            self._active[program] = left
+        remaining = self._running_commands[program] - 1
+        if remaining:
+            self._running_commands[program] = remaining
         else:
-            del self._active[program]
-        if self._line:
-            self._grant()
+            del self._running_commands[program]
+        if self._queue:
+            self._grant_requests()
 
     @property
-    def waiting(self) -> int:
-        """Number of waiting programs."""
-        return len(self._line)
+    def waiting_count(self) -> int:
+        """Number of waiting requests."""
+        return len(self._queue)
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of other programs out, and wait until their running commands end.
@@ -89,79 +89,79 @@ class Gate:
         Raises:
             TimeoutError: the turn did not come within ``timeout`` seconds.
         """
-        await self._pass(program, reservation, timeout)
+        await self._wait_turn(program, reservation, timeout)
 
     def release(self, reservation: Hashable) -> None:
         """End a reservation, or the wait for it; does nothing if there is neither."""
         self._reservations.discard(reservation)
         if not self._reservations:
-            self._free("Released")
-        self._grant()
+            self._end_hold("Released")
+        self._grant_requests()
 
     def holds(self, reservation: Hashable) -> bool:
         """Return True if a reservation was made and has not ended."""
         return reservation in self._reservations
 
-    def forget(self, program: str) -> None:
-        """End the reservations that a program has not released; report them as lost."""
+    def lose_program(self, program: str) -> None:
+        """End the reservations of a program that is lost, and report the loss."""
         if self.holder == program:
             self._reservations.clear()
-            self._free("ReservationLost")
-            self._grant()
+            self._end_hold("ReservationLost")
+            self._grant_requests()
 
-    def _free(self, change: Change) -> None:
+    def _end_hold(self, change: Change) -> None:
         holder, self.holder = self.holder, None
         if holder is not None:
             self.on_change(change, holder)
 
-    async def _pass(self, program: str, reservation: Hashable | None, timeout: float) -> None:
-        waiting = self.line_up(program, reservation)
-        if waiting.granted:
+    async def _wait_turn(self, program: str, reservation: Hashable | None, timeout: float) -> None:
+        request = self.add_request(program, reservation)
+        if request.granted:
             return
-        waiting.wake = asyncio.get_running_loop().create_future()
+        request.future = asyncio.get_running_loop().create_future()
         try:
             async with asyncio.timeout(timeout):
-                await waiting.wake
+                await request.future
         except BaseException:
-            self.give_up(waiting)
+            self.withdraw_request(request)
             raise
 
-    def line_up(self, program: str, reservation: Hashable | None) -> InLine:
-        """Add a command or a reservation to the line, and grant its turn if none is before it."""
-        waiting = InLine(program, reservation)
-        if not self._line or self.holder == program:
-            self._line.appendleft(waiting)
+    def add_request(self, program: str, reservation: Hashable | None) -> GateRequest:
+        """Add a request to the queue; grant it if no other request is before it."""
+        request = GateRequest(program, reservation)
+        if not self._queue or self.holder == program:
+            self._queue.appendleft(request)
         else:
-            self._line.append(waiting)
-        self._grant()
-        return waiting
+            self._queue.append(request)
+        self._grant_requests()
+        return request
 
-    def give_up(self, waiting: InLine) -> None:
-        """Remove an entry from the line, or end its turn if it was granted."""
-        if waiting in self._line:
-            self._line.remove(waiting)
-        elif waiting.reservation is not None:
-            self.release(waiting.reservation)
+    def withdraw_request(self, request: GateRequest) -> None:
+        """Remove a request from the queue; if it was granted, end its command or reservation."""
+        if request in self._queue:
+            self._queue.remove(request)
+        elif request.reservation is not None:
+            self.release(request.reservation)
         else:
-            self.leave(waiting.program)
-        self._grant()
+            self.leave(request.program)
+        self._grant_requests()
 
-    def _grant(self) -> None:
-        while self._line and self._may(self._line[0]):
-            waiting = self._line.popleft()
-            if waiting.reservation is None:
-                self._active[waiting.program] += 1
+    def _grant_requests(self) -> None:
+        while self._queue and self._can_grant(self._queue[0]):
+            request = self._queue.popleft()
+            if request.reservation is None:
+                self._running_commands[request.program] += 1
             else:
-                again, self.holder = self.holder is not None, waiting.program
-                self._reservations.add(waiting.reservation)
-                if not again:
-                    self.on_change("Reserved", waiting.program)
-            waiting.granted = True
-            if waiting.wake is not None and not waiting.wake.done():
-                waiting.wake.set_result(None)
+                was_held, self.holder = self.holder is not None, request.program
+                self._reservations.add(request.reservation)
+                if not was_held:
+                    self.on_change("Reserved", request.program)
+            request.granted = True
+            if request.future is not None and not request.future.done():
+                request.future.set_result(None)
 
-    def _may(self, waiting: InLine) -> bool:
-        if self.holder not in {None, waiting.program}:
+    def _can_grant(self, request: GateRequest) -> bool:
+        if self.holder not in {None, request.program}:
             return False
-        others = self._active.total() - self._active[waiting.program]
-        return waiting.reservation is None or not others
+        others = self._running_commands.total() - self._running_commands[request.program]
+        return request.reservation is None or not others

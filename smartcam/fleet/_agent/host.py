@@ -16,8 +16,8 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.fleet._agent.gate import Gate
-from smartcam.fleet._agent.shared import SharedCamera, Tap
-from smartcam.fleet._bus.errors import late, to_fields
+from smartcam.fleet._agent.shared import AgentCallbacks, SharedCamera
+from smartcam.fleet._bus.errors import late_call_error, to_fields
 from smartcam.fleet._bus.log import AgentLog
 from smartcam.fleet._bus.wire import (
     CURRENT,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._agent.bundle import AgentBundle
     from smartcam.fleet._agent.gate import Change
-    from smartcam.fleet._agent.shared import Carried, Owner
+    from smartcam.fleet._agent.shared import Owner, RawValue
     from smartcam.fleet._bus.bus import Bus, Publisher
     from smartcam.fleet._bus.keys import Keys
     from smartcam.fleet._frames.camera_frames import SharedFrames
@@ -51,22 +51,22 @@ if TYPE_CHECKING:
 MAX_STATES_PER_BUNDLE = 1000
 MAX_STATE_BYTES = 1 << 19
 STATUS_DELAY = 0.005
-"""Seconds that a status may wait for others, to be sent in one message. The program that triggered
-gets the status with the reply."""
+"""Seconds that a status may wait for further ones, to be sent in one message. A program that
+triggers gets the status with the reply."""
 
 CATCH_UP_DELAY = 0.2
-"""Seconds after a reply with a status until the number of the next state is sent, if no state was:
-otherwise a lost reply would stay unnoticed."""
+"""Seconds after a reply with a status until the number of the next state is sent, unless a state is
+sent before. Without this number the loss of the reply would stay unnoticed."""
 
 RESULTS_INTERVAL = 0.002
 """Least seconds between two messages with results: faster results are sent together."""
 
 FULL_MESSAGE_BYTES = 1 << 16
-"""Results of this many bytes are sent at once, without RESULTS_INTERVAL."""
+"""Number of bytes of results that are sent at once, without waiting for RESULTS_INTERVAL."""
 
 REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
-"""Seconds after the last results at which their numbers are sent again: otherwise a loss of these
-results would stay unnoticed."""
+"""Seconds after results at which the next number is sent again. Without these messages a loss of
+the last results would stay unnoticed."""
 
 
 class Host:
@@ -82,21 +82,21 @@ class Host:
         on_event: callback for the camera's events.
         topics: topics of the agent's cameras in JSON.
         frames: frames of the camera.
-        bundle: sender of the results of all the agent's cameras together.
+        bundle: sender of bundles, which have results of all the agent's cameras.
         observers: observers of the camera's sessions.
 
     Attributes:
         epoch: number of the agent's start, or of its current hold of the camera.
-        began: number of the first result of this epoch.
-        final: whether no other agent will take over the camera after the last session.
+        first_result: number of the first result of this epoch.
+        is_only_agent: whether no other agent can take over the camera.
         gate: gate that decides which program's commands may pass.
         results: the last results.
         states: the last states of the camera.
-        outcomes: runs of running triggers, by owner; only for owners that have added a list.
+        outcomes: lists to which the runs of running triggers are added, by the trigger's owner.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: reason why there was no session yet; None if there was one.
-        triggers: numbers of programs' triggers, by outcome (a word of ``OUTCOMES``).
+        failure: error of the last attempt while there was no session yet; None after a session.
+        triggers: numbers of programs' triggers, by outcome: a word of ``OUTCOMES``.
     """
 
     def __init__(
@@ -123,23 +123,23 @@ class Host:
         self.failure: SmartCamError | None = None
         self.triggers: collections.Counter[str] = collections.Counter()
         self.epoch: int = epoch
-        self.began: int = 1
-        self.final: bool = True
+        self.first_result: int = 1
+        self.is_only_agent: bool = True
         self._report_event, self._bundle, self._observers = on_event, bundle, observers
-        # programs decide about that
+        # raises for an invalid ``interpret_as``; programs set the other options
         Interpretation(settings.interpret_as, lenient=True, y_down=False)
         self.topics: CameraTopics = CameraTopics(self, topics)
-        self._camera = self._make()
-        self._fresh: list[bytes] = []  # runs that are not sent yet
-        self._fresh_states: list[bytes] = []
-        self._fresh_bytes = 0
-        self._due: asyncio.Handle | None = None  # task that sends the results
+        self._camera = self._make_client()
+        self._unsent_runs: list[bytes] = []
+        self._unsent_states: list[bytes] = []
+        self._unsent_bytes = 0
+        self._flush_handle: asyncio.Handle | None = None  # the next sending of results
         self._sent_at = -math.inf
-        self._held = DeadlineTimer(self._flush_states)
-        self._catch_up = DeadlineTimer(self._put_states)
+        self._states_timer = DeadlineTimer(self._flush_states)
+        self._next_number_timer = DeadlineTimer(self._put_states)
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
-        self._over = False  # whether no further session will come
+        self._has_ended = False  # whether there will be no further session
         self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_subscribers)
 
@@ -162,18 +162,22 @@ class Host:
     def numbers(self) -> tuple[int, ...]:
         """The numbers of the next message."""
         topics = self.topics
-        return self.results.following, self.states.following, topics.statuses, topics.events
+        return self.results.following, self.states.following, topics.next_status, topics.next_event
 
     @numbers.setter
     def numbers(self, numbers: tuple[int, ...]) -> None:
         topics = self.topics
-        self.results.following, self.states.following, topics.statuses, topics.events = numbers
+        self.results.following, self.states.following, topics.next_status, topics.next_event = (
+            numbers
+        )
 
-    def _make(self) -> SharedCamera:
-        tap = Tap(self._on_results, self._on_status, self._on_event, self._on_end, self._on_taken)
-        return SharedCamera(self.settings, tap, self._observers)
+    def _make_client(self) -> SharedCamera:
+        callbacks = AgentCallbacks(
+            self._on_results, self._on_status, self._on_event, self._on_end, self._on_taken
+        )
+        return SharedCamera(self.settings, callbacks, self._observers)
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ open and close
 
     async def run(self) -> None:
         """Keep a session with the camera; return after the last session."""
@@ -187,10 +191,10 @@ class Host:
                     self._fail(error)
                     delay = next(delays, None)
                     if delay is None or backoff is None or not backoff.transient(error):
-                        self._over = True
+                        self._has_ended = True
                         return
                     await asyncio.sleep(delay)
-                    self._camera = self._make()
+                    self._camera = self._make_client()
                 else:
                     self.failure = None
                     return
@@ -198,7 +202,7 @@ class Host:
             self._opened.set()
             self._publish_state({"kind": "Tried"})
 
-    async def tried(self, timeout: float) -> None:
+    async def wait_first_attempt(self, timeout: float) -> None:
         """Wait until the first attempt has ended, with or without success; bounded."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
@@ -215,8 +219,8 @@ class Host:
         if self._reminder is not None:
             self._reminder.cancel()
         self.flush()
-        self._held.cancel()
-        self._catch_up.cancel()
+        self._states_timer.cancel()
+        self._next_number_timer.cancel()
         self._states_out.close()
         self._results_out.close()
         self.topics.close()
@@ -242,8 +246,8 @@ class Host:
         return self._camera
 
     @contextlib.contextmanager
-    def counted(self, action: str) -> Iterator[None]:
-        """Count the outcome of the trigger in the block, if ``action`` is a trigger."""
+    def counting_trigger(self, action: str) -> Iterator[None]:
+        """Count the outcome of the block, if ``action`` is a trigger."""
         outcome = RESULT
         try:
             yield
@@ -272,14 +276,14 @@ class Host:
         If another agent may take over the camera, it can be reserved only during a session.
 
         Raises:
-            ResponseTimeoutError: another program holds it for longer than ``timeout`` seconds.
-            LinkError: there is no session, and another agent may have one.
+            ResponseTimeoutError: another program holds the camera longer than ``timeout`` seconds.
+            LinkError: this agent has no session, and another agent may have one.
         """
         try:
             await self.gate.reserve(program, reservation, timeout)
         except TimeoutError as exc:
             raise self._not_granted_error("reserve", timeout) from exc
-        if not (self.final or self.connected):
+        if not (self.is_only_agent or self.connected):
             self.gate.release(reservation)
             raise ConnectionLostError(
                 f"{self.name}: the agent has no session with the camera, and another one may have; "
@@ -299,7 +303,7 @@ class Host:
                 f"{action} was not done"
             )
 
-    async def keeps(self, reservation: Hashable, timeout: float) -> bool:
+    async def still_holds(self, reservation: Hashable, timeout: float) -> bool:
         """Return True if a reservation still holds, and this agent still has the camera.
 
         If another agent may take over, a request is sent to the camera. The camera serves one
@@ -308,7 +312,7 @@ class Host:
         Raises:
             SmartCamError: the camera does not answer.
         """
-        if not self.final and self.gate.holds(reservation):
+        if not self.is_only_agent and self.gate.holds(reservation):
             with contextlib.suppress(UnsupportedError):
                 await self.require().query_application(timeout=timeout)
         return self.gate.holds(reservation)
@@ -316,7 +320,7 @@ class Host:
     def lose_reservation(self) -> None:
         """End a reservation that its holder has not released, if there is one."""
         if self.gate.holder is not None:
-            self.gate.forget(self.gate.holder)
+            self.gate.lose_program(self.gate.holder)
 
     def _on_reservation(self, change: Change, program: str) -> None:
         self.topics.on_reservation(change, program)
@@ -330,18 +334,18 @@ class Host:
         holder = self.gate.holder
         cause = "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
         text = f"{self.name}: {cause} did not let go within {timeout:.3g} s; {action} was not done"
-        return late(action, text)
+        return late_call_error(action, text)
 
-    # ------------------------------------------------------------------ what the camera is
+    # ------------------------------------------------------------------ state
 
-    def state(self) -> dict[str, Any]:
+    def state_fields(self) -> dict[str, Any]:
         """Return the fields of a state message."""
         camera = self._camera
         try:
             status: int | None = int(camera.status)
         except SmartCamError:
             status = None
-        # a link that has just ended is no loss yet: earlier results are still to be sent
+        # not camera.connected: results that came before a link's end must be sent first
         trouble = self.failure or camera.trouble
         fields: dict[str, Any] = {
             "connected": trouble is None,
@@ -352,11 +356,11 @@ class Host:
         if not self._opened.is_set():
             fields["trying"] = True
         elif trouble is not None:
-            fields |= {"error": to_fields(trouble), "over": self._over and self.final}
+            fields |= {"error": to_fields(trouble), "over": self._has_ended and self.is_only_agent}
         return fields
 
-    def known(self) -> tuple[bool, int | None, int | None, str | None]:
-        """Return the presence of a session, its status and application, or the reason for none."""
+    def session_state(self) -> tuple[bool, int | None, int | None, str | None]:
+        """Return the session's state: connected or not, status, application, reason if not."""
         camera, trouble = self._camera, self.failure or self._camera.trouble
         try:
             status: int | None = int(camera.status)
@@ -365,7 +369,7 @@ class Host:
         why = None if trouble is None else str(trouble)
         return trouble is None, status, camera.active_application, why
 
-    def about(self) -> dict[str, Any]:
+    def camera_fields(self) -> dict[str, Any]:
         """Return the fields of the camera that do not change during a session."""
         camera, settings = self._camera, self.settings
         fields: dict[str, Any] = {
@@ -380,15 +384,15 @@ class Host:
             fields["capabilities"] = jsonable(camera.capabilities)
         return fields
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ events of the client
 
     def _on_status(self, status: Status) -> None:
         self.topics.on_status(status)
         camera, number = self._camera, self.states.following
         if not (camera.connected and self._opened.is_set()):
-            self._publish_state({"kind": "Status"}, hold=STATUS_DELAY)
+            self._publish_state({"kind": "Status"}, max_delay=STATUS_DELAY)
             return
-        # int(status) costs three times as much
+        # three times as fast as int(status)
         bits, application = status._value_, camera.active_application
         data = encode_status(number, bits, camera.endian, application)
         self._add_state(data, asyncio.get_running_loop().time(), STATUS_DELAY)
@@ -396,20 +400,20 @@ class Host:
     def _on_event(self, event: CameraEvent) -> None:
         self._report_event(event)
         if isinstance(event, StatusChanged):
-            return  # a status reports that
+            return  # a status message reports it
         self.topics.on_event(event)
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
         state: dict[str, Any] = {"kind": type(event).__name__, "event": fields}
         if isinstance(event, (Connected, Reconnected)):
-            state["about"] = self.about()
+            state["about"] = self.camera_fields()
         self._publish_state(state)
-        if isinstance(event, Disconnected) and not (event.expected or self.final):
+        if isinstance(event, Disconnected) and not (event.expected or self.is_only_agent):
             self.lose_reservation()  # another agent may have taken the camera
 
     def _on_end(self) -> None:
         if self._opened.is_set() and self.failure is None:
-            self._over = True
+            self._has_ended = True
             self._publish_state({"kind": "Over"})
         self.lose_reservation()
 
@@ -418,25 +422,25 @@ class Host:
         self._publish_state({"kind": "Removed", "why": why})
 
     def _on_taken(self) -> None:
-        """Announce that another client has the camera; sessions are tried at intervals."""
+        """Announce that another client has the camera."""
         self._publish_state({"kind": "Taken"})
 
-    def _publish_state(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
-        """Send the camera's state with an event: after ``hold`` seconds, or with the next event."""
+    def _publish_state(self, fields: dict[str, Any], *, max_delay: float = 0.0) -> None:
+        """Send an event with the camera's state, at the latest after ``max_delay`` seconds."""
         clock = asyncio.get_running_loop().time()
-        state = {**fields, **self.state(), "number": self.states.following, "clock": clock}
-        self._add_state(encode_state(state), clock, hold)
+        state = {**fields, **self.state_fields(), "number": self.states.following, "clock": clock}
+        self._add_state(encode_state(state), clock, max_delay)
 
-    def _add_state(self, data: bytes, clock: float, hold: float) -> None:
+    def _add_state(self, data: bytes, clock: float, max_delay: float) -> None:
         self.states.add(1, clock, data)
-        self._fresh_states.append(data)
-        if not hold:
+        self._unsent_states.append(data)
+        if not max_delay:
             self._flush_states()
-        elif len(self._fresh_states) == 1:
-            self._held.set(clock + hold)
+        elif len(self._unsent_states) == 1:
+            self._states_timer.set(clock + max_delay)
         self.topics.on_state()
 
-    def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
+    def _on_results(self, results: Sequence[Result[RawValue]], current: bool, late: bool) -> None:
         """Keep results that arrived together, and send them soon with later ones."""
         first = results[0]
         owner = first.value.owner
@@ -466,27 +470,29 @@ class Host:
         if outcomes is not None:
             outcomes.append(data)
         if self._results_out.has_subscribers or self._bundle.has_subscribers:
-            self._fresh.append(data)
-            self._fresh_bytes += len(data)
-            if self._fresh_bytes >= FULL_MESSAGE_BYTES:
+            self._unsent_runs.append(data)
+            self._unsent_bytes += len(data)
+            if self._unsent_bytes >= FULL_MESSAGE_BYTES:
                 self._flush_results()
-            elif self._due is None:
+            elif self._flush_handle is None:
                 loop = asyncio.get_running_loop()
-                at = self._sent_at + RESULTS_INTERVAL
-                call = self._flush_results
-                self._due = loop.call_at(at, call) if at > loop.time() else loop.call_soon(call)
+                send_at = self._sent_at + RESULTS_INTERVAL
+                if send_at > loop.time():
+                    self._flush_handle = loop.call_at(send_at, self._flush_results)
+                else:
+                    self._flush_handle = loop.call_soon(self._flush_results)
         self.topics.on_run(run)
 
-    def untold(self, since: int) -> list[bytes]:
+    def unsent_states(self, since: int) -> list[bytes]:
         """Return the states that are not sent yet, from number ``since`` on."""
-        fresh = self._fresh_states
-        return fresh[max(0, since - self.states.following + len(fresh)) :]
+        unsent = self._unsent_states
+        return unsent[max(0, since - self.states.following + len(unsent)) :]
 
-    def forget_fresh(self) -> None:
-        """Drop the states that were not sent yet, since all their receivers have them."""
-        self._held.clear()
-        self._fresh_states.clear()
-        self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP_DELAY)
+    def drop_unsent_states(self) -> None:
+        """Drop the states that were not sent yet, since the only program has them by its reply."""
+        self._states_timer.clear()
+        self._unsent_states.clear()
+        self._next_number_timer.set(asyncio.get_running_loop().time() + CATCH_UP_DELAY)
 
     def flush(self, *, states: bool = True) -> None:
         """Send the results and, with ``states``, the states that were not sent yet."""
@@ -496,45 +502,45 @@ class Host:
         self._bundle.flush()
 
     def _flush_states(self) -> None:
-        self._held.clear()
-        if self._fresh_states:
+        self._states_timer.clear()
+        if self._unsent_states:
             self._put_states()
 
     def _put_states(self) -> None:
-        self._catch_up.clear()
-        fresh, self._fresh_states = self._fresh_states, []
+        self._next_number_timer.clear()
+        states, self._unsent_states = self._unsent_states, []
         following = self.states.following
-        self._states_out.put(encode({"epoch": self.epoch, "following": following}, fresh))
+        self._states_out.put(encode({"epoch": self.epoch, "following": following}, states))
 
     def _flush_results(self) -> None:
-        if self._due is not None:
-            self._due.cancel()
-            self._due = None
-        if self._fresh:
-            self._sent_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
-            fresh, self._fresh = self._fresh, []
-            payload = encode_runs(self.epoch, self.results.following, fresh)
+        if self._flush_handle is not None:
+            self._flush_handle.cancel()
+            self._flush_handle = None
+        if self._unsent_runs:
+            self._sent_at, self._unsent_bytes = asyncio.get_running_loop().time(), 0
+            runs, self._unsent_runs = self._unsent_runs, []
+            payload = encode_runs(self.epoch, self.results.following, runs)
             if self._bundle.has_subscribers:
                 self._bundle.add(self.name, payload)
             if self._results_out.has_subscribers:
                 self._results_out.put(payload)
-                self._remind(0)
+                self._schedule_reminder(0)
 
     def _on_subscribers(self, has_subscribers: bool) -> None:
         if has_subscribers:
-            self._remind(0)
+            self._schedule_reminder(0)
 
-    def _remind(self, step: int) -> None:
-        """Send the last number again later; stop after the last reminder."""
+    def _schedule_reminder(self, step: int) -> None:
+        """Send the next number later; ``step``: number of reminders that were sent before."""
         if self._reminder is not None:
             self._reminder.cancel()
             self._reminder = None
         if step < len(REMINDER_DELAYS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_number, step + 1)
+            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_reminder, step + 1)
 
-    def _send_number(self, step: int) -> None:
+    def _send_reminder(self, step: int) -> None:
         self._reminder = None
         if self._results_out.has_subscribers:
             self._results_out.put(encode_runs(self.epoch, self.results.following, []))
-            self._remind(step)
+            self._schedule_reminder(step)

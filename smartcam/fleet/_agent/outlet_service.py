@@ -15,7 +15,7 @@ from smartcam.fleet._bus.address import check_pattern
 from smartcam.fleet._bus.bus import always
 from smartcam.fleet._json.plain import request_fields
 from smartcam.fleet._json.topics import as_json
-from smartcam.fleet._program.reading import failure
+from smartcam.fleet._program.reading import error_fields
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_STORE_QUESTIONS = 4
-"""Largest number of running questions to stores of one agent; each has a thread."""
+"""Largest number of running questions to the stores of one agent; each question needs a thread."""
 
 MAX_STORED_ROWS = 1000
 """Largest number of rows of a store in one answer."""
 
 MAX_ROWS_BYTES = 1 << 23
-"""Largest number of bytes of rows in one answer; beyond it the oldest are left out."""
+"""Largest number of bytes of rows in one answer; the oldest rows beyond it are left out."""
 
 ROW_BYTES = 300
-"""Approximate number of bytes of a row besides its value and its error."""
+"""Approximate number of bytes of a row without its value and its error."""
 
 
 class ReportedOutlet(NamedTuple):
-    """An outlet's account from its agent: ``results == delivered + spooled + dropped``.
+    """An outlet's account from its agent: ``results == delivered + spooled + sum of dropped``.
 
     Attributes:
         agent: name of the agent.
@@ -71,12 +71,13 @@ class ReportedStore(NamedTuple):
         outlet: name of the outlet that writes the store; "" if the agent could not answer.
         rows: requested rows, the oldest first, with the columns of the store's table ``results`` by
             their names.
-        total: number of results, errors and gaps of the time and the cameras, also beyond the rows.
+        total: number of results, errors and gaps that match the request, also those not in
+            ``rows``.
         failed: number of errors, gaps, and results that did not pass.
         errors: number of errors.
         gaps: number of gaps.
         lost: number of lost results in the gaps.
-        at_least: whether more may be lost than the gaps count.
+        at_least: whether more results may be lost than ``lost``.
         error: reason why the store could not be read; "" if it was read.
     """
 
@@ -92,7 +93,7 @@ class ReportedStore(NamedTuple):
     error: str = ""
 
 
-def _moment(text: str) -> str:
+def _check_time_text(text: str) -> str:
     try:
         aware = datetime.fromisoformat(text).tzinfo is not None
     except ValueError:
@@ -102,7 +103,7 @@ def _moment(text: str) -> str:
     return text
 
 
-def _pattern(text: str) -> str:
+def _check_pattern_text(text: str) -> str:
     try:
         return check_pattern(text)
     except ConfigurationError as exc:
@@ -110,13 +111,13 @@ def _pattern(text: str) -> str:
 
 
 class StoredRequest(BaseModel):
-    """The fields of a question to stores."""
+    """A question to stores of results."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    since: Annotated[str, Field(max_length=100), AfterValidator(_moment)] | None = None
+    since: Annotated[str, Field(max_length=100), AfterValidator(_check_time_text)] | None = None
     failed: bool = False
-    camera: Annotated[str, Field(max_length=200), AfterValidator(_pattern)] = "**"
+    camera: Annotated[str, Field(max_length=200), AfterValidator(_check_pattern_text)] = "**"
     most: Annotated[int, Field(ge=0, le=MAX_STORED_ROWS)] = 100
 
 
@@ -128,7 +129,7 @@ class OutletService:
         bus: the agent's end of the bus.
         keys: keys of the fleet.
         states: function that returns the states of the outlets, by name.
-        stored: function that returns the answers of the stores, by the outlet's name.
+        read_stores: function that returns the answers of the stores, by the outlet's name.
     """
 
     def __init__(
@@ -137,17 +138,17 @@ class OutletService:
         bus: Bus,
         keys: Keys,
         states: Callable[[], Mapping[str, OutletState]],
-        stored: Callable[[StoredRequest], Awaitable[dict[str, dict[str, Any]]]],
+        read_stores: Callable[[StoredRequest], Awaitable[dict[str, dict[str, Any]]]],
     ) -> None:
         self._agent, self._keys = agent, keys
-        self._states, self._stored = states, stored
-        self._under_way = 0
+        self._states, self._read_stored = states, read_stores
+        self._running_count = 0
         pattern = keys.outlets(agent.name, "*")
-        self._declared: Handle = bus.answer(pattern, self._on_question, patient=always)
+        self._handle: Handle = bus.answer(pattern, self._on_question, patient=always)
 
     def close(self) -> None:
         """Stop answering."""
-        self._declared.close()
+        self._handle.close()
 
     def _on_question(self, question: BusQuestion) -> None:
         name = question.key.rpartition("/")[2]
@@ -159,30 +160,30 @@ class OutletService:
             self._reply(question, name, {"error": "", "outlets": accounts})
         elif name != "results":
             error = ConfigurationError(f"outlets: expected accounts or results, got {name!r:.80}")
-            self._reply(question, name, failure(error))
-        elif self._under_way >= MAX_STORE_QUESTIONS:
-            text = f"{self._under_way} questions to the stores are under way"
-            self._reply(question, name, failure(LocalProtocolError(text)))
+            self._reply(question, name, error_fields(error))
+        elif self._running_count >= MAX_STORE_QUESTIONS:
+            text = f"{self._running_count} questions to the stores are under way"
+            self._reply(question, name, error_fields(LocalProtocolError(text)))
         else:
-            self._under_way += 1
-            self._agent.begin(self._answer(question), "smartcam.fleet.outlets")
+            self._running_count += 1
+            self._agent.start_task(self._answer(question), "smartcam.fleet.outlets")
 
     async def _answer(self, question: BusQuestion) -> None:
-        outcome = failure(SmartCamError("the agent ends"))
+        outcome = error_fields(SmartCamError("the agent ends"))
         try:
-            given, error = request_fields(question.payload)
+            fields, error = request_fields(question.payload)
             if error is not None:
                 raise error
-            request = validated(StoredRequest, given or {}, "outlets: results")
-            stored = await self._stored(request)
+            request = validated(StoredRequest, fields or {}, "outlets: results")
+            stored = await self._read_stored(request)
             outcome = {
                 "error": "",
-                "stores": {name: _bounded(value) for name, value in stored.items()},
+                "stores": {name: _newest_rows(value) for name, value in stored.items()},
             }
         except SmartCamError as exc:
-            outcome = failure(exc)
+            outcome = error_fields(exc)
         finally:
-            self._under_way -= 1
+            self._running_count -= 1
             self._reply(question, "results", outcome)
 
     def _reply(self, question: BusQuestion, name: str, fields: dict[str, Any]) -> None:
@@ -192,8 +193,8 @@ class OutletService:
         question.close()
 
 
-def _bounded(store: dict[str, Any]) -> dict[str, Any]:
-    """Return a store's answer without the oldest rows beyond the bound."""
+def _newest_rows(store: dict[str, Any]) -> dict[str, Any]:
+    """Return a store's answer with its newest rows, up to MAX_ROWS_BYTES."""
     rows, size = list[dict[str, Any]](), 0
     for row in reversed(store["rows"]):
         size += ROW_BYTES + len(row["value"] or "") + len(row["error"] or "")
@@ -208,7 +209,7 @@ T = TypeVar("T", ReportedOutlet, ReportedStore)
 
 async def ask_outlets(bus: Bus, keys: Keys, timeout: float) -> list[ReportedOutlet]:
     """Return the accounts of all agents' outlets that came within ``timeout`` seconds."""
-    return await _ask(bus, keys.outlets("*", "accounts"), b"", timeout, _accounts)
+    return await _ask(bus, keys.outlets("*", "accounts"), b"", timeout, _read_accounts)
 
 
 async def ask_stores(
@@ -216,7 +217,7 @@ async def ask_stores(
 ) -> list[ReportedStore]:
     """Return the answers of all agents' stores that came within ``timeout`` seconds."""
     payload = request.model_dump_json().encode()
-    return await _ask(bus, keys.outlets("*", "results"), payload, timeout, _stores)
+    return await _ask(bus, keys.outlets("*", "results"), payload, timeout, _read_stores)
 
 
 async def _ask(
@@ -231,7 +232,7 @@ async def _ask(
     return sorted(answers, key=lambda reported: reported[:2])
 
 
-def _accounts(answer: bytes) -> list[ReportedOutlet]:
+def _read_accounts(answer: bytes) -> list[ReportedOutlet]:
     report: Any = json.loads(answer)
     return [
         ReportedOutlet(
@@ -247,7 +248,7 @@ def _accounts(answer: bytes) -> list[ReportedOutlet]:
     ]
 
 
-def _stores(answer: bytes) -> list[ReportedStore]:
+def _read_stores(answer: bytes) -> list[ReportedStore]:
     report: Any = json.loads(answer)
     agent = str(report["agent"])
     if report["error"]:

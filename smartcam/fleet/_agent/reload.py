@@ -1,8 +1,8 @@
 """Reload a fleet file in a running agent; unchanged cameras are not touched.
 
-Failures come before the first change: the file is read and checked completely, and new emulated
-cameras are started. The rest cannot fail, and runs in its own task, which continues if its caller
-is cancelled.
+First the file is read and checked completely, and new emulated cameras are started. If this fails,
+nothing is changed. The changes themselves cannot fail. They run in an own task, which continues if
+the caller is cancelled.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from smartcam.fleet._agent.agent import Agent
-    from smartcam.fleet._file.fleet_file import Planned
-    from smartcam.fleet._frames.camera_frames import FramesOf
+    from smartcam.fleet._file.fleet_file import PlannedCamera
+    from smartcam.fleet._frames.camera_frames import FrameSupply
     from smartcam.settings import CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -35,8 +35,8 @@ REMOVED, CHANGED = "it was removed from the fleet file", "its entry in the fleet
 READ_TIMEOUT = 10.0
 """Seconds for reading a file and the files that it names; they may be on a network drive."""
 
-LIVE = frozenset({"cameras"})
-"""Fields of a fleet file that are changed while the agent runs; the others need a restart."""
+RELOADABLE_FIELDS = frozenset({"cameras"})
+"""Fields of a fleet file that can be changed while the agent runs; other fields need a restart."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class CameraSource(NamedTuple):
     """
 
     settings: CameraSettings
-    frames: FramesOf | None
+    frames: FrameSupply | None
     emulator: contextlib.AsyncExitStack
 
 
@@ -91,35 +91,35 @@ class LoadedFleet(NamedTuple):
     Attributes:
         file: contents of the fleet file.
         plan: cameras of the file, by name.
-        marks: texts by camera's name that show a change of the camera: its entry, and the contents
-            of the files that the entry names.
+        fingerprints: values by camera's name that differ if the camera has changed: its entry, and
+            digests of the files that the entry names.
     """
 
     file: FleetFile
-    plan: dict[str, Planned]
-    marks: dict[str, object]
+    plan: dict[str, PlannedCamera]
+    fingerprints: dict[str, object]
 
 
-def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
-    """Return a file with its cameras.
+def load_cameras(file: FleetFile, folder: Path) -> LoadedFleet:
+    """Return a fleet file with its cameras and their fingerprints.
 
     Raises:
         ValueError: the cameras are not valid.
     """
     plan = {planned.name: planned for planned in file.plan()}
-    seen: dict[str, str] = {}
+    digests: dict[str, str] = {}
 
     def digest(named: str | None) -> str | None:
         if named is None:
             return None
-        if named not in seen:
+        if named not in digests:
             try:
-                seen[named] = hashlib.sha256((folder / named).read_bytes()).hexdigest()
+                digests[named] = hashlib.sha256((folder / named).read_bytes()).hexdigest()
             except OSError as exc:
-                seen[named] = str(exc)
-        return seen[named]
+                digests[named] = str(exc)
+        return digests[named]
 
-    def mark(planned: Planned) -> object:
+    def fingerprint(planned: PlannedCamera) -> object:
         entry, emulated = planned.entry, planned.entry.emulated
         if emulated is not None:  # the number of cameras does not change a single one
             emulated = emulated.model_copy(update={"count": 1})
@@ -128,19 +128,19 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
         files.append(None if emulated is None else emulated.scenario)
         files.append(None if entry.frames is None else entry.frames.camera_info)
         files += _files_in(entry.software, folder)
-        return entry, planned.nth, [digest(path) for path in files]
+        return entry, planned.index_in_entry, [digest(path) for path in files]
 
-    return LoadedFleet(file, plan, {name: mark(planned) for name, planned in plan.items()})
+    return LoadedFleet(file, plan, {name: fingerprint(planned) for name, planned in plan.items()})
 
 
-def _files_in(given: object, folder: Path) -> list[str | None]:
-    """Return the texts in a camera's programs that are names of files."""
-    if isinstance(given, dict):
-        return [path for part in given.values() for path in _files_in(part, folder)]
-    if isinstance(given, list):
-        return [path for part in given for path in _files_in(part, folder)]
+def _files_in(fields: object, folder: Path) -> list[str | None]:
+    """Return the texts in the fields of a software camera that are names of existing files."""
+    if isinstance(fields, dict):
+        return [path for part in fields.values() for path in _files_in(part, folder)]
+    if isinstance(fields, list):
+        return [path for part in fields for path in _files_in(part, folder)]
     try:
-        return [given] if isinstance(given, str) and (folder / given).is_file() else []
+        return [fields] if isinstance(fields, str) and (folder / fields).is_file() else []
     except (OSError, ValueError):  # not the name of a file
         return []
 
@@ -150,13 +150,13 @@ class Reloader:
 
     Args:
         folder: folder of relative paths, if a file's contents are given and not its path.
-        make: function that starts a camera's source, given its plan and the folder.
-        now: the file before the first reload.
+        start_source: function that starts a camera's source, given its plan and the folder.
+        current: the file before the first reload.
 
     Attributes:
-        now: the current file.
+        current: the file as it was read last.
         sources: sources of the cameras' sessions, by name.
-        last: changes, or error, of the last reload; None before the first.
+        last: changes, or error, of the last reload; None before the first reload.
         outcomes: numbers of successful and of refused reloads.
         on_reload: callback for the start of a reload (None) and for its end (changes or error).
     """
@@ -164,22 +164,22 @@ class Reloader:
     def __init__(
         self,
         folder: Path,
-        now: LoadedFleet,
-        make: Callable[[Planned, Path], Awaitable[CameraSource]],
+        current: LoadedFleet,
+        start_source: Callable[[PlannedCamera, Path], Awaitable[CameraSource]],
     ) -> None:
-        self.now: LoadedFleet = now
+        self.current: LoadedFleet = current
         self.sources: dict[str, CameraSource] = {}
         self.last: FleetChanges | SmartCamError | None = None
         self.outcomes: dict[str, int] = {"done": 0, "refused": 0}
         self.on_reload: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
-        self._folder, self._make = folder, make
+        self._folder, self._start_source = folder, start_source
         self._reload_lock = asyncio.Lock()
         self._reading: asyncio.Future[tuple[LoadedFleet, FleetChanges]] | None = None
         self._applying: asyncio.Task[None] | None = None
         self._closed = False
 
     async def close(self) -> None:
-        """Wait for the end of a running reload; no other is started. Bounded."""
+        """Wait for the end of a running reload, and refuse further ones. Bounded."""
         self._closed = True
         if self._applying is not None:
             await asyncio.wait({self._applying})
@@ -189,7 +189,7 @@ class Reloader:
         async with self._reload_lock:
             self.on_reload(None)
             try:
-                changes = await self._typed(agent, file)
+                changes = await self._reload_with_known_errors(agent, file)
             except SmartCamError as exc:
                 logger.warning("the fleet file was not taken, all stays as it was: %s", exc)
                 self.last = exc
@@ -206,11 +206,13 @@ class Reloader:
                 self.last = changes
                 return changes
             finally:
-                done = isinstance(self.last, FleetChanges)
-                self.outcomes["done" if done else "refused"] += 1
+                succeeded = isinstance(self.last, FleetChanges)
+                self.outcomes["done" if succeeded else "refused"] += 1
                 self.on_reload(self.last)
 
-    async def _typed(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
+    async def _reload_with_known_errors(
+        self, agent: Agent, file: str | Path | FleetFile
+    ) -> FleetChanges:
         try:
             return await self._reload(agent, file)
         except SmartCamError:
@@ -228,17 +230,17 @@ class Reloader:
         new, changes = await self._read(file, folder, agent.name)
         _refuse_added(agent, changes)
         async with contextlib.AsyncExitStack() as stack:
-            made: dict[str, CameraSource] = {}
+            sources: dict[str, CameraSource] = {}
             for name in (*changes.added, *changes.changed):
-                made[name] = source = await self._make(new.plan[name], folder)
+                sources[name] = source = await self._start_source(new.plan[name], folder)
                 stack.push_async_callback(source.emulator.aclose)
                 await asyncio.sleep(0)
             if self._closed:
                 raise ConnectionClosedError(f"the agent {agent.name} ends; nothing was changed")
-            _refuse_added(agent, changes)  # a program may have added one meanwhile
+            _refuse_added(agent, changes)  # a program may have added a camera meanwhile
             stack.pop_all()
-            self.now = new
-            work = self._apply(agent, (*changes.removed, *changes.changed), made)
+            self.current = new
+            work = self._apply(agent, (*changes.removed, *changes.changed), sources)
             self._applying = asyncio.get_running_loop().create_task(work, name="smartcam.reload")
         await asyncio.shield(self._applying)
         return changes
@@ -246,26 +248,26 @@ class Reloader:
     async def _read(
         self, file: str | Path | FleetFile, folder: Path, agent: str
     ) -> tuple[LoadedFleet, FleetChanges]:
-        """Read and check a file, and find its changes, in a thread."""
+        """Read and check a file in a thread; return it and its changes."""
         if self._reading is not None:  # the reload's caller was cancelled, or timed out
-            _, late = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
-            if late:
+            _, unfinished = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
+            if unfinished:
                 raise ConfigurationError(
                     f"fleet file {file}: the reading that began before has no end yet"
                 )
 
-        old = self.now
+        old = self.current
 
         def read() -> tuple[LoadedFleet, FleetChanges]:
             contents = file if isinstance(file, FleetFile) else load_fleet(file)
             try:
-                new = loaded(contents, folder)
+                new = load_cameras(contents, folder)
             except ValueError as exc:
                 raise ConfigurationError(f"fleet {contents.fleet}: {exc}") from exc
             return new, changes_of(old, new, agent)
 
         self._reading = asyncio.get_running_loop().run_in_executor(None, read)
-        self._reading.add_done_callback(_looked_at)
+        self._reading.add_done_callback(_retrieve_error)
         try:
             async with asyncio.timeout(READ_TIMEOUT):
                 return await asyncio.shield(self._reading)
@@ -275,17 +277,20 @@ class Reloader:
             ) from exc
 
     async def _apply(
-        self, agent: Agent, ending: tuple[str, ...], made: dict[str, CameraSource]
+        self, agent: Agent, removed_names: tuple[str, ...], sources: dict[str, CameraSource]
     ) -> None:
-        """Apply changes to the agent; first remove cameras, whose addresses may be reused."""
-        ended = await asyncio.gather(
-            *(self._end(agent, name, CHANGED if name in made else REMOVED) for name in ending),
+        """Remove cameras from the agent, then add those that may have the same addresses."""
+        errors = await asyncio.gather(
+            *(
+                self._remove_camera(agent, name, CHANGED if name in sources else REMOVED)
+                for name in removed_names
+            ),
             return_exceptions=True,
         )
-        for error in ended:
+        for error in errors:
             if error is not None:
                 logger.error("! a camera did not close", exc_info=error)
-        for name, source in made.items():
+        for name, source in sources.items():
             self.sources[name] = source
             if self._closed:
                 continue  # the agent ends, and closes the source
@@ -293,15 +298,15 @@ class Reloader:
                 logger.error("%s ! it is not shared: a program has added one meanwhile", name)
                 continue
             try:
-                await agent.want(name, source.settings, source.frames)
+                await agent.add_camera(name, source.settings, source.frames)
             except SmartCamError:
                 logger.exception("%s ! it is not shared", name)
             await asyncio.sleep(0)
 
-    async def _end(self, agent: Agent, name: str, why: str) -> None:
+    async def _remove_camera(self, agent: Agent, name: str, why: str) -> None:
         source = self.sources.pop(name, None)
         try:
-            await agent.drop(name, why)
+            await agent.remove_camera(name, why)
         finally:
             if source is not None:
                 await source.emulator.aclose()
@@ -314,10 +319,10 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
         ConfigurationError: a field cannot be changed while the agent runs; the text names it.
     """
     for field in FleetFile.model_fields:
-        if field not in LIVE and getattr(old.file, field) != getattr(new.file, field):
+        if field not in RELOADABLE_FIELDS and getattr(old.file, field) != getattr(new.file, field):
             raise ConfigurationError(
                 f"{field}: it was changed, which wants a restart of the agent {agent}; only "
-                f"{', '.join(sorted(LIVE))} can be changed while it runs"
+                f"{', '.join(sorted(RELOADABLE_FIELDS))} can be changed while it runs"
             )
     for name, planned in new.plan.items():
         if old.file.ros2 is not None and _ros_entry(old.plan.get(name)) != _ros_entry(planned):
@@ -325,7 +330,7 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
                 f"cameras.{name}.ros2: it was changed, which wants a restart of the agent {agent}"
             )
     both = [name for name in new.plan if name in old.plan]
-    changed = tuple(name for name in both if new.marks[name] != old.marks[name])
+    changed = tuple(name for name in both if new.fingerprints[name] != old.fingerprints[name])
     return FleetChanges(
         agent,
         tuple(name for name in new.plan if name not in old.plan),
@@ -349,11 +354,11 @@ def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
             )
 
 
-def _ros_entry(planned: Planned | None) -> RosCamera:
-    """Return a camera's entry for ROS; for a camera that is new, the entry's defaults."""
+def _ros_entry(planned: PlannedCamera | None) -> RosCamera:
+    """Return a camera's entry for ROS; for None the entry with its defaults."""
     return RosCamera.model_validate({}) if planned is None else planned.entry.ros2
 
 
-def _looked_at(future: asyncio.Future[tuple[LoadedFleet, FleetChanges]]) -> None:
+def _retrieve_error(future: asyncio.Future[tuple[LoadedFleet, FleetChanges]]) -> None:
     if not future.cancelled():
         future.exception()  # the caller got the error, unless it was cancelled

@@ -40,20 +40,22 @@ class ReloadService:
         reload: Callable[[], Awaitable[FleetChanges]],
     ) -> None:
         self._agent, self._reload = agent, reload
-        self._waiting = 0
-        self._declared: Handle = bus.answer(keys.reload(agent.name), self._on_question)
+        self._running_count = 0
+        self._handle: Handle = bus.answer(keys.reload(agent.name), self._on_question)
 
     def close(self) -> None:
         """Stop answering."""
-        self._declared.close()
+        self._handle.close()
 
     def _on_question(self, question: BusQuestion) -> None:
-        if self._waiting >= MAX_WAITING_QUESTIONS:
-            text = f"{self._agent.name}: {self._waiting} reloads are under way; nothing was done"
+        if self._running_count >= MAX_WAITING_QUESTIONS:
+            text = (
+                f"{self._agent.name}: {self._running_count} reloads are under way; nothing was done"
+            )
             self._reply(question, {"error": to_fields(LocalProtocolError(text))})
             return
-        self._waiting += 1
-        self._agent.begin(self._answer(question), "smartcam.fleet.reload")
+        self._running_count += 1
+        self._agent.start_task(self._answer(question), "smartcam.fleet.reload")
 
     async def _answer(self, question: BusQuestion) -> None:
         fields: dict[str, Any] = {
@@ -64,7 +66,7 @@ class ReloadService:
         except SmartCamError as exc:
             fields = {"error": to_fields(exc)}
         finally:
-            self._waiting -= 1
+            self._running_count -= 1
             self._reply(question, fields)
 
     def _reply(self, question: BusQuestion, fields: dict[str, Any]) -> None:
@@ -75,12 +77,12 @@ class ReloadService:
 async def reload_agents(
     bus: Bus, keys: Keys, agents: list[str], timeout: float
 ) -> dict[str, FleetChanges | SmartCamError]:
-    """Reload the files of agents; return the answer of each, by its name."""
+    """Make agents reload their files; return the changes or the error of each, by its name."""
     outcomes: dict[str, FleetChanges | SmartCamError] = {}
     pattern = keys.reload(agents[0] if len(agents) == 1 else "*")
     for key, payload in await bus.ask(pattern, b"", timeout):
         agent = key.split("/")[-2]
-        outcomes[agent] = _read(agent, payload)
+        outcomes[agent] = _read_answer(agent, payload)
     for agent in agents:
         if agent not in outcomes:
             outcomes[agent] = ResponseTimeoutError(
@@ -91,7 +93,7 @@ async def reload_agents(
     return {name: outcomes[name] for name in sorted(outcomes)}
 
 
-def _read(agent: str, payload: bytes) -> FleetChanges | SmartCamError:
+def _read_answer(agent: str, payload: bytes) -> FleetChanges | SmartCamError:
     try:
         fields = json.loads(payload)
         if "error" in fields:

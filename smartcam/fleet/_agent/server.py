@@ -18,19 +18,19 @@ from smartcam.camera import DEFAULT_MAX_QUEUE
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
 from smartcam.fleet._agent.agent import Agent
 from smartcam.fleet._agent.outlet_service import OutletService
-from smartcam.fleet._agent.reload import CameraSource, FleetChanges, Reloader, loaded
+from smartcam.fleet._agent.reload import CameraSource, FleetChanges, Reloader, load_cameras
 from smartcam.fleet._agent.reload_service import ReloadService
 from smartcam.fleet._bus.address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._bus.keys import Keys
 from smartcam.fleet._bus.zenoh import ZenohEnd
-from smartcam.fleet._file.access import access_mistakes, access_of
+from smartcam.fleet._file.access import access_mistakes, effective_access
 from smartcam.fleet._file.fleet_file import FleetFile, load_fleet, software_camera
 from smartcam.fleet._file.ros import RosSection
-from smartcam.fleet._frames.camera_frames import FramesOf
+from smartcam.fleet._frames.camera_frames import FrameSupply
 from smartcam.fleet._security.access import access_control
 from smartcam.fleet._security.certificates import AGENT
-from smartcam.fleet._security.door import Door
-from smartcam.fleet._security.renewal import RETRY_AFTER, CertificateWatch
+from smartcam.fleet._security.door import ConnectionFilter
+from smartcam.fleet._security.renewal import RETRY_DELAY, CertificateWatch
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
 from smartcam.observers import Observers
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._agent.outlet_service import StoredRequest
     from smartcam.fleet._bus.bus import Bus
     from smartcam.fleet._file.access import Access
-    from smartcam.fleet._file.fleet_file import FramesEntry, Planned
+    from smartcam.fleet._file.fleet_file import FramesEntry, PlannedCamera
     from smartcam.fleet._ros import RosFleet
     from smartcam.frames import FrameSource
     from smartcam.inspection import SoftwareDevice
@@ -94,36 +94,38 @@ class FleetServer(Server):
         restore: bool | None = None,
         _frames: Mapping[str, Callable[[], FrameSource]] | None = None,
     ) -> None:
-        self._given_frames = _frames or {}
+        self._replayed_frames = _frames or {}
         if not isinstance(file, (Path, FleetFile)):
             file = check_text(file, "fleet file", least=1)
-        self._given_file = file
+        self._original_file = file
         self.observers: list[Observer] = []
         self.outlet_states: Callable[[], Mapping[str, OutletState]] = dict
-        self.stored_results: Callable[[StoredRequest], Awaitable[dict[str, Any]]] = _nothing
+        self.stored_results: Callable[[StoredRequest], Awaitable[dict[str, Any]]] = (
+            _no_stored_results
+        )
         contents = file if isinstance(file, FleetFile) else load_fleet(file)
         self.folder: Path = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
         try:
-            loaded_file = loaded(contents, self.folder)
+            loaded_file = load_cameras(contents, self.folder)
         except ValueError as exc:
             raise ConfigurationError(f"fleet {contents.fleet}: {exc}") from exc
-        self.reloads: Reloader = Reloader(self.folder, loaded_file, self._source)
+        self.reloads: Reloader = Reloader(self.folder, loaded_file, self._start_source)
         listen, connect = self.file.endpoints
         for _, mistake in access_mistakes(self.file.access, listen):
             raise ConfigurationError(f"fleet {self.file.fleet}: {mistake}")
         self._listen, self._connect = listen, connect = with_ports(listen), connect
-        # with certificates all connections must come through the router
+        # with certificates, all connections must go through the router
         peer = self.file.ros2 is not None and self.file.certificates is None
         link = BusLink(listen, connect, self.file.certificates, peer)
         self._bus = bus or ZenohEnd(link, self._engine_settings())
         self._ros: RosFleet | None = None
         section = self.file.ros2
-        self._restore = (section is not None and section.autostart) if restore is None else restore
+        self._restores = (section is not None and section.autostart) if restore is None else restore
         self.calibrations: CalibrationDesks | None = None
-        # settings of cameras for ROS, also of cameras that a reload adds
+        # settings of all cameras for ROS, also of those that a reload adds
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
-        self._controls: dict[str, Callable[[], Awaitable[FrameSource]]] = {}
+        self._device_sources: dict[str, Callable[[], Awaitable[FrameSource]]] = {}
         self._agent: Agent | None = None
         self._hosts: dict[str, Host] = {}
         self._events: Subscribers[CameraEvent] = Subscribers()
@@ -143,11 +145,11 @@ class FleetServer(Server):
         file = self.file
         async with contextlib.AsyncExitStack() as stack:
             sources: dict[str, CameraSource] = {}
-            self.reloads = Reloader(self.folder, self.reloads.now, self._source)
+            self.reloads = Reloader(self.folder, self.reloads.current, self._start_source)
             self.reloads.sources = sources
             stack.push_async_callback(_end_emulators, sources)
-            for name, planned in self.reloads.now.plan.items():
-                sources[name] = await self._source(planned, self.folder)
+            for name, planned in self.reloads.current.plan.items():
+                sources[name] = await self._start_source(planned, self.folder)
             self.calibrations = self._open_calibrations(stack)
             history = (file.history.results, file.history.bytes)
             agent = Agent(
@@ -163,7 +165,7 @@ class FleetServer(Server):
                 on_retired=self._retire,
                 calibrations=self.calibrations,
             )
-            self._hosts = agent.hosts  # observers need them from the first result on
+            self._hosts = agent.hosts  # observers use the hosts from the first result on
             stack.callback(self._forget_hosts)
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
@@ -183,12 +185,12 @@ class FleetServer(Server):
             await self._enter_ros()
             if isinstance(self._bus, ZenohEnd):
                 ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in self._listen)
-                door = Door(ports, self._bus.linked)
-                door.open()
-                stack.callback(door.close)
+                connection_filter = ConnectionFilter(ports, self._bus.connected_addresses)
+                connection_filter.open()
+                stack.callback(connection_filter.close)
             if self.file.certificates is not None and isinstance(self._bus, ZenohEnd):
                 watching = self._watch_certificates(self._bus, agent)
-                stack.push_async_callback(_end, watching)
+                stack.push_async_callback(_cancel_and_wait, watching)
             self._agent, self._stack = agent, stack.pop_all()
 
     def _open_calibrations(self, stack: contextlib.AsyncExitStack) -> CalibrationDesks | None:
@@ -201,18 +203,18 @@ class FleetServer(Server):
             return None
         with from_part("calibration", '"calibrations:" in a fleet file needs'):
             from smartcam.calibration._inside import CalibrationDesks
-        place = self.folder / self.file.calibrations
+        folder = self.folder / self.file.calibrations
         try:
-            calibrations = CalibrationDesks(place)
+            calibrations = CalibrationDesks(folder)
         except OSError as exc:
             raise ConfigurationError(
-                f"calibrations: {place}: expected a folder, or a place for one: {exc.strerror}"
+                f"calibrations: {folder}: expected a folder, or a place for one: {exc.strerror}"
             ) from exc
         stack.callback(calibrations.close)
         return calibrations
 
     def _retire(self, why: ConfigurationError) -> None:
-        """End the streams of the cameras' events with the error: another agent has the name."""
+        """End the streams of events with the reason why the agent has ended."""
         for stream in self._events:
             stream.end(why)
 
@@ -235,10 +237,10 @@ class FleetServer(Server):
 
     @property
     def _access(self) -> Access | None:
-        return access_of(self.file.access, self._listen)
+        return effective_access(self.file.access, self._listen)
 
     def _check_role(self) -> None:
-        """Refuse access by roles with a certificate that has none, which no program could use.
+        """Refuse access by roles if the agent's certificate does not have the role of an agent.
 
         Raises:
             ConfigurationError: the certificate has another role, or none.
@@ -253,9 +255,12 @@ class FleetServer(Server):
             )
 
     def _watch_certificates(self, bus: ZenohEnd, agent: Agent) -> asyncio.Task[None]:
-        """Use renewed certificates from now on."""
+        """Start to watch the certificates, and use renewed ones."""
         watch = CertificateWatch(
-            bus, listens=bool(self._listen), busy=lambda: agent.busy, away=self._away_from_ros
+            bus,
+            listens=bool(self._listen),
+            busy=lambda: agent.busy,
+            without_nodes=self._without_ros_nodes,
         )
         return asyncio.get_running_loop().create_task(
             watch.run(), name="smartcam.fleet.certificates"
@@ -272,8 +277,8 @@ class FleetServer(Server):
             await ros.stop()
 
     @contextlib.asynccontextmanager
-    async def _away_from_ros(self) -> AsyncIterator[None]:
-        """Close the nodes for a while: their latched messages would be lost with the session."""
+    async def _without_ros_nodes(self) -> AsyncIterator[None]:
+        """Close the nodes during the block: a new session would lose their latched messages."""
         await self._leave_ros()
         yield
         while True:
@@ -282,7 +287,7 @@ class FleetServer(Server):
             except SmartCamError as exc:
                 logger.error("ros2 ! %s; it is tried again", exc)  # noqa: TRY400 - the text says it
                 await self._leave_ros()
-                await asyncio.sleep(RETRY_AFTER)
+                await asyncio.sleep(RETRY_DELAY)
             else:
                 return
 
@@ -290,7 +295,7 @@ class FleetServer(Server):
         with from_part("ros2", '"ros2:" in a fleet file needs'):
             from smartcam.fleet._ros import RosFleet
         file, own_name = self.file, self.file.agent_name
-        cameras = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
+        cameras = {name: planned.entry.ros2 for name, planned in self.reloads.current.plan.items()}
         calibrations = {name: ros.load_calibration(self.folder) for name, ros in cameras.items()}
         hand_eyes = {name: ros.load_hand_eye(self.folder) for name, ros in cameras.items()}
         return RosFleet(
@@ -301,9 +306,15 @@ class FleetServer(Server):
             cameras=cameras,
             settings=self._settings,
             frames=self._ros_frames,
-            controls=self._controls,
-            calibrations={name: made for name, made in calibrations.items() if made is not None},
-            hand_eyes={name: made for name, made in hand_eyes.items() if made is not None},
+            controls=self._device_sources,
+            calibrations={
+                name: calibration
+                for name, calibration in calibrations.items()
+                if calibration is not None
+            },
+            hand_eyes={
+                name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
+            },
             wanted=lambda agent, _camera: agent == own_name,
             desks=self.calibrations,
         )
@@ -343,18 +354,18 @@ class FleetServer(Server):
         """
         if self._agent is None:
             raise ConnectionClosedError("the agent is not started: there is nothing to reload")
-        return await self.reloads.reload(self._agent, self._given_file if file is None else file)
+        return await self.reloads.reload(self._agent, self._original_file if file is None else file)
 
-    async def _source(self, planned: Planned, folder: Path) -> CameraSource:
-        """Return the source of a camera's session; start an emulated camera for it.
+    async def _start_source(self, planned: PlannedCamera, folder: Path) -> CameraSource:
+        """Return a camera's settings and frames; first start the camera if it is emulated.
 
         Raises:
             SmartCamError: the source cannot be created.
         """
         async with contextlib.AsyncExitStack() as stack:
             entry = planned.entry
-            given = self._given_frames.get(planned.name)
-            frames = None if given is None else FramesOf(given, "replayed")
+            replay = self._replayed_frames.get(planned.name)
+            frames = None if replay is None else FrameSupply(replay, "replayed")
             if entry.software is not None:
                 device, frames = await self._start_software_camera(planned, folder, stack)
                 url = device.url
@@ -366,19 +377,21 @@ class FleetServer(Server):
                 entry = entry.model_copy(update=update)
             else:
                 url = entry.url or await self._emulate(planned, stack)
-            settings = entry.settings(planned.name, url, restore=self._restore)
+            settings = entry.settings(planned.name, url, restore=self._restores)
             if entry.frames is not None:
-                make = functools.partial(entry.frames.source, folder)
-                make()  # so that wrong options are reported now
+                make = functools.partial(entry.frames.make_source, folder)
+                make()  # raises for wrong options now
                 address = FrameAddress.parse(entry.frames.url)
-                frames = FramesOf(make, address.shown)
+                frames = FrameSupply(make, address.shown)
                 if address.scheme in ("v4l2", "gige"):
-                    self._controls[planned.name] = functools.partial(self._frames_of, planned.name)
+                    self._device_sources[planned.name] = functools.partial(
+                        self._open_frame_source, planned.name
+                    )
             self._settings[planned.name] = settings
             self._ros_frames[planned.name] = _ros_frames(entry.frames, folder)
             return CameraSource(settings, frames, stack.pop_all())
 
-    async def _frames_of(self, name: str) -> FrameSource:
+    async def _open_frame_source(self, name: str) -> FrameSource:
         """Return the open source of a camera's frames.
 
         Raises:
@@ -391,17 +404,17 @@ class FleetServer(Server):
         return await host.frames.source()
 
     async def _start_software_camera(
-        self, planned: Planned, folder: Path, stack: contextlib.AsyncExitStack
-    ) -> tuple[SoftwareDevice, FramesOf]:
-        """Start a software camera; return it, and the frames that it has judged."""
-        given = planned.entry.software or {}
-        camera = await asyncio.to_thread(software_camera, planned.name, given, folder)
+        self, planned: PlannedCamera, folder: Path, stack: contextlib.AsyncExitStack
+    ) -> tuple[SoftwareDevice, FrameSupply]:
+        """Start a software camera; return it, and the supply of its inspected frames."""
+        entry = planned.entry.software or {}
+        camera = await asyncio.to_thread(software_camera, planned.name, entry, folder)
         with from_part("inspection", '"software:" in a fleet file needs'):
             from smartcam.inspection import SoftwareDevice
             from smartcam.inspection._inside import JudgedResults, judged_source
         device = SoftwareDevice(camera)
         await stack.enter_async_context(device)
-        drawn = bool(given.get("drawn", True))
+        drawn = bool(entry.get("drawn", True))
         make = functools.partial(judged_source, device.inspector, drawn=drawn)
         observers = Observers(self.observers)
         reporter = JudgedResults(
@@ -411,9 +424,9 @@ class FleetServer(Server):
             max_kept=0,
         )
         device.inspector.viewers.add(reporter.take)
-        return device, FramesOf(make, masked(camera.frames), reporter)
+        return device, FrameSupply(make, masked(camera.frames), reporter)
 
-    async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
+    async def _emulate(self, planned: PlannedCamera, stack: contextlib.AsyncExitStack) -> str:
         """Start an emulated camera; return its URL."""
         from smartcam.emulator import EmulatedCamera, load_scenario
         from smartcam.emulator._inside import emulated_class
@@ -421,7 +434,7 @@ class FleetServer(Server):
         emulated = planned.entry.emulated
         if emulated is None:
             raise ConfigurationError(f"{planned.name}: neither url nor emulated")
-        seed = emulated.seed + planned.nth
+        seed = emulated.seed + planned.index_in_entry
         camera: WireCamera
         if emulated.scenario is None:
             camera = EmulatedCamera(seed=seed)
@@ -461,7 +474,7 @@ class FleetServer(Server):
     @property
     def file(self) -> FleetFile:
         """The fleet file, as it was read last."""
-        return self.reloads.now.file
+        return self.reloads.current.file
 
     @property
     def agent(self) -> Agent | None:
@@ -512,7 +525,7 @@ class FleetServer(Server):
     def urls(self) -> dict[str, str]:
         """The fleet URLs of the cameras, by name."""
         address = self.address
-        return {name: address.of(name).url for name in self.reloads.now.plan}
+        return {name: address.of(name).url for name in self.reloads.current.plan}
 
 
 def _ros_frames(entry: FramesEntry | None, folder: Path) -> dict[str, Any]:
@@ -525,7 +538,7 @@ def _ros_frames(entry: FramesEntry | None, folder: Path) -> dict[str, Any]:
     return parameters
 
 
-async def _nothing(_asked: StoredRequest) -> dict[str, Any]:
+async def _no_stored_results(_request: StoredRequest) -> dict[str, Any]:
     return {}
 
 
@@ -534,23 +547,23 @@ async def _end_emulators(sources: dict[str, CameraSource]) -> None:
         await source.emulator.aclose()
 
 
-async def _end(task: asyncio.Task[None]) -> None:
+async def _cancel_and_wait(task: asyncio.Task[None]) -> None:
     task.cancel()
     await asyncio.wait({task})
 
 
 def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
     """Return the address of a fleet from an endpoint such as ``tcp/127.0.0.1:7447``."""
-    kind, _, place = endpoint.partition("/")
-    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
-    host = host.strip("[]") or place
+    kind, _, rest = endpoint.partition("/")
+    host, _, port = rest.partition("?")[0].partition("#")[0].rpartition(":")
+    host = host.strip("[]") or rest
     if host in {"0.0.0.0", "::"}:  # noqa: S104 - listening on all addresses includes this host
         host = "127.0.0.1"
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
-    # with roles each program needs a certificate of its own: the agent's own may not command
-    usable = scheme == "fleet+tls" and file.access == "any-certificate"
-    certificates = file.certificates if usable else None
+    # with roles, each program needs an own certificate: that of the agent may not command
+    is_usable = scheme == "fleet+tls" and file.access == "any-certificate"
+    certificates = file.certificates if is_usable else None
     # a router of several agents may have several fleets
     name = None if file.endpoints[0] else file.fleet
     return FleetAddress(scheme, host, number, name, "", certificates)

@@ -1,7 +1,7 @@
-"""The client of a shared camera at its agent, whose results are the containers themselves.
+"""Define an agent's client of a shared camera, which does not interpret the results.
 
-Each program interprets containers by itself, so here the value of a result is the container, with
-the owner of its trigger. A layout is used only for its ``@sequence``.
+Each program interprets containers by itself. So the value of a result has only the owner of its
+trigger here; its bytes are in ``raw``. A layout is used only for its ``@sequence``.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ if TYPE_CHECKING:
 
 
 class Owner(NamedTuple):
-    """The owner of a trigger: the program's number at its agent, and the call's. 0 for no owner."""
+    """The owner of a trigger: the numbers of the program and of its call; 0 without an owner."""
 
     program: int
     call: int
 
 
-NOBODY = Owner(0, 0)
+NO_OWNER = Owner(0, 0)
 
 
-class Carried(NamedTuple):
-    """The value of a result at an agent: its owner, and the texts that made up the container."""
+class RawValue(NamedTuple):
+    """The value of a result at an agent: its trigger's owner, and the container's cells as JSON."""
 
     owner: Owner
     cells: bytes
 
 
-class Carrier(Interpretation):
-    """Reads only the sequence number of a container, if ``layouts`` have one.
+class AgentInterpretation(Interpretation):
+    """An interpretation that does not read the container; its ``layouts`` are for ``@sequence``.
 
     Args:
         owner: owner of the trigger of the results.
@@ -57,25 +57,25 @@ class Carrier(Interpretation):
     """
 
     def __init__(
-        self, owner: Owner = NOBODY, layouts: Any = None, *, by_application: bool = False
+        self, owner: Owner = NO_OWNER, layouts: Any = None, *, by_application: bool = False
     ) -> None:
         super().__init__(layouts, lenient=True, y_down=False)
-        self._carried = Carried(owner, b"")
+        self._raw_value = RawValue(owner, b"")
         self.by_application = by_application
 
-    def of(self, owner: Owner) -> Carrier:
-        """Return a copy for another owner's trigger, which is cheaper than a new object."""
-        other = Carrier.__new__(Carrier)
-        other.__dict__ = {**self.__dict__, "_carried": new_tuple(Carried, (owner, b""))}
+    def for_owner(self, owner: Owner) -> AgentInterpretation:
+        """Return a copy for another owner's trigger; this is faster than a new object."""
+        other = AgentInterpretation.__new__(AgentInterpretation)
+        other.__dict__ = {**self.__dict__, "_raw_value": new_tuple(RawValue, (owner, b""))}
         return other
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
     ) -> Interpreted:
         if container.cells is None and container.fault is None:
-            return self._carried, None, 0
+            return self._raw_value, None, 0
         text = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
-        return self._carried._replace(cells=text), None, 0
+        return self._raw_value._replace(cells=text), None, 0
 
     def burst(
         self,
@@ -87,24 +87,24 @@ class Carrier(Interpretation):
         number: int,
         at: datetime,
     ) -> tuple[Sequence[Any], int]:
-        return [self._carried] * len(payloads), 0
+        return [self._raw_value] * len(payloads), 0
 
 
-class Tap(NamedTuple):
+class AgentCallbacks(NamedTuple):
     """The agent's callbacks for one of its cameras."""
 
-    results: Callable[[Sequence[Result[Carried]], bool, bool], None]
-    status: Callable[[Status], None]
-    event: Callable[[CameraEvent], None]
-    end: Callable[[], None]
-    taken: Callable[[], None]
+    on_results: Callable[[Sequence[Result[RawValue]], bool, bool], None]
+    on_status: Callable[[Status], None]
+    on_event: Callable[[CameraEvent], None]
+    on_end: Callable[[], None]
+    on_taken: Callable[[], None]
 
 
-class TappedListeners(Listeners):
-    """Passes everything to the agent, too."""
+class AgentListeners(Listeners):
+    """The listeners of an agent's client, which also call the agent's callbacks."""
 
     wants_all_changes = True
-    tap: Tap | None = None
+    callbacks: AgentCallbacks | None = None
 
     @property
     def only_streams_results(self) -> bool:
@@ -124,65 +124,68 @@ class TappedListeners(Listeners):
 
     def publish(self, event: CameraEvent) -> None:
         super().publish(event)
-        if self.tap is not None:
-            self.tap.event(event)
+        if self.callbacks is not None:
+            self.callbacks.on_event(event)
 
     def end(self, error: SmartCamError | None) -> None:
         super().end(error)
-        if self.tap is not None:
-            self.tap.end()
+        if self.callbacks is not None:
+            self.callbacks.on_end()
 
     def offer_status(self, status: Status, now: float) -> None:
-        Listeners.offer_status(self, status, now)  # super() would take longer than this
-        if self.tap is not None:
-            self.tap.status(status)
+        Listeners.offer_status(self, status, now)  # faster than super()
+        if self.callbacks is not None:
+            self.callbacks.on_status(status)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
         super().offer_burst(results, now, size)
-        if self.tap is not None:
-            self.tap.results(results, True, False)
+        if self.callbacks is not None:
+            self.callbacks.on_results(results, True, False)
 
     def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
         Listeners.offer_result(self, result, now, current=current, late=late)
-        if self.tap is not None:
-            self.tap.results((result,), current, late)
+        if self.callbacks is not None:
+            self.callbacks.on_results((result,), current, late)
 
 
-class SharedCamera(SmartCamera[Carried]):
+class SharedCamera(SmartCamera[RawValue]):
     """A camera that its agent shares.
 
     Args:
-        settings: validated options; their interpretation is for the programs.
-        tap: the agent's callbacks for the session.
-        observers: observers of the session; a result's value is a :class:`Carried`.
+        settings: validated options; only programs use their interpretation.
+        callbacks: the agent's callbacks for the session.
+        observers: observers of the session; a result's value is a :class:`RawValue`.
     """
 
     def __init__(
-        self, settings: CameraSettings, tap: Tap, observers: Iterable[Observer] = ()
+        self,
+        settings: CameraSettings,
+        callbacks: AgentCallbacks,
+        observers: Iterable[Observer] = (),
     ) -> None:
         super().__init__(settings, observers=observers)
-        self._listeners.tap = tap
-        self._supervisor.on_taken = tap.taken
+        self._listeners.callbacks = callbacks
+        self._supervisor.on_taken = callbacks.on_taken
 
-    _listeners: TappedListeners
+    _listeners: AgentListeners
 
     def _make_listeners(self) -> Listeners:
-        return TappedListeners(self.settings.name, self._observers)
+        return AgentListeners(self.settings.name, self._observers)
 
     def _make_state(self) -> CameraState:
         settings = self.settings
         return CameraState(settings.name, settings.application, self._listeners, shared=True)
 
     def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
-        return Carrier()
+        return AgentInterpretation()
 
     @property
-    def taken(self) -> bool:
+    def is_taken(self) -> bool:
         """True if another client has the camera."""
         return self._supervisor.taken
 
-    def take_again(self) -> None:
-        """Try again now if another client has the camera."""
+    def try_take_back(self) -> None:
+        """Try now to take the camera back if another client has it."""
         self._supervisor.take_back()
 
     @property
@@ -192,7 +195,7 @@ class SharedCamera(SmartCamera[Carried]):
 
     async def trigger_for(
         self, request: TriggerRequest, application: int | None, timeout: float
-    ) -> list[Result[Carried]]:
+    ) -> list[Result[RawValue]]:
         """Trigger for a program, like :meth:`trigger`.
 
         Args:
@@ -200,8 +203,8 @@ class SharedCamera(SmartCamera[Carried]):
             application: application that must run for the trigger; None for any.
             timeout: seconds of the timeout.
 
-        If the camera may still have input data queued, from a trigger without a result, the
-        application is loaded again first, which empties the queue.
+        The camera may still have queued input data of a trigger without a result. If so, and this
+        trigger has input data, the application is first loaded again, which empties the queue.
         """
         if not self._has_observers and request.input_data is None:
             return await self._trigger(application, request, timeout)
@@ -214,36 +217,36 @@ class SharedCamera(SmartCamera[Carried]):
 
     async def _trigger_in_order(
         self, application: int | None, request: TriggerRequest, timeout: float
-    ) -> list[Result[Carried]]:
+    ) -> list[Result[RawValue]]:
         if request.input_data is not None and self._results.input_in_doubt:
-            begun = self._deadline(0.0)
+            started_at = self._deadline(0.0)
             try:
                 await self._lock.load_again(lambda: self._results.input_in_doubt, timeout)
             except ResponseTimeoutError as exc:
                 text = f"{exc}; no trigger was sent"
                 raise TriggerTimeoutError(text, waited=exc.waited) from exc
-            timeout = max(0.0, timeout - (self._deadline(0.0) - begun))
+            timeout = max(0.0, timeout - (self._deadline(0.0) - started_at))
         return await self._trigger(application, request, timeout)
 
-    async def ensure(self, application: int, timeout: float) -> None:
-        """Load and run an application, like ``application=`` at the start."""
+    async def ensure_application(self, application: int, timeout: float) -> None:
+        """Make sure that an application is loaded and runs, like ``application=`` of connect()."""
         async with self._lock.hold(timeout) as deadline:
             await self._commands.ensure_running(application, deadline)
 
-    async def enter(self, application: int, timeout: float) -> Any:
-        """Switch like the start of :meth:`application`; return the argument for :meth:`leave`."""
+    async def enter_application(self, application: int, timeout: float) -> Any:
+        """Switch temporarily; return the argument for :meth:`leave_application`."""
         async with self._lock.hold(timeout) as deadline:
             return await self._lock.enter_application(application, deadline)
 
-    def leave(self, before: Any) -> None:
+    def leave_application(self, before: Any) -> None:
         """Switch back in the background."""
         self._lock.go_back(before)
 
-    async def leave_and_wait(self, before: Any) -> None:
-        """Switch back, and wait for the end."""
+    async def leave_application_and_wait(self, before: Any) -> None:
+        """Switch back, and wait until this is done."""
         await self._lock.go_back_and_wait(before)
 
-    async def refresh(self, timeout: float) -> bool:
+    async def refresh_status(self, timeout: float) -> bool:
         """Make sure that the last status is current; return whether the camera was asked."""
         deadline = self._deadline(timeout)
         self._require_session()

@@ -1,4 +1,4 @@
-"""Summarise all of an agent's cameras in one answer, without asking the cameras."""
+"""Summarize all cameras of an agent in one answer, from what the agent knows about them."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 CAMERAS_PER_TURN = 50
-"""Number of cameras that are written, or read, in one turn of the event loop."""
+"""Largest number of cameras in one part of an answer, which takes one turn of the event loop."""
 
 MAX_PATTERN_BYTES = 4096
-"""Largest number of bytes of a question."""
+"""Largest number of bytes of a question that are read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class ReportedCamera(NamedTuple):
         summary: the camera's state.
         epoch: number of the agent's start, or of its current hold of the camera.
         following: number of the camera's next result.
-        standby: whether the agent stands by for cameras that others have.
+        standby: whether the agent is a standby agent.
     """
 
     summary: CameraSummary
@@ -82,21 +82,21 @@ class Summaries:
 
     def __init__(self, agent: Agent, keys: Keys, bus: Bus) -> None:
         self._agent, self._keys, self._bus = agent, keys, bus
-        self._declared: Handle | None = None
+        self._handle: Handle | None = None
 
     def open(self) -> None:
         """Start to answer."""
         key = self._keys.summary(self._agent.name)
-        self._declared = self._bus.answer(key, self._on_question, patient=always)
+        self._handle = self._bus.answer(key, self._on_question, patient=always)
 
     def close(self) -> None:
         """Stop answering."""
-        if self._declared is not None:
-            self._declared.close()
+        if self._handle is not None:
+            self._handle.close()
 
     def _on_question(self, question: BusQuestion) -> None:
         pattern = str(question.payload[:MAX_PATTERN_BYTES], "utf-8", "replace") or "**"
-        self._agent.begin(self._answer(question, pattern), "smartcam.fleet.summary")
+        self._agent.start_task(self._answer(question, pattern), "smartcam.fleet.summary")
 
     async def _answer(self, question: BusQuestion, pattern: str) -> None:
         """Answer in parts, so that a thousand cameras do not block the event loop."""
@@ -104,10 +104,10 @@ class Summaries:
         try:
             hosts = [host for host in self._agent.hosts.values() if meets(pattern, host.name)]
             for begin in range(0, len(hosts), CAMERAS_PER_TURN):
-                cameras = [_row(host) for host in hosts[begin : begin + CAMERAS_PER_TURN]]
+                cameras = [_summary_row(host) for host in hosts[begin : begin + CAMERAS_PER_TURN]]
                 summary = {
                     "agent": self._agent.name,
-                    "standby": self._agent.stands_by,
+                    "standby": self._agent.is_standby,
                     "cameras": cameras,
                 }
                 question.reply(key, as_json(summary))
@@ -116,8 +116,8 @@ class Summaries:
             question.close()
 
 
-def _row(host: Host) -> list[Any]:
-    connected, status, application, reason = host.known()
+def _summary_row(host: Host) -> list[Any]:
+    connected, status, application, reason = host.session_state()
     return [
         host.name,
         int(connected),
@@ -133,7 +133,7 @@ def _row(host: Host) -> list[Any]:
 async def ask_cameras(
     bus: Bus, keys: Keys, agent: str, pattern: str, timeout: float
 ) -> list[ReportedCamera]:
-    """Return agents' answers on their cameras that come within ``timeout`` seconds.
+    """Ask agents for their cameras; return the answers that come within ``timeout`` seconds.
 
     Args:
         bus: an end of the bus.
@@ -146,31 +146,31 @@ async def ask_cameras(
     cameras: list[ReportedCamera] = []
     for _, payload in answers:
         try:
-            cameras += _read(payload)
+            cameras += _read_cameras(payload)
         except (ValueError, TypeError, KeyError, SmartCamError) as exc:
             logger.warning("%s ! an agent's cameras cannot be read: %s", keys.fleet, exc)
         await asyncio.sleep(0)
     return cameras
 
 
-def _read(payload: bytes) -> Iterable[ReportedCamera]:
+def _read_cameras(payload: bytes) -> Iterable[ReportedCamera]:
     listed: Any = json.loads(payload)
     agent, standby = str(listed["agent"]), bool(listed.get("standby"))
     cameras: list[ReportedCamera] = []
     for name, connected, status, application, holder, reason, epoch, following in listed["cameras"]:
-        word = None if status is None else Status(status)
-        summary = CameraSummary(name, agent, bool(connected), word, application, holder, reason)
+        bits = None if status is None else Status(status)
+        summary = CameraSummary(name, agent, bool(connected), bits, application, holder, reason)
         cameras.append(ReportedCamera(summary, int(epoch), int(following), standby))
     return cameras
 
 
-def by_name(
-    cameras: Iterable[ReportedCamera], better: Callable[[ReportedCamera], Any]
+def best_by_name(
+    cameras: Iterable[ReportedCamera], sort_key: Callable[[ReportedCamera], Any]
 ) -> dict[str, Any]:
-    """Return one camera for each name: if two agents have it for a moment, the better one."""
+    """Return one camera for each name: if two agents have it, the one with the highest key."""
     reported: dict[str, ReportedCamera] = {}
     for camera in cameras:
         known = reported.get(camera.summary.camera)
-        if known is None or better(camera) > better(known):
+        if known is None or sort_key(camera) > sort_key(known):
             reported[camera.summary.camera] = camera
     return reported

@@ -1,7 +1,7 @@
-"""Tasks that carry out one trigger after another.
+"""Keep tasks that carry out one trigger after another.
 
-A new task takes its first step in the next turn of the event loop. A worker that waits takes it at
-once, so that the camera is triggered in the turn in which the call came.
+A new task takes its first step in the next turn of the event loop. A waiting worker begins at once,
+so that the camera is triggered in the same turn in which the call came.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class TriggerWorker:
     """A task that does one piece of work after another.
 
     Args:
-        workers: the workers that it belongs to.
+        workers: the workers of the agent, to which this one belongs.
 
     Attributes:
-        task: the task. It may be cancelled at its work, which ends it.
+        task: the worker's task; cancelling it ends the worker.
     """
 
     def __init__(self, workers: Workers) -> None:
@@ -35,8 +35,8 @@ class TriggerWorker:
         self._work: Callable[[], Awaitable[None]] | None = None
         self.task: asyncio.Task[None] = loop.create_task(self._run(), name="smartcam.fleet.worker")
 
-    def do(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Do one piece of work; begin at once if the worker waits and no other task runs."""
+    def start_work(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Give the worker one piece of work; a waiting worker begins at once if no task runs."""
         self._work = work
         self._bell.ring()
 
@@ -47,7 +47,7 @@ class TriggerWorker:
                 await self._bell
                 continue
             await work()
-            if not self._workers.keep(self):
+            if not self._workers.keep_worker(self):
                 return
 
 
@@ -55,12 +55,12 @@ class Workers:
     """The workers of an agent."""
 
     def __init__(self) -> None:
-        self._idle: list[TriggerWorker] | None = []  # None: closed
+        self._idle: list[TriggerWorker] | None = []  # None after close()
 
-    def take(self) -> TriggerWorker:
+    def get_worker(self) -> TriggerWorker:
         """Return a worker that has nothing to do; give it work before the next turn of the loop.
 
-        A worker that was cancelled after its work, or at its end, would never begin the next one.
+        Workers that were cancelled are left out: they would never begin the work.
         """
         while self._idle:
             worker = self._idle.pop()
@@ -68,15 +68,15 @@ class Workers:
                 return worker
         return TriggerWorker(self)
 
-    def keep(self, worker: TriggerWorker) -> bool:
-        """Keep a worker for further work; return False if it is not needed."""
+    def keep_worker(self, worker: TriggerWorker) -> bool:
+        """Keep a worker for further work; return False if there are enough, and it must end."""
         if self._idle is None or len(self._idle) >= MAX_IDLE_WORKERS:
             return False
         self._idle.append(worker)
         return True
 
     def close(self) -> list[asyncio.Task[None]]:
-        """Cancel the workers that wait, and keep none any more; return their tasks. Idempotent."""
+        """Cancel the waiting workers, and keep none from now on; return their tasks. Idempotent."""
         idle, self._idle = self._idle or (), None
         for worker in idle:
             worker.task.cancel()

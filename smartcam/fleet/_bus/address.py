@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 7447
 CERTIFICATES = "SMARTCAM_FLEET_CERTIFICATES"
-"""Variable of the environment with the folder of certificates, if the URL names none."""
+"""Environment variable with the folder of certificates, for URLs that name no folder."""
 
 CERTIFICATE_FILES = ("ca.pem", "cert.pem", "key.pem")
 
@@ -79,7 +79,7 @@ def check_pattern(pattern: str) -> str:
 
 
 def missing_certificates(folder: Path) -> str:
-    """Return a text on the missing files of a folder of certificates; empty if there are none."""
+    """Return a text that names the missing files of a folder of certificates; empty if complete."""
     missing = [name for name in CERTIFICATE_FILES if not (folder / name).is_file()]
     return f"{folder} has no {', no '.join(missing)}" if missing else ""
 
@@ -91,7 +91,7 @@ class FleetAddress(NamedTuple):
         scheme: ``fleet``, or ``fleet+tls``.
         host: name or address of an agent, or of a router.
         port: port of the agent, or of the router.
-        fleet: name of the fleet; None: the only one.
+        fleet: name of the fleet; None: the only fleet there.
         camera: name of the camera; empty for the fleet.
         certificates: folder with the certificates of this program, for ``fleet+tls``.
         program: name of this program for people, such as ``robot1``; None: the script's name.
@@ -134,8 +134,8 @@ class FleetAddress(NamedTuple):
             )
         if not _HOST.fullmatch(parts.hostname):
             raise ConfigurationError(f"{label}: {parts.hostname!r:.80} is no host")
-        wrong = {"a user": "@" in parts.netloc, "a fragment": parts.fragment, "port 0": port == 0}
-        for part, present in wrong.items():
+        refused = {"a user": "@" in parts.netloc, "a fragment": parts.fragment, "port 0": port == 0}
+        for part, present in refused.items():
             if present:
                 raise ConfigurationError(f"{label} has {part}, which means nothing")
         query: dict[str, str] = {}
@@ -152,7 +152,7 @@ class FleetAddress(NamedTuple):
         if camera:
             check_name(camera, f"{label}: camera")
         fleet = check_word(query["fleet"], f"{label}: fleet") if "fleet" in query else None
-        called = check_word(query["program"], f"{label}: program") if "program" in query else None
+        program = check_word(query["program"], f"{label}: program") if "program" in query else None
         tls = parts.scheme == "fleet+tls"
         certificates = query.get("certificates") or (os.environ.get(CERTIFICATES) if tls else None)
         if tls and not certificates:
@@ -161,7 +161,7 @@ class FleetAddress(NamedTuple):
             )
         if "certificates" in query and not tls:
             raise ConfigurationError(f"{label}: certificates are for fleet+tls://")
-        return cls(parts.scheme, parts.hostname, port, fleet, camera, certificates, called)
+        return cls(parts.scheme, parts.hostname, port, fleet, camera, certificates, program)
 
     @property
     def link(self) -> BusLink:
@@ -172,12 +172,12 @@ class FleetAddress(NamedTuple):
 
     def of(self, camera: str) -> Address:
         """Return the address of a camera of the fleet."""
-        given = {} if self.fleet is None else {"fleet": self.fleet}
+        options = {} if self.fleet is None else {"fleet": self.fleet}
         if self.certificates is not None:
-            given["certificates"] = self.certificates
+            options["certificates"] = self.certificates
         if self.program is not None:
-            given["program"] = self.program
-        parameters = tuple(given.items())
+            options["program"] = self.program
+        parameters = tuple(options.items())
         return Address("fleet", self.scheme, self.host, self.port, None, (), parameters, camera)
 
     @property

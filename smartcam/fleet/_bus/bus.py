@@ -1,4 +1,4 @@
-"""The bus of a fleet: programs and agents send messages under keys, and receive others'.
+"""Define the bus of a fleet, on which programs and agents exchange messages under keys.
 
 A key is chunks joined by ``/``; in a pattern ``*`` is one chunk and ``**`` any number of them. A
 message reaches each subscriber in the order of sending, or not at all: a bus may lose messages, and
@@ -37,7 +37,7 @@ def always(_: str) -> bool:
 
 
 class Handle(abc.ABC):
-    """A declaration that lasts until it is closed."""
+    """A subscription, or another declaration on the bus, that lasts until it is closed."""
 
     @abc.abstractmethod
     def close(self) -> None:
@@ -120,7 +120,8 @@ class Bus(abc.ABC):
         Args:
             key: key of the messages.
             on_subscribers: callback for whether the key has subscribers, when that changes.
-            urgent: whether messages wait in one line with messages of :meth:`put`; else after them.
+            urgent: whether messages wait in one queue with messages of :meth:`put`; else after
+                them.
         """
 
     @abc.abstractmethod
@@ -132,7 +133,7 @@ class Bus(abc.ABC):
         Args:
             pattern: pattern of the keys.
             on_message: the callback.
-            patient: whether messages wait after all others, with a bound of their own.
+            patient: whether messages wait until all others were received, within an own bound.
         """
 
     @abc.abstractmethod
@@ -198,8 +199,8 @@ class BusQuestion(abc.ABC):
 class MemoryBus:
     """A bus inside this process, for agents and programs in one event loop.
 
-    Hand ``MemoryBus().end()`` to each as its ``bus``. Deliveries are calls of the event loop, in
-    order.
+    Each agent and program gets its own ``MemoryBus().end()``. Messages are delivered by the event
+    loop, in order.
     """
 
     def __init__(self) -> None:
@@ -217,69 +218,73 @@ class _Patterned(Protocol):
 P = TypeVar("P", bound=_Patterned)
 
 
-class _ByPattern(Generic[P]):
-    """The declarations of one kind at an end, by pattern, to find the few that match a key."""
+class _PatternTable(Generic[P]):
+    """The declarations of one kind at an end, by pattern, so that a key's are found fast."""
 
     def __init__(self) -> None:
-        self._exact: dict[str, dict[P, None]] = {}
-        self._wild: dict[P, None] = {}
+        self._exact_keys: dict[str, dict[P, None]] = {}
+        self._wildcards: dict[P, None] = {}
 
     def __iter__(self) -> Iterator[P]:
-        for same in (*self._exact.values(), self._wild):
-            yield from tuple(same)
+        for entries in (*self._exact_keys.values(), self._wildcards):
+            yield from tuple(entries)
 
     def __contains__(self, entry: P) -> bool:
-        return entry in self._wild or entry in self._exact.get(entry.pattern, ())
+        return entry in self._wildcards or entry in self._exact_keys.get(entry.pattern, ())
 
     def add(self, entry: P) -> None:
-        same = self._wild if "*" in entry.pattern else self._exact.setdefault(entry.pattern, {})
-        same[entry] = None
+        entries = (
+            self._wildcards
+            if "*" in entry.pattern
+            else self._exact_keys.setdefault(entry.pattern, {})
+        )
+        entries[entry] = None
 
     def remove(self, entry: P) -> None:
-        self._wild.pop(entry, None)
-        same = self._exact.get(entry.pattern, {})
-        same.pop(entry, None)
-        if not same:
-            self._exact.pop(entry.pattern, None)
+        self._wildcards.pop(entry, None)
+        entries = self._exact_keys.get(entry.pattern, {})
+        entries.pop(entry, None)
+        if not entries:
+            self._exact_keys.pop(entry.pattern, None)
 
     def clear(self) -> None:
-        self._exact.clear()
-        self._wild.clear()
+        self._exact_keys.clear()
+        self._wildcards.clear()
 
-    def meeting(self, pattern: str) -> list[P]:
+    def matching(self, pattern: str) -> list[P]:
         """Return the entries whose patterns overlap with a pattern or a key."""
         if "*" in pattern:
             return [entry for entry in self if meets(entry.pattern, pattern)]
-        wild = [entry for entry in self._wild if meets(entry.pattern, pattern)]
-        return [*self._exact.get(pattern, ()), *wild]
+        wild = [entry for entry in self._wildcards if meets(entry.pattern, pattern)]
+        return [*self._exact_keys.get(pattern, ()), *wild]
 
 
-class _MemoryDeclared(Handle):
+class _MemoryDeclaration(Handle):
     """A declaration of an end under a pattern."""
 
     def __init__(
-        self, place: _ByPattern[_MemoryDeclared], pattern: str, call: Callable[..., None]
+        self, table: _PatternTable[_MemoryDeclaration], pattern: str, call: Callable[..., None]
     ) -> None:
         self.pattern = pattern
         self.call = call
-        self._place = place
-        self._after: Callable[[], None] = _nothing
-        place.add(self)
+        self._table = table
+        self._on_close: Callable[[], None] = _do_nothing
+        table.add(self)
 
-    def then(self, after: Callable[[], None]) -> Self:
-        """Call ``after`` once the declaration is closed."""
-        self._after = after
+    def on_close(self, callback: Callable[[], None]) -> Self:
+        """Call ``callback`` when the declaration is closed; return the declaration."""
+        self._on_close = callback
         return self
 
     @property
     def closed(self) -> bool:
         """True once the declaration is closed."""
-        return self not in self._place
+        return self not in self._table
 
     def close(self) -> None:
         if not self.closed:
-            self._place.remove(self)
-            self._after()
+            self._table.remove(self)
+            self._on_close()
 
 
 class MemoryEnd(Bus):
@@ -289,16 +294,18 @@ class MemoryEnd(Bus):
 
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
-        self.part_subscriptions: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
-        self.subscriptions: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
-        self.answered: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
-        self.watched: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
-        self.present_here: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
-        self.publishers: _ByPattern[_MemoryPublisher] = _ByPattern[_MemoryPublisher]()
+        self.part_subscriptions: _PatternTable[_MemoryDeclaration] = _PatternTable[
+            _MemoryDeclaration
+        ]()
+        self.subscriptions: _PatternTable[_MemoryDeclaration] = _PatternTable[_MemoryDeclaration]()
+        self.answerers: _PatternTable[_MemoryDeclaration] = _PatternTable[_MemoryDeclaration]()
+        self.watchers: _PatternTable[_MemoryDeclaration] = _PatternTable[_MemoryDeclaration]()
+        self.presences: _PatternTable[_MemoryDeclaration] = _PatternTable[_MemoryDeclaration]()
+        self.publishers: _PatternTable[_MemoryPublisher] = _PatternTable[_MemoryPublisher]()
 
     @property
     def attached(self) -> bool:
-        """True if this end is on the bus now: open, and not cut off."""
+        """True if this end is on the bus now: opened, and not detached."""
         return self in self._bus.ends
 
     @property
@@ -312,15 +319,15 @@ class MemoryEnd(Bus):
 
     async def close(self) -> None:
         self.detach()
-        places = (
+        tables = (
             self.subscriptions,
             self.part_subscriptions,
-            self.answered,
-            self.watched,
-            self.present_here,
+            self.answerers,
+            self.watchers,
+            self.presences,
         )
-        for place in places:
-            place.clear()
+        for table in tables:
+            table.clear()
 
     def attach(self) -> None:
         """Join the bus, or join it again."""
@@ -330,24 +337,24 @@ class MemoryEnd(Bus):
             self._check_subscribers("**")
 
     def detach(self) -> None:
-        """Leave the bus like after a broken cable: both sides lose each other."""
+        """Leave the bus as if a cable broke: this end and the others lose each other."""
         if self.attached:
             self._report_presences(False)
             self._bus.ends.remove(self)
             self._check_subscribers("**")
 
     def put(self, key: str, payload: bytes) -> None:
-        for end in self._others():
-            for subscription in end.subscriptions.meeting(key):
+        for end in self._connected_ends():
+            for subscription in end.subscriptions.matching(key):
                 self._loop.call_soon(_call, subscription, key, payload)
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
-        for end in self._others():
-            for subscription in end.part_subscriptions.meeting(key):
+        for end in self._connected_ends():
+            for subscription in end.part_subscriptions.matching(key):
                 self._loop.call_soon(_call, subscription, key, head, data)
 
     def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
-        return _MemoryDeclared(self.part_subscriptions, pattern, on_part)
+        return _MemoryDeclaration(self.part_subscriptions, pattern, on_part)
 
     def publisher(
         self,
@@ -361,9 +368,9 @@ class MemoryEnd(Bus):
     def subscribe(
         self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        made = _MemoryDeclared(self.subscriptions, pattern, on_message)
+        declaration = _MemoryDeclaration(self.subscriptions, pattern, on_message)
         self._check_subscribers(pattern)
-        return made.then(lambda: self._check_subscribers(pattern))
+        return declaration.on_close(lambda: self._check_subscribers(pattern))
 
     def answer(
         self,
@@ -372,13 +379,13 @@ class MemoryEnd(Bus):
         *,
         patient: Callable[[str], bool] = never,
     ) -> Handle:
-        return _MemoryDeclared(self.answered, pattern, answer)
+        return _MemoryDeclaration(self.answerers, pattern, answer)
 
     async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
         questions = [
             (answerer, _MemoryQuestion(pattern, payload))
-            for end in self._others()
-            for answerer in end.answered.meeting(pattern)
+            for end in self._connected_ends()
+            for answerer in end.answerers.matching(pattern)
         ]
         for answerer, question in questions:
             self._loop.call_soon(_call, answerer, question)
@@ -389,69 +396,71 @@ class MemoryEnd(Bus):
         return [answer for _, question in questions for answer in question.answers]
 
     def be_present(self, key: str) -> Handle:
-        made = _MemoryDeclared(self.present_here, key, _nothing)
+        declaration = _MemoryDeclaration(self.presences, key, _do_nothing)
         self._report_presence(key, True)
-        return made.then(lambda: self._report_presence(key, False))
+        return declaration.on_close(lambda: self._report_presence(key, False))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
         return [
-            token.pattern for end in self._others() for token in end.present_here.meeting(pattern)
+            token.pattern
+            for end in self._connected_ends()
+            for token in end.presences.matching(pattern)
         ]
 
     def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
-        made = _MemoryDeclared(self.watched, pattern, on_presence)
-        for end in self._others():
-            for token in end.present_here.meeting(pattern):
-                self._loop.call_soon(_call, made, token.pattern, True)
-        return made
+        declaration = _MemoryDeclaration(self.watchers, pattern, on_presence)
+        for end in self._connected_ends():
+            for token in end.presences.matching(pattern):
+                self._loop.call_soon(_call, declaration, token.pattern, True)
+        return declaration
 
-    # ------------------------------------------------------------------ among ends
+    # ------------------------------------------------------------------ presence and subscribers
 
-    def _others(self) -> list[MemoryEnd]:
-        """Return the ends that receive from this one: all on the bus, including itself."""
+    def _connected_ends(self) -> list[MemoryEnd]:
+        """Return all ends on the bus, including this one; none if this end is not on the bus."""
         return list(self._bus.ends) if self.attached else []
 
     def _report_presences(self, present: bool) -> None:
         """Report this end's presences to all ends, and theirs to this one."""
-        for end in self._others():
-            for token in end.present_here:
+        for end in self._connected_ends():
+            for token in end.presences:
                 if end is not self:
-                    for watch in self.watched.meeting(token.pattern):
+                    for watch in self.watchers.matching(token.pattern):
                         self._loop.call_soon(_call, watch, token.pattern, present)
-        for token in self.present_here:
+        for token in self.presences:
             self._report_presence(token.pattern, present)
 
     def _report_presence(self, key: str, present: bool) -> None:
-        for end in self._others():
-            for watcher in end.watched.meeting(key):
+        for end in self._connected_ends():
+            for watcher in end.watchers.matching(key):
                 self._loop.call_soon(_call, watcher, key, present)
 
     def _check_subscribers(self, pattern: str) -> None:
         """Make the publishers under a pattern check for subscribers."""
         for end in self._bus.ends:
-            for publisher in end.publishers.meeting(pattern):
-                publisher.look()
+            for publisher in end.publishers.matching(pattern):
+                publisher.check_subscribers()
 
     def has_subscribers(self, key: str) -> bool:
         """Return True if this end's messages under ``key`` have a subscriber."""
-        return any(end.subscriptions.meeting(key) for end in self._others())
+        return any(end.subscriptions.matching(key) for end in self._connected_ends())
 
 
 class _MemoryPublisher(Publisher):
     def __init__(
         self,
         end: MemoryEnd,
-        place: _ByPattern[_MemoryPublisher],
+        table: _PatternTable[_MemoryPublisher],
         key: str,
         on_subscribers: Callable[[bool], None] | None,
     ) -> None:
         self.pattern = key
-        self._end, self._place = end, place
+        self._end, self._table = end, table
         self._on_subscribers = on_subscribers
-        place.add(self)
-        self.look()
+        table.add(self)
+        self.check_subscribers()
 
-    def look(self) -> None:
+    def check_subscribers(self) -> None:
         """Check for subscribers, and report a change."""
         has_subscribers = self._end.has_subscribers(self.pattern)
         if has_subscribers != self.has_subscribers:
@@ -463,7 +472,7 @@ class _MemoryPublisher(Publisher):
         self._end.put(self.pattern, payload)
 
     def close(self) -> None:
-        self._place.remove(self)
+        self._table.remove(self)
 
 
 class _MemoryQuestion(BusQuestion):
@@ -480,11 +489,11 @@ class _MemoryQuestion(BusQuestion):
         self.done.set()
 
 
-def _call(declared: _MemoryDeclared, *arguments: object) -> None:
-    """Call a callback of an open declaration; log its error."""
+def _call(declared: _MemoryDeclaration, *arguments: object) -> None:
+    """Call the callback of a declaration, unless the declaration is closed."""
     if not declared.closed:
         declared.call(*arguments)
 
 
-def _nothing(*_: object) -> None:
+def _do_nothing(*_: object) -> None:
     pass

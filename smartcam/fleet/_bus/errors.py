@@ -20,9 +20,10 @@ MAX_CHAIN = 8
 
 
 def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
-    """Return an error as JSON; one of an unknown class has its nearest known base class."""
-    known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _KINDS), None)
-    if known is None:
+    """Return an error as fields for JSON; its ``kind`` is its class, or the nearest known base."""
+    names = (base.__name__ for base in type(error).__mro__)
+    kind = next((name for name in names if name in _ERROR_CLASSES), None)
+    if kind is None:
         fields: dict[str, Any] = {
             "kind": SmartCamError.__name__,
             "text": f"{type(error).__name__}: {error}",
@@ -30,7 +31,7 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
     else:
         # the text of a KeyError is its argument in quotes
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        fields = {"kind": known, "text": str(text)}
+        fields = {"kind": kind, "text": str(text)}
     values = vars(error) if isinstance(error, SmartCamError) else {}
     attributes = {name: _as_json(value) for name, value in values.items() if name[0] != "_"}
     if attributes:
@@ -41,7 +42,7 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
 
 
 def from_fields(fields: Any) -> SmartCamError:
-    """Return the error in ``fields``."""
+    """Return the error that ``fields`` describe."""
     error = _from_fields(fields)
     if isinstance(error, SmartCamError):
         return error
@@ -52,25 +53,25 @@ def _from_fields(fields: Any) -> BaseException:
     if not isinstance(fields, dict):
         return RemoteProtocolError(f"the agent's error is not valid: {fields!r:.80}")
     known = cast("dict[str, Any]", fields)
-    error = _KINDS.get(str(known.get("kind")), SmartCamError)(str(known.get("text", "")))
+    error = _ERROR_CLASSES.get(str(known.get("kind")), SmartCamError)(str(known.get("text", "")))
     attributes: Any = known.get("attributes")
     if isinstance(attributes, dict):
         for name, value in cast("dict[str, Any]", attributes).items():
             if name in vars(error):  # the class's own attributes, with their defaults
-                setattr(error, name, _meant(value))
+                setattr(error, name, _from_json(value))
     if "cause" in known:
         error.__cause__ = _from_fields(known["cause"])
     return error
 
 
 def _as_json(value: object) -> Any:
-    """Return an attribute's value as JSON, which has no tuples and no bytes."""
+    """Return an attribute's value for JSON: a tuple, or bytes, as an object that names the type."""
     if isinstance(value, (tuple, bytes)):
         return {type(value).__name__: jsonable(value)}
     return jsonable(value)
 
 
-def _meant(value: Any) -> Any:
+def _from_json(value: Any) -> Any:
     if isinstance(value, dict):
         pair = cast("dict[str, Any]", value)
         if pair.keys() == {"tuple"} and isinstance(pair["tuple"], list):
@@ -81,7 +82,7 @@ def _meant(value: Any) -> Any:
     return cast("object", value)
 
 
-_KINDS: dict[str, type[BaseException]] = {
+_ERROR_CLASSES: dict[str, type[BaseException]] = {
     **{
         name: kind
         for name, kind in vars(builtins).items()
@@ -94,10 +95,10 @@ _KINDS: dict[str, type[BaseException]] = {
         if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
     },
 }
-"""Classes of errors from the bus: smartcam's and, for causes, the system's."""
+"""Classes of errors that cross the bus: smartcam's, and Python's for causes."""
 
 
-def late(action: str, text: str) -> SmartCamError:
+def late_call_error(action: str, text: str) -> SmartCamError:
     """Return the error of a call whose deadline has passed before it was carried out."""
-    kind = TriggerTimeoutError if "trigger" in action.lower() else ResponseTimeoutError
-    return kind(text)
+    error_class = TriggerTimeoutError if "trigger" in action.lower() else ResponseTimeoutError
+    return error_class(text)

@@ -1,4 +1,4 @@
-"""The keys of a fleet, and the matching of patterns. ``docs/bus.md`` lists the keys."""
+"""Define the keys of a fleet, and match patterns of keys. ``docs/bus.md`` lists the keys."""
 
 from __future__ import annotations
 
@@ -36,52 +36,56 @@ COMMANDS = frozenset(
         "trigger_frame",
     }
 )
-"""Calls that change something, or keep others from doing so; all others are questions."""
+"""Calls that change something, or reserve the camera; all other calls are questions."""
 
-FENCED = COMMANDS - {"release", "leave"}
-"""Commands that name and need the reservation in whose block they are called."""
+RESERVED_COMMANDS = COMMANDS - {"release", "leave"}
+"""Commands that name the reservation in whose block they are called, and fail if it is lost."""
 
 
 @lru_cache(maxsize=4096)
 def meets(one: str, other: str) -> bool:
-    """Return True if two patterns share a key: ``*`` is one chunk, ``**`` any number."""
-    return _meet(tuple(one.split("/")), tuple(other.split("/")))
+    """Return True if some key matches both patterns: ``*`` is one chunk, ``**`` any number."""
+    return _patterns_overlap(tuple(one.split("/")), tuple(other.split("/")))
 
 
-def _meet(one: Sequence[str], other: Sequence[str]) -> bool:
-    """Return True if the chunks of two patterns meet, in as many steps as pairs of chunks."""
-    # for each beginning of the other pattern: whether it matches the chunks of the first pattern so
-    # far
+def _patterns_overlap(one: Sequence[str], other: Sequence[str]) -> bool:
+    """Return True if some key matches both patterns; needs one step for each pair of chunks."""
+    # for each prefix of the other pattern: whether it overlaps with the first pattern's prefix
     row: list[bool] = [True]
     for chunk in other:
         row.append(row[-1] and chunk == "**")
     for chunk in one:
-        before, row = row, [row[0] and chunk == "**"]
-        for place, following in enumerate(other):
-            if "**" in (chunk, following):
-                row.append(before[place + 1] or row[-1])
+        previous_row, row = row, [row[0] and chunk == "**"]
+        for index, other_chunk in enumerate(other):
+            if "**" in (chunk, other_chunk):
+                row.append(previous_row[index + 1] or row[-1])
             else:
-                row.append(before[place] and _same(chunk, following))
+                row.append(previous_row[index] and _chunks_overlap(chunk, other_chunk))
     return row[-1]
 
 
-def _same(one: str, other: str) -> bool:
-    return one == other or "*" in {one, other} or _fits(one, other) or _fits(other, one)
+def _chunks_overlap(one: str, other: str) -> bool:
+    return (
+        one == other
+        or "*" in {one, other}
+        or _chunk_matches(one, other)
+        or _chunk_matches(other, one)
+    )
 
 
-def _fits(pattern: str, chunk: str) -> bool:
-    """Return True if a chunk fits a pattern such as ``cam$*``, which the engine has, too."""
+def _chunk_matches(pattern: str, chunk: str) -> bool:
+    """Return True if a chunk matches a pattern in the engine's form, such as ``cam$*``."""
     first, *parts = pattern.split("$*")
     if not parts or not chunk.startswith(first):
         return False
     *parts, last = parts
-    place = len(first)
-    for part in parts:  # each as early as possible, which leaves most room for the others
-        place = chunk.find(part, place)
-        if place < 0:
+    position = len(first)
+    for part in parts:  # match each part as early as possible
+        position = chunk.find(part, position)
+        if position < 0:
             return False
-        place += len(part)
-    return len(chunk) - place >= len(last) and chunk.endswith(last)
+        position += len(part)
+    return len(chunk) - position >= len(last) and chunk.endswith(last)
 
 
 class Keys:
@@ -99,19 +103,19 @@ class Keys:
         self.root: str = f"{ROOT}/{fleet}"
 
     def agent(self, agent: str) -> str:
-        """Presence of an agent."""
+        """Return the key under which an agent is present."""
         return f"{self.root}/presence/agent/{agent}"
 
     def start(self, agent: str, start: str) -> str:
-        """Presence of one start of an agent, by which two agents of one name see each other."""
+        """Return the key of one start of an agent, which shows two agents with the same name."""
         return f"{self.root}/presence/start/{agent}/{start}"
 
     def camera(self, agent: str, camera: str) -> str:
-        """Presence of a camera at its agent, connected or not."""
+        """Return the key under which a camera is present at its agent, connected or not."""
         return f"{self.root}/presence/camera/{agent}/{camera}"
 
     def program(self, program: str) -> str:
-        """Presence of a calling program; ``program`` is its name and its secret."""
+        """Return the key under which a program is present; ``program``: its name and secret."""
         return f"{self.root}/presence/program/{program}"
 
     def command(self, agent: str, camera: str) -> str:
@@ -143,7 +147,7 @@ class Keys:
         return f"{self.root}/results/{camera}"
 
     def bundle(self, agent: str) -> str:
-        """Return the key of the results of all cameras of an agent, together."""
+        """Return the key of an agent's bundles, which have the results of all its cameras."""
         return f"{self.root}/bundle/{agent}"
 
     def summary(self, agent: str) -> str:
@@ -167,11 +171,11 @@ class Keys:
         return f"{self.root}/service/{camera}/{name}"
 
     def thesis(self, name: str) -> str:
-        """Return the key of a service of the thesis' interface."""
+        """Return the key of a service of the bus interface that the thesis defines."""
         return f"{self.root}/thesis/{name}"
 
     def thesis_topic(self, name: str) -> str:
-        """Return the key of a topic that a request names."""
+        """Return the key of a topic whose name a request of that interface gives."""
         return f"{self.root}/thesis/topic/{name}"
 
     def tail(self, key: str, kind: str) -> list[str]:

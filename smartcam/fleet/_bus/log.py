@@ -1,8 +1,8 @@
-"""Numbered messages of one camera: kept by its agent, and put in order by their receiver.
+"""Keep numbered messages of one camera at its agent, and put them in order at their receiver.
 
 An agent numbers its messages without gaps and keeps the last ones (:class:`AgentLog`). A receiver
 (:class:`Feed`) takes each number once and in order: it drops repetitions, and asks for missing
-messages. Those that the agent no longer has are missed, and their number is known.
+messages. Messages that the agent no longer has are counted as missed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 MAX_EPOCHS_REMEMBERED = 16
-"""Largest number of earlier epochs whose next numbers are remembered."""
+"""Largest number of earlier epochs (starts of an agent) whose next numbers are remembered."""
 
 
 class Numbered(Protocol):
@@ -24,12 +24,12 @@ class Numbered(Protocol):
 
     @property
     def number(self) -> int:
-        """The number of the first one."""
+        """The number of the first message."""
         ...
 
     @property
     def next(self) -> int:
-        """The number after the last one."""
+        """The number that follows the last message's."""
         ...
 
     @property
@@ -42,15 +42,16 @@ class Numbered(Protocol):
         ...
 
 
-_Kept = tuple[int, int, float, bytes]
-"""A number, the one after the entry's last, the clock, and the entry; each message makes one."""
+_LogEntry = tuple[int, int, float, bytes]
+"""An entry of a log: its first number, the number after its last, its clock time, and its bytes."""
 
 
 class LogPart(NamedTuple):
     """A part of a log.
 
     Attributes:
-        first: first number of the part; later than the requested one if that is no longer kept.
+        first: first number of the part, which is later than the requested number if that number is
+            no longer kept.
         data: the kept entries, one after the other.
         following: the agent's next number.
     """
@@ -64,17 +65,17 @@ class AgentLog:
     """The last messages of an agent about one camera, as bytes; bounded.
 
     Args:
-        most: largest number of kept messages.
-        most_bytes: largest number of kept bytes; the last entry is always kept.
+        max_messages: largest number of kept messages.
+        max_bytes: largest number of kept bytes; the last entry is always kept.
 
     Attributes:
         following: number of the next message, from 1.
     """
 
-    def __init__(self, most: int, most_bytes: int) -> None:
+    def __init__(self, max_messages: int, max_bytes: int) -> None:
         self.following: int = 1
-        self._most, self._most_bytes = most, most_bytes
-        self._entries: collections.deque[_Kept] = collections.deque()
+        self._max_messages, self._max_bytes = max_messages, max_bytes
+        self._entries: collections.deque[_LogEntry] = collections.deque()
         self._bytes = 0
 
     @property
@@ -83,7 +84,7 @@ class AgentLog:
         return self._entries[0][0] if self._entries else self.following
 
     @property
-    def kept(self) -> int:
+    def kept_count(self) -> int:
         """Number of kept messages."""
         return self.following - self.first
 
@@ -98,24 +99,24 @@ class AgentLog:
         following = self.following = number + count
         entries.append((number, following, clock, data))
         size = self._bytes + len(data)
-        while following - entries[0][1] >= self._most or size > self._most_bytes:
+        while following - entries[0][1] >= self._max_messages or size > self._max_bytes:
             if len(entries) == 1:
                 break
             size -= len(entries.popleft()[3])
         self._bytes = size
 
-    def part(self, first: int, most_bytes: int) -> LogPart:
-        """Return the entries from ``first`` on: up to ``most_bytes`` bytes, and at least one.
+    def read_part(self, first: int, max_bytes: int) -> LogPart:
+        """Return entries from number ``first`` on: up to ``max_bytes`` bytes, at least one entry.
 
-        An entry that contains ``first`` is returned completely.
+        The entry that contains ``first`` is returned whole, with its earlier messages.
         """
         begin = max(first, self.first)
         parts: list[bytes] = []
         for _, following, _, data in self._entries:
             if following <= begin:
                 continue
-            most_bytes -= len(data)
-            if parts and most_bytes < 0:
+            max_bytes -= len(data)
+            if parts and max_bytes < 0:
                 break
             parts.append(data)
         return LogPart(begin, parts, self.following)
@@ -134,168 +135,169 @@ NumberedT = TypeVar("NumberedT", bound=Numbered)
 
 
 class Feed(Generic[NumberedT]):
-    """The messages of one camera's agent, put in order.
+    """Puts the messages of one camera's agent in order.
 
     Args:
-        take: function that is called with each message once, in order of the numbers.
-        miss: function that is called with the number of missed messages, and the message after
-            them; None without one.
-        lacks: function that is called if a message is missing; then the feed's owner should ask
-            the agent for messages from ``expected`` on, and :meth:`fill` them in.
-        most_held: largest number of bytes of messages that wait for a missing one; further ones are
-            dropped, and requested later.
-        returns: whether an epoch that comes again after another one continues at its next number;
-            missing messages of an epoch that ends are reported.
+        on_message: callback for each message, once, in order of the numbers.
+        on_missed: callback for missed messages: their count, and the message after them or None.
+        on_gap: callback for a missing message. The feed's owner then asks the agent for messages
+            from ``expected`` on, and adds them by :meth:`fill`.
+        max_held_bytes: largest number of bytes of messages that wait for a missing one; further
+            messages are dropped, and requested later.
+        resumes_epochs: whether an epoch that begins again after another epoch goes on at its next
+            number; then messages that are missing when an epoch ends are reported as missed.
 
     Attributes:
         epoch: number of the agent's start; 0 before the first.
         expected: number of the next message; 0 if that is not known yet.
-        lacking: whether a message is missing and awaited.
+        has_gap: whether a message is missing and awaited.
     """
 
     def __init__(
         self,
-        take: Callable[[NumberedT], None],
-        miss: Callable[[int, NumberedT | None], None],
-        lacks: Callable[[], None],
+        on_message: Callable[[NumberedT], None],
+        on_missed: Callable[[int, NumberedT | None], None],
+        on_gap: Callable[[], None],
         *,
-        most_held: int = 1 << 23,
-        returns: bool = False,
+        max_held_bytes: int = 1 << 23,
+        resumes_epochs: bool = False,
     ) -> None:
         self.epoch: int = 0
         self.expected: int = 0
-        self.lacking: bool = False
-        self._take, self._miss, self._lacks = take, miss, lacks
+        self.has_gap: bool = False
+        self._on_message, self._on_missed, self._on_gap = on_message, on_missed, on_gap
         self._held: collections.deque[NumberedT] = collections.deque()
         self._held_epoch = 0
-        self._held_bytes, self._most_held = 0, most_held
-        self._returns = returns
-        self._announced = 0  # the highest next number of this epoch from the agent
-        self._places: dict[int, int] = {}  # next expected number, by earlier epoch
-        self._next_numbers: dict[int, int] = {}  # next number from the agent, by other epoch
+        self._held_bytes, self._max_held_bytes = 0, max_held_bytes
+        self._resumes_epochs = resumes_epochs
+        self._highest_following = 0  # the agent's highest next number in this epoch
+        self._expected_in_epoch: dict[int, int] = {}  # next expected number, by earlier epoch
+        self._following_in_epoch: dict[
+            int, int
+        ] = {}  # the agent's next number, by epoch that did not begin here
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
-        """Take messages with ``expected`` or a later number, of this epoch of the agent.
+        """Begin an epoch of the agent, with ``expected`` as the number of its first message.
 
         In a known epoch the expected number stays. ``following`` is the agent's next number:
         missing messages before it are requested.
         """
         if epoch != self.epoch or not self.expected:
-            if self._returns and self.expected:
+            if self._resumes_epochs and self.expected:
                 self._end_epoch()
-                expected = self._places.get(epoch, expected)
+                expected = self._expected_in_epoch.get(epoch, expected)
             self.epoch, self.expected = epoch, expected
-            self._announced = 0
-            following = max(following, self._next_numbers.pop(epoch, 0))
+            self._highest_following = 0
+            following = max(following, self._following_in_epoch.pop(epoch, 0))
         if epoch != self._held_epoch:
             self._drop_held()
-        self._go_on(following)
+        self._take_held(following)
 
     def _end_epoch(self) -> None:
-        """End this epoch, since another begins: take held messages, report missed ones."""
-        held = self._now_held()
+        """End the current epoch: take its held messages, and report its missed ones."""
+        held = self._held_in_epoch()
         while held:
-            thing = held.popleft()
-            self._held_bytes -= thing.size
-            if thing.number > self.expected:
-                self._miss(thing.number - self.expected, thing)
-                self.expected = thing.number
-            if thing.next > self.expected:
-                self._have(thing)
-        if self._announced > self.expected:
-            self._miss(self._announced - self.expected, None)
-            self.expected = self._announced
-        self._places[self.epoch] = self.expected
-        if len(self._places) > MAX_EPOCHS_REMEMBERED:
-            del self._places[next(iter(self._places))]
+            message = held.popleft()
+            self._held_bytes -= message.size
+            if message.number > self.expected:
+                self._on_missed(message.number - self.expected, message)
+                self.expected = message.number
+            if message.next > self.expected:
+                self._take_new_part(message)
+        if self._highest_following > self.expected:
+            self._on_missed(self._highest_following - self.expected, None)
+            self.expected = self._highest_following
+        self._expected_in_epoch[self.epoch] = self.expected
+        if len(self._expected_in_epoch) > MAX_EPOCHS_REMEMBERED:
+            del self._expected_in_epoch[next(iter(self._expected_in_epoch))]
 
-    def receive(self, epoch: int, following: int, things: list[NumberedT]) -> None:
-        """Take messages that the agent sent by itself; ``following`` is its next number."""
-        if epoch == self.epoch and self.expected and not self.lacking:
-            for thing in things:
-                if thing.number == self.expected:
-                    self.expected = thing.next
-                    self._take(thing)
-                elif thing.number > self.expected:
-                    self._hold(epoch, thing)
-                elif thing.next > self.expected:
-                    self._have(thing)
-            self._go_on(following)
+    def receive(self, epoch: int, following: int, messages: list[NumberedT]) -> None:
+        """Take messages that the agent published; ``following`` is the agent's next number."""
+        if epoch == self.epoch and self.expected and not self.has_gap:
+            for message in messages:
+                if message.number == self.expected:
+                    self.expected = message.next
+                    self._on_message(message)
+                elif message.number > self.expected:
+                    self._hold(epoch, message)
+                elif message.next > self.expected:
+                    self._take_new_part(message)
+            self._take_held(following)
             return
         if epoch == self.epoch and self.expected:
-            self._announced = max(self._announced, following)
+            self._highest_following = max(self._highest_following, following)
         else:  # begin() requests messages that are not held
-            self._next_numbers[epoch] = max(following, self._next_numbers.get(epoch, 0))
-            if len(self._next_numbers) > MAX_EPOCHS_REMEMBERED:
-                del self._next_numbers[next(iter(self._next_numbers))]
+            self._following_in_epoch[epoch] = max(following, self._following_in_epoch.get(epoch, 0))
+            if len(self._following_in_epoch) > MAX_EPOCHS_REMEMBERED:
+                del self._following_in_epoch[next(iter(self._following_in_epoch))]
         if epoch >= self.epoch:
-            for thing in things:
-                self._hold(epoch, thing)
+            for message in messages:
+                self._hold(epoch, message)
 
-    def fill(self, epoch: int, first: int, following: int, things: list[NumberedT]) -> None:
-        """Take requested messages: all messages of the agent from ``first`` on, or some."""
+    def fill(self, epoch: int, first: int, following: int, messages: list[NumberedT]) -> None:
+        """Take requested messages, which begin at number ``first``; later ones may be left out."""
         if epoch != self.epoch or not self.expected:
             return  # a newer epoch starts with begin(), or the feed is stopped
-        held = self._now_held()
-        before, stuck = self.expected, held[0].number if held else following
-        if first <= before and not things:
-            first = max(following, stuck)  # the agent announces more, but sends nothing
-        if first > before:
-            self._miss(first - before, things[0] if things else None)
+        held = self._held_in_epoch()
+        expected, first_held = self.expected, held[0].number if held else following
+        if first <= expected and not messages:
+            first = max(following, first_held)  # the agent announces more, but sends nothing
+        if first > expected:
+            self._on_missed(first - expected, messages[0] if messages else None)
             self.expected = first
-        for thing in things:
-            if thing.next > self.expected:
-                self._have(thing)
-        self._go_on(following)
+        for message in messages:
+            if message.next > self.expected:
+                self._take_new_part(message)
+        self._take_held(following)
 
     def interrupt(self) -> None:
-        """Wait for :meth:`begin`, since the agent cannot be asked."""
-        self.lacking = True
+        """Hold messages until :meth:`begin`, since no agent can be asked for missing ones."""
+        self.has_gap = True
 
     def stop(self) -> None:
         """Stop taking messages."""
-        self.expected = self._announced = 0
-        self._places.clear()
-        self._next_numbers.clear()
-        self.lacking = False
+        self.expected = self._highest_following = 0
+        self._expected_in_epoch.clear()
+        self._following_in_epoch.clear()
+        self.has_gap = False
         self._drop_held()
 
-    def _have(self, thing: NumberedT) -> None:
-        new = thing.since(self.expected)
-        self.expected = new.next
-        self._take(new)
+    def _take_new_part(self, message: NumberedT) -> None:
+        new_part = message.since(self.expected)
+        self.expected = new_part.next
+        self._on_message(new_part)
 
-    def _go_on(self, following: int) -> None:
-        """Take held messages that are next; request the missing ones before the rest."""
-        self.lacking = False
-        if following > self._announced:
-            self._announced = following
+    def _take_held(self, following: int) -> None:
+        """Take held messages that are next in order; report a gap before further ones."""
+        self.has_gap = False
+        if following > self._highest_following:
+            self._highest_following = following
         if not self._held and following <= self.expected:
             return
-        held = self._now_held()
+        held = self._held_in_epoch()
         while held and held[0].number <= self.expected:
-            thing = held.popleft()
-            self._held_bytes -= thing.size
-            if thing.next > self.expected:
-                self._have(thing)
+            message = held.popleft()
+            self._held_bytes -= message.size
+            if message.next > self.expected:
+                self._take_new_part(message)
         if held or following > self.expected:
-            self.lacking = True
-            self._lacks()
+            self.has_gap = True
+            self._on_gap()
 
-    def _now_held(self) -> collections.deque[NumberedT]:
-        """Return the messages held for this epoch; messages of the next epoch wait for begin()."""
+    def _held_in_epoch(self) -> collections.deque[NumberedT]:
+        """Return the held messages if they are of this epoch; those of the next epoch stay held."""
         return self._held if self._held_epoch == self.epoch else collections.deque()
 
-    def _hold(self, epoch: int, thing: NumberedT) -> None:
+    def _hold(self, epoch: int, message: NumberedT) -> None:
         if epoch != self._held_epoch:
             if epoch < self._held_epoch:
                 return
             self._drop_held()
             self._held_epoch = epoch
-        if self._held_bytes + thing.size > self._most_held:
-            return  # the number in following shows that it is missing
-        self._held.append(thing)
-        self._held_bytes += thing.size
+        if self._held_bytes + message.size > self._max_held_bytes:
+            return  # a later ``following`` shows that this message is missing
+        self._held.append(message)
+        self._held_bytes += message.size
 
     def _drop_held(self) -> None:
         self._held.clear()

@@ -1,10 +1,10 @@
 """Encode and decode the messages between smartcam's own ends of a fleet.
 
 A message is a JSON object followed by byte strings: calls, replies, descriptions. Results are sent
-as runs: containers of one camera that came together, with consecutive numbers. Messages of each
-trigger are a few numbers instead of JSON, which is the largest cost: the call
-(:class:`TriggerOrder`), the reply (:class:`TriggerReply`), and statuses. Everything is little
-endian. ``docs/bus.md`` has the layouts.
+as runs: containers of one camera that came together, with consecutive numbers. The messages of each
+trigger are binary, since JSON would cost more than all the rest: the call (:class:`TriggerOrder`),
+the reply (:class:`TriggerReply`), and statuses. Everything is little endian. ``docs/bus.md`` has
+the layouts.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 
-def grace(timeout: float) -> float:
-    """Return the seconds for which a reply is awaited beyond a call's timeout.
+def reply_grace(timeout: float) -> float:
+    """Return the seconds for which a program awaits a reply beyond a call's timeout.
 
-    So the agent gives up first. The call may take half of this time to reach the agent without
-    losing any of its own.
+    So the agent gives up first, and its reply arrives in time. The agent expects that a call needs
+    up to half of this time to arrive, and does not take that from the call's timeout.
     """
     return min(0.25, 0.02 + 0.1 * timeout)
 
@@ -48,18 +48,18 @@ def encode_state(fields: dict[str, Any]) -> bytes:
 
 
 _STATUS = struct.Struct("<4sQQIq")
-_IS_STATUS = b"scs1"
-_NONE = -(1 << 63)  # instead of a number
+_STATUS_MAGIC = b"scs1"
+_NONE = -(1 << 63)  # stands for None
 
 
 def encode_status(number: int, status: int, endian: int, application: int | None) -> bytes:
-    """Return a status as bytes, like :func:`encode_state`; ``number`` is the event's.
+    """Return a status as bytes, like :func:`encode_state`; ``number``: number of the event.
 
     Raises:
         struct.error: a value does not fit.
     """
     return _STATUS.pack(
-        _IS_STATUS, number, status, endian, _NONE if application is None else application
+        _STATUS_MAGIC, number, status, endian, _NONE if application is None else application
     )
 
 
@@ -69,7 +69,7 @@ def decode_state(data: bytes) -> dict[str, Any]:
     Raises:
         ValueError: the bytes are no event.
     """
-    if data[:4] == _IS_STATUS and len(data) == _STATUS.size:
+    if data[:4] == _STATUS_MAGIC and len(data) == _STATUS.size:
         _, number, status, endian, application = _STATUS.unpack(data)
         return {
             "kind": "Status",
@@ -124,31 +124,33 @@ def decode(payload: bytes, label: str) -> BusMessage:
 # ---------------------------------------------------------------------- results
 
 CURRENT, LATE = 1, 2
-"""Flags of a run: CURRENT, not known to belong to an older trigger; LATE, after its timeout."""
+"""Flags of a run. CURRENT: not known to belong to an older trigger. LATE: of a trigger that had
+timed out before."""
 
 _RUN = struct.Struct("<QIqIBxxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
-_MAGIC = b"scr1"
+_BATCH_MAGIC = b"scr1"
 _NO_NUMBER = math.nan
-_NEVER = 253_402_300_800.0  # the year 10,000, which no datetime has
+_MAX_TIMESTAMP = 253_402_300_800.0  # the year 10,000; datetime ends before it
 
 
 class ResultRun(NamedTuple):
     """Containers of one application that came together.
 
     Attributes:
-        number: the agent's number of the first container; the others follow.
+        number: the agent's number of the first container; the other containers have the next
+            numbers.
         application: application of the containers; below 0 if the camera does not report it.
         endian: the byte order in the camera's last status.
-        flags: bits ``CURRENT`` and ``LATE``, for all the containers.
+        flags: the flags ``CURRENT`` and ``LATE``, which hold for all containers.
         owner: the agent's number of the program whose trigger brought the containers; otherwise 0.
         call: number of the trigger's call at its program; otherwise 0.
         clock: time of the arrival by the agent's monotonic clock, seconds.
         at: time of the arrival, seconds since 1970, UTC.
-        triggered_at: time at which the trigger was sent, the same way; NaN without a trigger.
+        triggered_at: time at which the trigger was sent, seconds since 1970; NaN without a trigger.
         latency: seconds from the trigger to the containers; NaN without a trigger.
         payloads: bytes of each container.
-        cells: JSON with the values of the one payload, and errors in them; empty without
+        cells: JSON with the values in cells of the only payload, and their error; empty without
             cells.
     """
 
@@ -167,7 +169,7 @@ class ResultRun(NamedTuple):
 
     @property
     def next(self) -> int:
-        """The number after the run's last one."""
+        """The number that follows the run's last number."""
         return self.number + len(self.payloads)
 
     @property
@@ -216,11 +218,11 @@ class ResultRun(NamedTuple):
 
 def encode_runs(epoch: int, following: int, runs: Sequence[bytes]) -> bytes:
     """Return runs as one message; ``following`` is the agent's next number."""
-    return b"".join((_BATCH.pack(_MAGIC, epoch, following, len(runs)), *runs))
+    return b"".join((_BATCH.pack(_BATCH_MAGIC, epoch, following, len(runs)), *runs))
 
 
 class Batch(NamedTuple):
-    """Runs in order, the agent's epoch, and its next number."""
+    """The agent's epoch, its next number, and runs in order."""
 
     epoch: int
     following: int
@@ -235,15 +237,15 @@ def decode_runs(payload: bytes, label: str) -> Batch:
     """
     try:
         magic, epoch, following, count = _BATCH.unpack_from(payload)
-        if magic != _MAGIC:
-            raise ValueError(f"it begins with {magic!r}, not {_MAGIC!r}")
+        if magic != _BATCH_MAGIC:
+            raise ValueError(f"it begins with {magic!r}, not {_BATCH_MAGIC!r}")
         runs: list[ResultRun] = []
-        place = _BATCH.size
+        position = _BATCH.size
         for _ in range(count):
-            run, place = _decode_run(payload, place)
+            run, position = _decode_run(payload, position)
             runs.append(run)
-        if place != len(payload):
-            raise ValueError(f"{len(payload) - place} bytes are left over")
+        if position != len(payload):
+            raise ValueError(f"{len(payload) - position} bytes are left over")
     except (ValueError, struct.error, OverflowError) as exc:
         raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
     batch: Batch = new_tuple(Batch, (epoch, following, runs))
@@ -255,35 +257,39 @@ def decode_own_run(data: bytes) -> ResultRun:
     return _decode_run(data, 0)[0]
 
 
-def _decode_run(payload: bytes, place: int) -> tuple[ResultRun, int]:
+def _decode_run(payload: bytes, position: int) -> tuple[ResultRun, int]:
     number, count, application, endian, flags, owner, call, clock, at, trigger, latency, cells = (
-        _RUN.unpack_from(payload, place)
+        _RUN.unpack_from(payload, position)
     )
-    place += _RUN.size
-    known = 0 <= at < _NEVER and (0 <= trigger < _NEVER or math.isnan(trigger))
-    if not 1 <= count <= (len(payload) - place) // 4 or not known:
+    position += _RUN.size
+    has_valid_times = 0 <= at < _MAX_TIMESTAMP and (
+        0 <= trigger < _MAX_TIMESTAMP or math.isnan(trigger)
+    )
+    if not 1 <= count <= (len(payload) - position) // 4 or not has_valid_times:
         raise ValueError(f"a run of {count} containers at {at} does not fit")
-    lengths = struct.unpack_from(f"<{count}I", payload, place)
-    place += 4 * count
-    if sum(lengths) + cells > len(payload) - place:
+    lengths = struct.unpack_from(f"<{count}I", payload, position)
+    position += 4 * count
+    if sum(lengths) + cells > len(payload) - position:
         raise ValueError(f"{sum(lengths) + cells} bytes of containers do not fit")
     payloads: list[bytes] = []
     for length in lengths:
-        payloads.append(payload[place : place + length])
-        place += length
-    end, about = place + cells, (number, application, endian, flags, owner, call, clock, at)
-    run: ResultRun = new_tuple(ResultRun, (*about, trigger, latency, payloads, payload[place:end]))
+        payloads.append(payload[position : position + length])
+        position += length
+    end, head = position + cells, (number, application, endian, flags, owner, call, clock, at)
+    run: ResultRun = new_tuple(
+        ResultRun, (*head, trigger, latency, payloads, payload[position:end])
+    )
     return run, end
 
 
 # ---------------------------------------------------------------------- triggers
 
 _ORDER = struct.Struct("<4sQQddqqIBB")
-_IS_ORDER = b"sct1"
+_ORDER_MAGIC = b"sct1"
 _WAIT, _BY_APPLICATION, _INPUT, _RESERVED = 1, 2, 4, 8
 _RESERVATION = struct.Struct("<Q")
 _OUTCOME = struct.Struct("<4sQQdQI")
-_IS_OUTCOME = b"sco1"
+_OUTCOME_MAGIC = b"sco1"
 
 
 class TriggerOrder(NamedTuple):
@@ -320,9 +326,11 @@ class TriggerOrder(NamedTuple):
 
 def encode_order(program: str, order: TriggerOrder) -> bytes:
     """Return a call of ``program`` as bytes; a call with layouts becomes a JSON message."""
-    number, epoch, deadline, timeout, application, expected, results, wait, each, data = order[:10]
+    number, epoch, deadline, timeout, application, expected, results, wait, by_application, data = (
+        order[:10]
+    )
     layouts, reservation = order.layouts, order.reservation
-    flags = wait * _WAIT | each * _BY_APPLICATION | (data is not None) * _INPUT
+    flags = wait * _WAIT | by_application * _BY_APPLICATION | (data is not None) * _INPUT
     if reservation is not None:
         flags |= _RESERVED
     name = program.encode()
@@ -330,7 +338,7 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
         try:
             fence = b"" if reservation is None else _RESERVATION.pack(reservation)
             head = _ORDER.pack(
-                _IS_ORDER,
+                _ORDER_MAGIC,
                 number,
                 epoch,
                 deadline,
@@ -357,7 +365,7 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
             "expected": expected,
             "results": results,
             "wait": wait,
-            "by_application": each,
+            "by_application": by_application,
             "layouts": layouts,
         },
     }
@@ -372,7 +380,7 @@ def decode_order(payload: bytes, label: str) -> tuple[str, TriggerOrder] | None:
     Raises:
         RemoteProtocolError: the payload is broken; ``label`` names it.
     """
-    if payload[:4] != _IS_ORDER:
+    if payload[:4] != _ORDER_MAGIC:
         return None
     try:
         (_, number, epoch, deadline, timeout, application, expected, results, flags, size) = (
@@ -432,7 +440,7 @@ def encode_outcome(
 ) -> bytes:
     """Return a reply as bytes; ``runs`` is in the form of :func:`encode_runs`."""
     count = len(new_states)
-    head = _OUTCOME.pack(_IS_OUTCOME, call, epoch, clock, states, count)
+    head = _OUTCOME.pack(_OUTCOME_MAGIC, call, epoch, clock, states, count)
     lengths = struct.pack(f"<{count}I", *map(len, new_states))
     return b"".join((head, lengths, *new_states, runs))
 
@@ -443,22 +451,22 @@ def decode_outcome(payload: bytes, label: str) -> TriggerReply | None:
     Raises:
         RemoteProtocolError: the payload is broken; ``label`` names it.
     """
-    if payload[:4] != _IS_OUTCOME:
+    if payload[:4] != _OUTCOME_MAGIC:
         return None
     try:
         _, call, epoch, clock, states, count = _OUTCOME.unpack_from(payload)
-        place = _OUTCOME.size
-        lengths = struct.unpack_from(f"<{count}I", payload, place)
-        place += 4 * count
+        position = _OUTCOME.size
+        lengths = struct.unpack_from(f"<{count}I", payload, position)
+        position += 4 * count
         new_states: list[bytes] = []
         for length in lengths:
-            new_states.append(payload[place : place + length])
-            place += length
-        if place > len(payload):
-            raise ValueError(f"{place} bytes were announced, {len(payload)} came")
+            new_states.append(payload[position : position + length])
+            position += length
+        if position > len(payload):
+            raise ValueError(f"{position} bytes were announced, {len(payload)} came")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
-    batch = decode_runs(payload[place:], label)
+    batch = decode_runs(payload[position:], label)
     fields = (call, epoch, clock, states, new_states, batch)
     reply: TriggerReply = new_tuple(TriggerReply, fields)
     return reply
@@ -469,6 +477,6 @@ def timestamp(at: datetime | None) -> float:
     return _NO_NUMBER if at is None else at.timestamp()
 
 
-def joined(runs: Iterable[ResultRun]) -> list[bytes]:
-    """Return runs as bytes."""
+def encode_each(runs: Iterable[ResultRun]) -> list[bytes]:
+    """Return the bytes of each run."""
     return [run.encode() for run in runs]

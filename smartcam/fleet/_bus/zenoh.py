@@ -1,9 +1,9 @@
-"""The bus between processes and hosts: Zenoh, whose binding calls back in its own threads.
+"""Define the bus between processes and hosts, over Zenoh, which calls back in its own threads.
 
-Received messages are put into one queue, and a burst wakes the event loop once. The loop waits for
-room in the engine's buffers for at most a millisecond. Results, states and parts of frames without
-room are dropped there, and their receivers find the gap by the numbers. Calls and replies are never
-dropped for want of room: a thread, which may wait, sends the slow ones again.
+Received messages are put into one queue, and a burst wakes the event loop once. A message that is
+sent waits for room in the engine's buffers for at most a millisecond. After that, the engine drops
+results, states and parts of frames; their receivers find the gap by the numbers. Calls and replies
+are not lost in this way: if one took so long, a thread sends it again, and waits for room.
 """
 
 from __future__ import annotations
@@ -44,27 +44,28 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_DIRECT_BYTES = 1 << 16
-"""Bytes beyond which a thread sends a message, and waits until the engine has taken it."""
+"""Largest size of a message that the loop sends itself; a thread sends larger ones."""
 
 LINK = re.compile(r"\w+/(?P<host>[0-9.]+|\[[^]]+\]):(?P<port>[0-9]+)")
-"""The address of the other end of a connection, in the engine's form."""
+"""Address of the other end of a connection, in the engine's form."""
 
 BURST_PERIOD = 0.01
-"""Seconds in which a few messages are sent at once, and further ones together."""
+"""Seconds in which only :data:`MAX_EXPRESS_MESSAGES` messages are sent without delay."""
 
 MAX_EXPRESS_MESSAGES = 8
-"""Number of messages in that time that are each sent at once. The engine has room for 16 packets of
-a kind: the next messages are sent in packets of many, up to a millisecond later."""
+"""Messages of a burst that are each sent as an own packet, without delay. The engine has room for
+16 such packets. Further messages share packets, which are sent up to a millisecond later."""
 
 MAX_FREQUENT_KEYS = 64
-"""Largest number of keys with a publisher of their own, which routers have to know."""
+"""Largest number of keys with an own publisher, since routers have to know each publisher."""
 
-IDLE_KEY_TIME = 10.0
-"""Seconds without use after which a key loses its publisher to another key. Closing it
-would overtake messages that still wait for room."""
+IDLE_KEY_TIMEOUT = 10.0
+"""Seconds without use after which a key's publisher may be closed, for another key. An earlier end
+of the publisher could overtake its messages that still wait for room."""
 
-SENDERS = 8
-"""Threads that send messages that may have to wait; a program that does not read blocks one."""
+SENDER_THREADS = 8
+"""Number of threads for messages that may have to wait for room. A program that does not read
+blocks one of them."""
 
 
 class ZenohEnd(ZenohSession, Bus):
@@ -78,17 +79,19 @@ class ZenohEnd(ZenohSession, Bus):
     def __init__(self, link: BusLink, more: Mapping[str, Any] | None = None) -> None:
         super().__init__(link, more)
         self._warned: tuple[bytes, int] | None = None
-        self._looking: asyncio.Task[None] | None = None
+        self._certificate_task: asyncio.Task[None] | None = None
         self._senders: dict[int, ThreadPoolExecutor] = {}
-        self._sending = 0
-        self._doubtful = 0  # messages that may have been dropped, and are not sent again yet
-        self._behind: collections.Counter[str] = collections.Counter()
-        self._calm_since, self._burst_messages = -BURST_PERIOD, 0
-        # keys that are used again and again, in the order of their last use
-        self._frequent: dict[str, _FrequentKey] = {}
+        self._sending_bytes = 0
+        self._uncertain_count = (
+            0  # messages that may have been dropped, and were not sent again yet
+        )
+        self._waiting_in_threads: collections.Counter[str] = collections.Counter()
+        self._burst_began_at, self._burst_count = -BURST_PERIOD, 0
+        # keys that are used often, in the order of their last use
+        self._frequent_keys: dict[str, _FrequentKey] = {}
         zenoh = self._zenoh
         control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
-        self._dropping, self._waiting_for_room = (
+        self._drop_options, self._block_options = (
             {
                 express: {
                     "priority": priority,
@@ -99,7 +102,7 @@ class ZenohEnd(ZenohSession, Bus):
             }
             for congestion in (control.DROP, control.BLOCK)
         )
-        self._behind_all = {
+        self._part_options = {
             "priority": zenoh.Priority.DATA_LOW,
             "express": True,
             "congestion_control": control.DROP,
@@ -109,7 +112,7 @@ class ZenohEnd(ZenohSession, Bus):
         senders, self._senders = self._senders, {}
         return [*super()._threads(), *senders.values()]
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ open and close
 
     async def open(self, timeout: float) -> Self:
         """Connect to the bus.
@@ -123,18 +126,20 @@ class ZenohEnd(ZenohSession, Bus):
         if folder is None:
             return await self._open_plain(timeout)
         loop = asyncio.get_running_loop()
-        end = loop.time() + timeout
-        await self.look_at_certificates()
+        deadline = loop.time() + timeout
+        await self.check_certificates()
         try:
-            # the rest of the time is for finding causes
+            # the rest of the timeout is for finding the cause of a failure
             await super().open(timeout - min(DIAGNOSIS_TIMEOUT, timeout / 3))
         except ConnectFailedError as exc:
             if self._link.listen:
                 raise
-            if why := await self._why_refused(Path(folder), end - loop.time()):
+            if why := await self._find_handshake_error(Path(folder), deadline - loop.time()):
                 raise self._connect_error(why) from exc
             raise
-        self._looking = loop.create_task(self._look_now_and_then(), name="smartcam.fleet.look")
+        self._certificate_task = loop.create_task(
+            self._watch_certificates(), name="smartcam.fleet.look"
+        )
         return self
 
     async def _open_plain(self, timeout: float) -> Self:
@@ -148,14 +153,14 @@ class ZenohEnd(ZenohSession, Bus):
 
     async def close(self) -> None:
         """Leave the bus, which ends all declarations. Idempotent."""
-        looking, self._looking = self._looking, None
+        looking, self._certificate_task = self._certificate_task, None
         if looking is not None:
             looking.cancel()
-        self._frequent.clear()
+        self._frequent_keys.clear()
         await super().close()
 
-    async def look_at_certificates(self) -> Identity:
-        """Read the identity of the current certificates; warn if they end soon, also later.
+    async def check_certificates(self) -> Identity:
+        """Read the identity of the current certificates; log a warning if they end soon.
 
         Raises:
             ConnectFailedError: the certificates have expired.
@@ -171,23 +176,23 @@ class ZenohEnd(ZenohSession, Bus):
         self._warned, self.identity = warning, identity
         return identity
 
-    async def _look_now_and_then(self) -> None:
-        """Warn of certificates that end soon, until this end is closed."""
+    async def _watch_certificates(self) -> None:
+        """Check the certificates again and again, until this end is closed."""
         while self.identity is not None:
-            await asyncio.sleep(self.identity.look_after)
+            await asyncio.sleep(self.identity.next_check_delay)
             try:
-                await self.look_at_certificates()
+                await self.check_certificates()
             except SmartCamError as exc:
                 logger.error("%s ! %s", self._link.place, exc)  # noqa: TRY400 - the text says it
 
-    async def _why_refused(self, folder: Path, left: float) -> str:
-        """Return one endpoint's error of a handshake; empty if there is none."""
-        each = max(0.0, min(DIAGNOSIS_TIMEOUT, left / len(self._link.connect)))
+    async def _find_handshake_error(self, folder: Path, timeout: float) -> str:
+        """Return the first error of a handshake with an endpoint; empty if there is none."""
+        endpoint_timeout = max(0.0, min(DIAGNOSIS_TIMEOUT, timeout / len(self._link.connect)))
         for endpoint in self._link.connect:
-            kind, _, place = endpoint.partition("/")
-            host, _, port = place.rpartition(":")
+            kind, _, address = endpoint.partition("/")
+            host, _, port = address.rpartition(":")
             if kind == "tls":
-                handshake = await shake_hands(host.strip("[]"), int(port), folder, each)
+                handshake = await shake_hands(host.strip("[]"), int(port), folder, endpoint_timeout)
                 if handshake.trouble:
                     return handshake.trouble
         return ""
@@ -197,50 +202,54 @@ class ZenohEnd(ZenohSession, Bus):
         session = self._session
         if session is None:
             return False
-        # links, since the engine reports their loss before it forgets the lost router
+        # the engine drops a lost link earlier than the lost router
         return bool(self._link.mode != "client" or session.info.links())
 
-    def linked(self) -> set[tuple[str, int]] | None:
+    def connected_addresses(self) -> set[tuple[str, int]] | None:
         """Return the addresses of connected ends; None while they are not known."""
         if self._session is None:
             return None
-        places = (place_of(str(link.dst)) for link in self._session.info.links())
-        return {place for place in places if place is not None}
+        addresses = (parse_link_address(str(link.dst)) for link in self._session.info.links())
+        return {address for address in addresses if address is not None}
 
     # ------------------------------------------------------------------ sending
 
     @property
     def waiting_bytes(self) -> int:
-        return self._sending
+        return self._sending_bytes
 
     def put(self, key: str, payload: bytes) -> None:
         session = self._session
         if session is None:
             return
-        begun = self._loop.time()
-        if begun - self._calm_since > BURST_PERIOD:
-            self._calm_since, self._burst_messages = begun, 0
-        self._burst_messages += 1
-        # a single message is sent at once, a burst together: there is not room for many
-        express = self._burst_messages <= MAX_EXPRESS_MESSAGES
-        waits = len(payload) > MAX_DIRECT_BYTES or self._doubtful
-        if waits or (self._behind and self._queue_of(key) in self._behind):
-            self._hand_over(self._queue_of(key), session, key, payload, express)
+        started_at = self._loop.time()
+        if started_at - self._burst_began_at > BURST_PERIOD:
+            self._burst_began_at, self._burst_count = started_at, 0
+        self._burst_count += 1
+        # a few messages are sent without delay; the engine has no room for many of these
+        express = self._burst_count <= MAX_EXPRESS_MESSAGES
+        needs_thread = len(payload) > MAX_DIRECT_BYTES or self._uncertain_count
+        if needs_thread or (
+            self._waiting_in_threads and self._queue_name(key) in self._waiting_in_threads
+        ):
+            self._send_in_thread(self._queue_name(key), session, key, payload, express)
             return
         try:
-            publisher = self._publisher_of(key, begun) if express else None
+            publisher = self._publisher_of(key, started_at) if express else None
             if publisher is None:
-                session.put(key, payload, **self._dropping[express])
+                session.put(key, payload, **self._drop_options[express])
             else:
                 publisher.put(payload)
         except self._zenoh.ZError as exc:  # the session ends meanwhile
             logger.debug("the fleet's bus: %s", exc)
-        if self._loop.time() - begun >= ROOM_TIMEOUT:
-            self._hand_over(self._queue_of(key), session, key, payload, express, doubtful=True)
+        if self._loop.time() - started_at >= ROOM_TIMEOUT:
+            self._send_in_thread(
+                self._queue_name(key), session, key, payload, express, may_be_dropped=True
+            )
 
-    def _queue_of(self, key: str) -> str:
+    def _queue_name(self, key: str) -> str:
         """Return the name of the queue in which a message is sent in order."""
-        # a router, and a peer, has one to each who listens
+        # a client sends everything to its router; others have a queue for each receiver
         return "" if self._link.mode == "client" else key
 
     def _publisher_of(self, key: str, now: float) -> Any:
@@ -251,23 +260,23 @@ class ZenohEnd(ZenohSession, Bus):
         Raises:
             ZError: the session ends meanwhile.
         """
-        frequent = self._frequent
+        frequent = self._frequent_keys
         known = frequent.pop(key, None)
         if known is not None:
             frequent[key] = known
-            return known.used(now)
+            return known.use_publisher(now)
         if len(frequent) >= MAX_FREQUENT_KEYS:
             oldest = next(iter(frequent))
-            if now - frequent[oldest].used_at < IDLE_KEY_TIME:
+            if now - frequent[oldest].used_at < IDLE_KEY_TIMEOUT:
                 return None
             frequent.pop(oldest).close()
-        frequent[key] = _FrequentKey(self, key, self._dropping[True], now)
+        frequent[key] = _FrequentKey(self, key, self._drop_options[True], now)
         return None
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         if self._session is not None:
             payload = bytes(data) if isinstance(data, memoryview) else data
-            quietly(self._session.put, key, payload, attachment=head, **self._behind_all)
+            quietly(self._session.put, key, payload, attachment=head, **self._part_options)
 
     def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
         def on_sample(sample: Any) -> None:
@@ -280,7 +289,7 @@ class ZenohEnd(ZenohSession, Bus):
         declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
 
-    def _hand_over(
+    def _send_in_thread(
         self,
         queue: str,
         session: Any,
@@ -288,48 +297,48 @@ class ZenohEnd(ZenohSession, Bus):
         payload: bytes,
         express: bool,
         *,
-        doubtful: bool = False,
+        may_be_dropped: bool = False,
     ) -> None:
-        """Let a thread send a message, which waits for room; and later ones of the same way.
+        """Let a thread send a message, and later ones of the same queue until this one is sent.
 
         Args:
-            queue: key of messages that are sent in order.
+            queue: name of the queue whose messages are sent in order.
             session: the engine's session.
             key: key of the message.
             payload: the message.
-            express: whether the message is sent at once.
-            doubtful: whether it was sent before, and took so long that the engine may have dropped
-                it. The engine then drops further messages at once, until it has sent one; so all
-                are sent by threads until this one is sent. A receiver recognizes a repetition by
-                its number.
+            express: whether the message is sent as an own packet, without delay.
+            may_be_dropped: whether the message was sent before, and took so long that the engine
+                may have dropped it. The engine then drops further messages, too, until it has room
+                again. So threads send all messages until this one is sent. A receiver recognizes
+                a repeated message by its number.
         """
         size = len(payload)
-        if self._sending + size > MAX_WAITING_BYTES:
+        if self._sending_bytes + size > MAX_WAITING_BYTES:
             logger.warning(
-                "%s ! %d bytes wait to be sent; further ones are dropped", key, self._sending
+                "%s ! %d bytes wait to be sent; further ones are dropped", key, self._sending_bytes
             )
             return
-        lane = hash(queue) % SENDERS
-        sender = self._senders.get(lane)
+        thread_index = hash(queue) % SENDER_THREADS
+        sender = self._senders.get(thread_index)
         if sender is None:
-            sender = self._senders[lane] = ThreadPoolExecutor(1, "smartcam-fleet")
-        how = self._waiting_for_room[express]
+            sender = self._senders[thread_index] = ThreadPoolExecutor(1, "smartcam-fleet")
+        options = self._block_options[express]
 
         def send() -> None:
             try:
-                _put(session, key, payload, how)
+                _put(session, key, payload, options)
             finally:
                 with self._lock:
-                    self._sending -= size
-                    self._doubtful -= doubtful
-                    self._behind[queue] -= 1
-                    if not self._behind[queue]:
-                        del self._behind[queue]
+                    self._sending_bytes -= size
+                    self._uncertain_count -= may_be_dropped
+                    self._waiting_in_threads[queue] -= 1
+                    if not self._waiting_in_threads[queue]:
+                        del self._waiting_in_threads[queue]
 
         with self._lock:
-            self._sending += size
-            self._doubtful += doubtful
-            self._behind[queue] += 1
+            self._sending_bytes += size
+            self._uncertain_count += may_be_dropped
+            self._waiting_in_threads[queue] += 1
         sender.submit(send)
 
     def publisher(
@@ -347,7 +356,7 @@ class ZenohEnd(ZenohSession, Bus):
         in_loop = self.in_loop_patiently if patient else self.in_loop
         full = functools.partial(self.full, patient=True) if patient else self.full
 
-        key = None if "*" in pattern else pattern  # saves asking the engine for it
+        key = None if "*" in pattern else pattern  # faster than the engine's text of the key
 
         def on_sample(sample: Any) -> None:
             payload = sample.payload.to_bytes()
@@ -367,11 +376,11 @@ class ZenohEnd(ZenohSession, Bus):
     ) -> Handle:
         def on_query(query: Any) -> None:
             question = _ZenohQuestion(self, query)
-            waits, size = patient(question.key), QUERY_BYTES + len(question.payload)
-            if self.full(size, patient=waits):
+            is_patient, size = patient(question.key), QUERY_BYTES + len(question.payload)
+            if self.full(size, patient=is_patient):
                 quietly(query.drop)
                 return
-            in_loop = self.in_loop_patiently if waits else self.in_loop
+            in_loop = self.in_loop_patiently if is_patient else self.in_loop
             in_loop(declared.call, size, answer, question)
 
         declared = _OnBus(self)
@@ -396,7 +405,7 @@ class ZenohEnd(ZenohSession, Bus):
     async def _answers(
         self, ask: Callable[[Any, Any], None], timeout: float
     ) -> list[tuple[str, bytes]]:
-        """Return all answers; ``ask`` sends the question, given the session and a callback."""
+        """Return all answers; ``ask(session, callback)`` sends the question."""
         session = self._session
         answers: list[tuple[str, bytes]] = []
         done = self._loop.create_future()
@@ -415,8 +424,8 @@ class ZenohEnd(ZenohSession, Bus):
 
         if session is None:
             return answers
-        ended = functools.partial(self.in_loop, end, 0)
-        ask(session, direct(on_reply, ended))
+        on_end = functools.partial(self.in_loop, end, 0)
+        ask(session, direct(on_reply, on_end))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await done
@@ -445,21 +454,21 @@ class ZenohEnd(ZenohSession, Bus):
                 keys_present.pop(key, None)
             on_presence(key, present)
 
-        def lost() -> None:  # a new session does not report ends that have gone meanwhile
+        def on_session_lost() -> None:  # a new session reports no ends that left meanwhile
             for key in [*keys_present]:
                 note_presence(key, False)
 
         def on_sample(sample: Any) -> None:
             self.in_loop(declared.call, 0, note_presence, str(sample.key_expr), sample.kind == put)
 
-        declared = _OnBus(self).when_lost(lost)
+        declared = _OnBus(self).when_lost(on_session_lost)
         return declared.of(
             lambda session: session.liveliness().declare_subscriber(
                 pattern, direct(on_sample), history=True
             )
         )
 
-    # ------------------------------------------------------------------ for declarations
+    # ------------------------------------------------------------------ publishing
 
     def publish(self, publisher: Any, payload: bytes, urgent_key: str | None) -> None:
         """Send a message by a publisher.
@@ -467,16 +476,21 @@ class ZenohEnd(ZenohSession, Bus):
         Args:
             publisher: the engine's publisher; None while its session is not open yet.
             payload: the message.
-            urgent_key: key of the message if it waits in one line with messages of :meth:`put`.
+            urgent_key: key of an urgent message, see :meth:`publisher`; None otherwise.
         """
         session = self._session
         if publisher is None or session is None:
             return
-        begun = self._loop.time()
+        started_at = self._loop.time()
         quietly(publisher.put, payload)
-        if urgent_key is not None and self._loop.time() - begun >= ROOM_TIMEOUT:
-            self._hand_over(
-                self._queue_of(urgent_key), session, urgent_key, payload, False, doubtful=True
+        if urgent_key is not None and self._loop.time() - started_at >= ROOM_TIMEOUT:
+            self._send_in_thread(
+                self._queue_name(urgent_key),
+                session,
+                urgent_key,
+                payload,
+                False,
+                may_be_dropped=True,
             )
 
 
@@ -485,29 +499,29 @@ class _OnBus(ZenohDeclared, Handle):
 
 
 class _FrequentKey(_OnBus):
-    """A key that is used again and again; from its second use on it has a publisher.
+    """A key that is used often; from its second use on, it has a publisher.
 
     Args:
-        end: the end that uses it.
+        end: the end that uses the key.
         key: the key.
-        how: the engine's options of the publisher.
+        options: the engine's options of the publisher.
         now: loop time.
 
     Attributes:
         used_at: loop time of the last use.
     """
 
-    def __init__(self, end: ZenohEnd, key: str, how: dict[str, Any], now: float) -> None:
+    def __init__(self, end: ZenohEnd, key: str, options: dict[str, Any], now: float) -> None:
         super().__init__(end)
         self.used_at: float = now
-        self._key, self._options = key, how
-        self._declares = False
+        self._key, self._options = key, options
+        self._is_declared = False
 
-    def used(self, now: float) -> Any:
-        """Return the publisher; None while there is none."""
+    def use_publisher(self, now: float) -> Any:
+        """Return the publisher, and declare it at the first call; None while there is none."""
         self.used_at = now
-        if not self._declares:
-            self._declares = True
+        if not self._is_declared:
+            self._is_declared = True
             self.of(lambda session: session.declare_publisher(self._key, **self._options))
         return self._declaration
 
@@ -542,10 +556,10 @@ class _ZenohPublisher(Publisher):
         self._declared.of(lambda session: self._declare(declare(session), on_matching))
 
     def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
-        again, self._publisher = self._publisher is not None, publisher
+        is_new_session, self._publisher = self._publisher is not None, publisher
         publisher.declare_matching_listener(direct(on_matching))
         has_subscribers = bool(publisher.matching_status.matching)
-        if again:
+        if is_new_session:
             self._end.later(self._declared.call, self._on_subscribers, has_subscribers)
         else:
             self.has_subscribers = has_subscribers
@@ -581,11 +595,11 @@ class _ZenohQuestion(BusQuestion):
             )
 
 
-def place_of(text: str) -> tuple[str, int] | None:
-    """Return address and port in the engine's text; None if there are none."""
+def parse_link_address(text: str) -> tuple[str, int] | None:
+    """Return address and port from the engine's text on a link; None if it has none."""
     match = LINK.match(text)
     return None if match is None else (plain_host(match["host"]), int(match["port"]))
 
 
-def _put(session: Any, key: str, payload: bytes, how: dict[str, Any]) -> None:
-    quietly(session.put, key, payload, **how)
+def _put(session: Any, key: str, payload: bytes, options: dict[str, Any]) -> None:
+    quietly(session.put, key, payload, **options)

@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on access to the bus, and refuse wrong values."""
+"""Check the settings of a fleet file for access to the bus."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ CURE = "smartcam fleet certificates makes certificates: then listen: tls/..., ce
 Mistake = tuple[tuple[str, ...], str]
 
 
-def access_of(given: Access | None, listen: Sequence[str]) -> Access | None:
-    """Return the effective access: with TLS roles, or any certificate could command."""
+def effective_access(access: Access | None, listen: Sequence[str]) -> Access | None:
+    """Return the access of a fleet file; without one, ``roles`` if an endpoint has TLS."""
     tls = any(endpoint.startswith("tls/") for endpoint in listen)
-    return given or ("roles" if tls else None)
+    return access or ("roles" if tls else None)
 
 
-def access_mistakes(given: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
+def access_mistakes(access: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
     """Yield the mistakes in the access of a fleet file."""
     plain = [endpoint for endpoint in listen if not endpoint.startswith("tls/")]
     open_to_all = [
         endpoint for endpoint in plain if not is_loopback(endpoint[4:].rpartition(":")[0])
     ]
-    access = access_of(given, listen)
-    if access == "roles" and plain:
+    effective = effective_access(access, listen)
+    if effective == "roles" and plain:
         yield (
             ("listen",),
             f"{plain[0]} asks for no certificate, so its programs have no role: expected only "
             "tls/ endpoints, or access: any-certificate",
         )
-    elif access != ANYONE and open_to_all:
+    elif effective != ANYONE and open_to_all:
         yield (
             ("listen",),
             f"{open_to_all[0]} accepts every program without a certificate, and each may command "
             f"the cameras. {CURE}. If this is wanted: access: {ANYONE}",
         )
-    elif given in {"roles", "any-certificate"} and listen and len(plain) == len(listen):
-        yield ("access",), f"{given} needs listen: tls/... and certificates"
+    elif access in {"roles", "any-certificate"} and listen and len(plain) == len(listen):
+        yield ("access",), f"{access} needs listen: tls/... and certificates"

@@ -1,4 +1,4 @@
-"""Fleet files, read from YAML: the cameras that an agent shares, and its settings."""
+"""Read fleet files in YAML: the cameras that an agent shares, and the agent's settings."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from smartcam.fleet._bus.address import (
 )
 from smartcam.fleet._file.access import Access, access_mistakes
 from smartcam.fleet._file.operations import OperationsSection  # noqa: TC001 - pydantic does
-from smartcam.fleet._file.recording import RecordSection, mistakes_of
+from smartcam.fleet._file.recording import RecordSection, record_mistakes
 from smartcam.fleet._file.ros import Fields, RosCamera, RosSection, node_names
-from smartcam.fleet._file.standby import Standby, standby_of
+from smartcam.fleet._file.standby import Standby, expand_standby
 from smartcam.layout._inside import file_schema, read_model
 from smartcam.settings import (
     CameraSettings,
@@ -58,31 +58,31 @@ if TYPE_CHECKING:
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 MAX_CAMERAS_PER_AGENT = 10_000
-"""Largest number of cameras of one agent; each emulated one has a port of its own."""
+"""Largest number of cameras of one agent; each emulated camera has an own port."""
 
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 _PATTERN = "/**"
 
 
-def _word(text: str) -> str:
+def _check_word_text(text: str) -> str:
     return check_word(text, "name")
 
 
 Word = Annotated[
     str,
-    AfterValidator(_word),
+    AfterValidator(_check_word_text),
     WithJsonSchema({"type": "string", "pattern": f"^{CHUNK}$", "maxLength": MAX_NAME_CHARACTERS}),
 ]
 
 
-def _endpoints(least_port: int) -> Any:
-    """Return the validator of one endpoint, or of several, with ports of ``least_port`` or more."""
+def _endpoint_validator(least_port: int) -> Any:
+    """Return the validator of one endpoint or a list of them, with ports from ``least_port`` on."""
 
-    def checked(given: object) -> list[str] | None:
-        if given is None:
+    def check_endpoints(value: object) -> list[str] | None:
+        if value is None:
             return None
         endpoints: list[str] = []
-        for endpoint in cast("list[object]", given) if isinstance(given, list) else [given]:
+        for endpoint in cast("list[object]", value) if isinstance(value, list) else [value]:
             parts = _ENDPOINT.fullmatch(endpoint) if isinstance(endpoint, str) else None
             if parts is None or not least_port <= int(parts[3]) <= 0xFFFF:
                 raise ValueError(
@@ -92,7 +92,7 @@ def _endpoints(least_port: int) -> Any:
             endpoints.append(parts[0])
         return endpoints
 
-    return PlainValidator(checked)
+    return PlainValidator(check_endpoints)
 
 
 _ENDPOINT_SCHEMA = {"type": "string", "pattern": f"^{_ENDPOINT.pattern}$"}
@@ -125,15 +125,15 @@ class Retry(Fields):
         return Backoff(**self.model_dump())
 
 
-def _never(given: object) -> object:
-    return None if given is False else given
+def _none_for_false(value: object) -> object:
+    return None if value is False else value
 
 
-def _or_false(schema: dict[str, Any]) -> None:
+def _allow_false(schema: dict[str, Any]) -> None:
     schema["anyOf"].append({"const": False})
 
 
-def _or_bool(schema: dict[str, Any]) -> None:
+def _allow_bool(schema: dict[str, Any]) -> None:
     schema["anyOf"].append({"type": "boolean"})
 
 
@@ -168,12 +168,12 @@ class FramesEntry(Fields):
     )
 
     def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
-        """Yield all fields, without a password, which is not for logs."""
+        """Yield all fields; in URLs the password is masked, since logs may show the fields."""
         for name, value in super().__repr_args__():
             yield name, masked(value) if name == "url" else value
 
-    def source(self, folder: Path) -> FrameSource:
-        """Return the closed source of the frames.
+    def make_source(self, folder: Path) -> FrameSource:
+        """Return a source of the frames, which is not open.
 
         Args:
             folder: folder of the fleet file.
@@ -185,10 +185,12 @@ class FramesEntry(Fields):
         from smartcam import frames
 
         url = self.url if "://" in self.url else str(folder / self.url)
-        return frames.open(url, camera_info=self.lens(folder), stall=self.stall, linger=self.linger)
+        return frames.open(
+            url, camera_info=self.load_lens(folder), stall=self.stall, linger=self.linger
+        )
 
-    def lens(self, folder: Path) -> CameraModel | None:
-        """Return the lens, None if the file names none.
+    def load_lens(self, folder: Path) -> CameraModel | None:
+        """Read the lens of ``camera_info``, and return it; None without ``camera_info``.
 
         Raises:
             CalibrationError: the file has no lens.
@@ -200,19 +202,19 @@ class FramesEntry(Fields):
         from smartcam.calibration.formats import read_cameras
 
         path = folder / self.camera_info
-        if _is_ours(path):
+        if _is_calibration_file(path):
             return IntrinsicCalibration.load(path).camera
         return read_cameras(path, "camera_info").cameras[0]
 
     def camera_info_url(self, folder: Path) -> str:
-        """Return the URL of ROS' ``camera_info``; empty if the file is not one of ROS."""
+        """Return the URL of ``camera_info`` if it is a file of ROS; otherwise an empty text."""
         if self.camera_info is None:
             return ""
         path = (folder / self.camera_info).absolute()
-        return "" if path.exists() and _is_ours(path) else path.as_uri()
+        return "" if path.exists() and _is_calibration_file(path) else path.as_uri()
 
 
-def _is_ours(path: Path) -> bool:
+def _is_calibration_file(path: Path) -> bool:
     """Return True if a file is a calibration of smartcam.
 
     Raises:
@@ -222,17 +224,17 @@ def _is_ours(path: Path) -> bool:
         return file.read(64).lstrip()[:1] == b"{"
 
 
-def _frames(given: object) -> object:
+def _expand_url(value: object) -> object:
     """Convert a URL alone to a mapping."""
-    return {"url": given} if isinstance(given, str) else given
+    return {"url": value} if isinstance(value, str) else value
 
 
-def _or_url(schema: dict[str, Any]) -> None:
+def _allow_url(schema: dict[str, Any]) -> None:
     schema["anyOf"].append({"type": "string"})
 
 
 _SOURCES = ("url", "emulated", "software")
-"""The keys of an entry, one of which has the camera's source."""
+"""Keys for the source of a camera; an entry has exactly one of them."""
 
 
 class CameraEntry(Fields):
@@ -275,22 +277,22 @@ class CameraEntry(Fields):
         5.0,
         description="longest wait for the answer to a check of the connection; null: no end",
     )
-    frames: Annotated[FramesEntry | None, BeforeValidator(_frames)] = Field(
+    frames: Annotated[FramesEntry | None, BeforeValidator(_expand_url)] = Field(
         None,
         description="source of the camera's pictures: a URL, or a mapping with more",
-        json_schema_extra=_or_url,
+        json_schema_extra=_allow_url,
     )
     ros2: RosCamera = Field(
         RosCamera.model_validate({}), description="its node in ROS 2, if the fleet has nodes"
     )
-    reconnect: Annotated[Retry | None, BeforeValidator(_never)] = Field(
+    reconnect: Annotated[Retry | None, BeforeValidator(_none_for_false)] = Field(
         Retry.model_validate({}),
         description="delays before a lost camera is connected again; false: never",
-        json_schema_extra=_or_false,
+        json_schema_extra=_allow_false,
     )
 
     @model_validator(mode="after")
-    def _one_of(self) -> CameraEntry:
+    def _check_source(self) -> CameraEntry:
         given = [name for name in _SOURCES if getattr(self, name) is not None]
         if len(given) != 1:
             given_names = " and ".join(given) or "none of them"
@@ -298,7 +300,7 @@ class CameraEntry(Fields):
         return self
 
     def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
-        """Yield all fields, without a password, which is not for logs."""
+        """Yield all fields; in URLs the password is masked, since logs may show the fields."""
         for name, value in super().__repr_args__():
             yield name, masked(value) if name == "url" and isinstance(value, str) else value
 
@@ -329,30 +331,30 @@ class History(Fields):
     bytes: int = Field(1 << 24, ge=1, le=1 << 34, description="approximate bytes of results")
 
 
-class Planned(NamedTuple):
-    """A camera of a fleet file.
+class PlannedCamera(NamedTuple):
+    """A camera of a fleet file, which may be one of several cameras of an entry.
 
     Attributes:
         name: name of the camera in the fleet.
         entry: entry of the camera in the file.
-        nth: place of the camera among the emulated ones of its entry, from 0.
+        index_in_entry: index of the camera among the emulated cameras of its entry, from 0.
     """
 
     name: str
     entry: CameraEntry
-    nth: int
+    index_in_entry: int
 
 
-def _named(given: object) -> object:
-    """Refuse names that YAML has not read as texts, such as 12 and yes."""
-    if isinstance(given, dict):
-        for name in cast("dict[object, object]", given):
+def _refuse_other_keys(value: object) -> object:
+    """Refuse names that YAML does not read as texts, such as 12 and yes."""
+    if isinstance(value, dict):
+        for name in cast("dict[object, object]", value):
             if not isinstance(name, str):
                 raise ValueError(f"the name {name!r:.40} is no text: put it in quotes")  # noqa: TRY004 - as pydantic wants
-    return given
+    return value
 
 
-def _names(schema: dict[str, Any]) -> None:
+def _limit_names(schema: dict[str, Any]) -> None:
     tail = rf"(/{CHUNK}){{0,{MAX_CHUNKS - 1}}}(/\*\*)?"
     schema["propertyNames"] = {"pattern": f"^{CHUNK}{tail}$", "maxLength": MAX_NAME_CHARACTERS}
 
@@ -364,12 +366,12 @@ class FleetFile(Fields):
     agent: Word | None = Field(
         None, description="name of this agent, unique in the fleet; default: host and process"
     )
-    listen: Annotated[list[str] | str | None, _endpoints(0), _ENDPOINTS_SCHEMA] = Field(
+    listen: Annotated[list[str] | str | None, _endpoint_validator(0), _ENDPOINTS_SCHEMA] = Field(
         None,
         description="endpoints to listen on, which makes this agent a router; default without "
         "connect: tcp/127.0.0.1:7447; port 0 takes a free one",
     )
-    connect: Annotated[list[str] | str | None, _endpoints(1), _ENDPOINTS_SCHEMA] = Field(
+    connect: Annotated[list[str] | str | None, _endpoint_validator(1), _ENDPOINTS_SCHEMA] = Field(
         None, description="endpoints of routers or other agents, such as tls/plant-server:7447"
     )
     certificates: str | None = Field(
@@ -404,16 +406,16 @@ class FleetFile(Fields):
         description="folder, beside this file, of the calibration services, made if missing; "
         "without it they refuse",
     )
-    standby: Annotated[Standby | None, BeforeValidator(standby_of)] = Field(
+    standby: Annotated[Standby | None, BeforeValidator(expand_standby)] = Field(
         None,
         description="stand by for cameras of another agent, and take over when it is lost: "
         "true, or a mapping with more",
-        json_schema_extra=_or_bool,
+        json_schema_extra=_allow_bool,
     )
-    cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
+    cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_refuse_other_keys)] = Field(
         description="cameras by name, such as line1/cam3; emulated ones by a name that ends in "
         "/**; {}: none, the agent is a router for others",
-        json_schema_extra=_names,
+        json_schema_extra=_limit_names,
     )
 
     @property
@@ -434,21 +436,21 @@ class FleetFile(Fields):
         )
         return f"{name or 'agent'}-{os.getpid()}"
 
-    def plan(self) -> list[Planned]:
-        """Return the cameras of the file.
+    def plan(self) -> list[PlannedCamera]:
+        """Return the cameras of the file, with one item for each emulated camera.
 
         Raises:
             ValueError: a name is not valid, or comes twice; or there are too many.
         """
-        planned: dict[str, Planned] = {}
+        planned: dict[str, PlannedCamera] = {}
         for name, entry in self.cameras.items():
-            _add(planned, name, entry)
+            _add_planned(planned, name, entry)
         return [*planned.values()]
 
 
-def _add(planned_cameras: dict[str, Planned], name: str, entry: CameraEntry) -> None:
-    """Add the cameras of an entry to the cameras so far."""
-    for planned in _planned(name, entry):
+def _add_planned(planned_cameras: dict[str, PlannedCamera], name: str, entry: CameraEntry) -> None:
+    """Add the cameras of an entry to ``planned_cameras``."""
+    for planned in _plan_entry(name, entry):
         if planned.name in planned_cameras:
             raise ValueError(f"there is a camera {planned.name} already")
         planned_cameras[planned.name] = planned
@@ -458,25 +460,25 @@ def _add(planned_cameras: dict[str, Planned], name: str, entry: CameraEntry) -> 
         )
 
 
-def _planned(name: str, entry: CameraEntry) -> Iterator[Planned]:
-    many = name.endswith(_PATTERN)
-    if not many and "*" in name:
+def _plan_entry(name: str, entry: CameraEntry) -> Iterator[PlannedCamera]:
+    is_pattern = name.endswith(_PATTERN)
+    if not is_pattern and "*" in name:
         raise ValueError(f"{name!r:.120} means several: expected a name that ends in {_PATTERN}")
     count = 1 if entry.emulated is None else entry.emulated.count
-    if not many:
+    if not is_pattern:
         check_name(name)
         if count > 1:
             raise ValueError(f"{count} cameras want a name such as {name}{_PATTERN}")
-        yield Planned(name, entry, 0)
+        yield PlannedCamera(name, entry, 0)
         return
     if entry.emulated is None:
         raise ValueError("only emulated cameras have a pattern for a name")
     stem, width = name.removesuffix(_PATTERN), len(str(count))
-    for n in range(count):
-        yield Planned(check_name(f"{stem}/cam{n + 1:0{width}}"), entry, n)
+    for index in range(count):
+        yield PlannedCamera(check_name(f"{stem}/cam{index + 1:0{width}}"), entry, index)
 
 
-# ---------------------------------------------------------------------- reading one
+# ---------------------------------------------------------------------- reading a file
 
 
 def load_fleet(path: str | Path) -> FleetFile:
@@ -521,41 +523,43 @@ Mistake = tuple["Sequence[int | str]", str]
 
 
 def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
-    """Yield the mistakes in a file, and their places."""
+    """Yield the mistakes in a file: the keys that lead to the field, and a text."""
     yield from access_mistakes(file.access, file.endpoints[0])
-    yield from _of_certificates(file, folder)
+    yield from _certificate_mistakes(file, folder)
     if not file.cameras and not file.endpoints[0]:
         text = "an agent without cameras is a router for others: expected listen, which it lacks"
         yield ("cameras",), text
     if file.record is not None:
-        seeing = [name for name, entry in file.cameras.items() if entry.frames or entry.software]
-        yield from mistakes_of(file.record, folder, seeing)
+        with_frames = [
+            name for name, entry in file.cameras.items() if entry.frames or entry.software
+        ]
+        yield from record_mistakes(file.record, folder, with_frames)
     if file.outlets is not None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):
             from smartcam.outlets._inside import mistakes_of as outlet_mistakes
         yield from outlet_mistakes(file.outlets)
-    planned: dict[str, Planned] = {}
-    taken: dict[tuple[str, int], str] = {}
+    planned: dict[str, PlannedCamera] = {}
+    addresses: dict[tuple[str, int], str] = {}
     for name, entry in file.cameras.items():
-        place = ("cameras", name)
+        keys = ("cameras", name)
         try:
-            _add(planned, name, entry)
+            _add_planned(planned, name, entry)
         except ValueError as exc:
-            yield place, str(exc)
-        for where, text in _of_entry(name, entry, taken, folder):
-            yield (*place, *where), text
+            yield keys, str(exc)
+        for more_keys, text in _entry_mistakes(name, entry, addresses, folder):
+            yield (*keys, *more_keys), text
     if file.ros2 is not None:
-        yield from _of_ros(planned)
+        yield from _ros_mistakes(planned)
 
 
-def _of_ros(planned: dict[str, Planned]) -> Iterator[Mistake]:
+def _ros_mistakes(planned: dict[str, PlannedCamera]) -> Iterator[Mistake]:
     try:
         node_names([*planned])
     except ValueError as exc:
         yield ("cameras",), str(exc)
 
 
-def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
+def _certificate_mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
     listen, connect = file.endpoints
     tls = [endpoint for endpoint in (*listen, *connect) if endpoint.startswith("tls/")]
     if file.certificates is None:
@@ -566,32 +570,32 @@ def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
         yield ("certificates",), missing
 
 
-def _of_entry(
-    name: str, entry: CameraEntry, taken: dict[tuple[str, int], str], folder: Path
+def _entry_mistakes(
+    name: str, entry: CameraEntry, addresses: dict[tuple[str, int], str], folder: Path
 ) -> Iterator[Mistake]:
-    """Yield the mistakes of a camera; ``taken``: cameras by their addresses."""
+    """Yield the mistakes of an entry, and add its address and name to ``addresses``."""
     if entry.url is not None:
         try:
             address = parse_address(entry.url, model=entry.model)
         except SmartCamError as exc:
             yield ("url",), str(exc)
             return
-        other = taken.setdefault((address.host, address.port), name)
+        other = addresses.setdefault((address.host, address.port), name)
         if other != name:
             yield ("url",), f"this is the camera {other}, and a camera takes one client"
     elif entry.model is not None:
         yield ("model",), "is for a url"
     elif entry.emulated is not None and entry.emulated.scenario is not None:
-        yield from _of_scenario(folder / entry.emulated.scenario)
+        yield from _scenario_mistakes(folder / entry.emulated.scenario)
     elif entry.software is not None:
-        yield from _of_software(name, entry.software, folder)
+        yield from _software_mistakes(name, entry.software, folder)
     if entry.frames is not None:
-        yield from _of_frames(entry.frames, folder)
-    seen = entry.ros2
+        yield from _frames_mistakes(entry.frames, folder)
+    ros = entry.ros2
     for key, load in (
-        ("calibration", lambda: seen.load_calibration(folder)),
-        ("hand_eye", lambda: seen.load_hand_eye(folder)),
-        ("calibrated_at", seen.robot_pose),
+        ("calibration", lambda: ros.load_calibration(folder)),
+        ("hand_eye", lambda: ros.load_hand_eye(folder)),
+        ("calibrated_at", ros.robot_pose),
     ):
         try:
             load()
@@ -610,30 +614,30 @@ def _of_entry(
     except ConfigurationError as exc:
         yield ("application_names",), str(exc)
     specs = entry.interpret_as
-    each = specs.items() if isinstance(specs, dict) else [(None, specs)]
-    for application, spec in each:
+    spec_items = specs.items() if isinstance(specs, dict) else [(None, specs)]
+    for application, spec in spec_items:
         if spec is not None:
             try:
                 Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
             except SmartCamError as exc:
-                numbered = () if application is None else (application,)
-                yield ("interpret_as", *numbered), str(exc)
+                application_key = () if application is None else (application,)
+                yield ("interpret_as", *application_key), str(exc)
 
 
-def _of_frames(entry: FramesEntry, folder: Path) -> Iterator[Mistake]:
+def _frames_mistakes(entry: FramesEntry, folder: Path) -> Iterator[Mistake]:
     try:
-        entry.lens(folder)
+        entry.load_lens(folder)
     except (SmartCamError, OSError) as exc:
         yield ("frames", "camera_info"), str(exc)
         return
     try:
-        entry.source(folder)
+        entry.make_source(folder)
     except SmartCamError as exc:
         yield ("frames", "url"), str(exc)
 
 
-def software_camera(name: str, given: dict[str, Any], folder: Path) -> CellCamera:
-    """Return the software camera of an entry.
+def software_camera(name: str, fields: dict[str, Any], folder: Path) -> CellCamera:
+    """Return the software camera that the fields of an entry describe.
 
     Raises:
         ConfigurationError: the entry is wrong.
@@ -641,23 +645,23 @@ def software_camera(name: str, given: dict[str, Any], folder: Path) -> CellCamer
     """
     with from_part("inspection", '"software:" in a fleet file needs'):
         from smartcam.inspection._inside import Software, make_camera
-    return make_camera(name, validated(Software, given, f"{name}: software"), folder)
+    return make_camera(name, validated(Software, fields, f"{name}: software"), folder)
 
 
-def _of_software(name: str, given: dict[str, Any], folder: Path) -> Iterator[Mistake]:
+def _software_mistakes(name: str, fields: dict[str, Any], folder: Path) -> Iterator[Mistake]:
     with from_part("inspection", '"software:" in a fleet file needs'):
         from smartcam.inspection._inside import Software, software_mistakes
     try:
-        software = Software.model_validate(given)
+        software = Software.model_validate(fields)
     except ValidationError as exc:
         first = exc.errors(include_url=False)[0]
         yield ("software", *first["loc"]), first["msg"].removeprefix("Value error, ")
         return
-    for place, text in software_mistakes(name, software, folder):
-        yield ("software", *place), text
+    for keys, text in software_mistakes(name, software, folder):
+        yield ("software", *keys), text
 
 
-def _of_scenario(path: Path) -> Iterator[Mistake]:
+def _scenario_mistakes(path: Path) -> Iterator[Mistake]:
     from smartcam.emulator import load_scenario
 
     try:

@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on health, metrics and the log."""
+"""Define the section of a fleet file on health, metrics and the log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DEFAULT_PLACE = "127.0.0.1:9464"
 _PLACE = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 
 
-def _place(text: str) -> str:
+def _check_place(text: str) -> str:
     match = _PLACE.fullmatch(text)
     if match is None or int(match[2]) > 0xFFFF:
         raise ValueError(f"expected HOST:PORT such as {DEFAULT_PLACE}, got {text!r:.80}")
@@ -23,7 +23,7 @@ def _place(text: str) -> str:
 
 Place = Annotated[
     str,
-    AfterValidator(_place),
+    AfterValidator(_check_place),
     WithJsonSchema({"type": "string", "pattern": f"^{_PLACE.pattern}$"}),
 ]
 

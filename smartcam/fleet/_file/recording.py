@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on recording beside the agent."""
+"""Define the section of a fleet file on recording in the agent's process."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ class RecordSection(Fields):
         return folder / Path(self.folder).expanduser()
 
 
-def mistakes_of(
-    section: RecordSection, folder: Path, seeing: Iterable[str]
+def record_mistakes(
+    section: RecordSection, folder: Path, with_frames: Iterable[str]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the mistakes in the section, and their places.
+    """Yield the mistakes in the section: the keys that lead to the field, and a text.
 
     Args:
         section: section of a fleet file.
         folder: folder of the fleet file.
-        seeing: names of the cameras with frames.
+        with_frames: names of the cameras with frames.
     """
-    recorded = any(name.endswith("/**") or section.chooses(name) for name in seeing)
+    recorded = any(name.endswith("/**") or section.chooses(name) for name in with_frames)
     if section.pictures != "none" and not recorded:
         yield (
             ("record", "pictures"),

@@ -1,4 +1,4 @@
-"""Read the sections of a fleet file on ROS 2."""
+"""Define the sections of a fleet file on ROS 2."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class RosCamera(Fields):
     )
 
     def load_calibration(self, folder: Path) -> AnyCalibration | None:
-        """Return the calibration, None if the file names none.
+        """Read the calibration, and return it; None without ``calibration``.
 
         Args:
             folder: folder of the fleet file.
@@ -102,7 +102,7 @@ class RosCamera(Fields):
         return load_calibration(folder / self.calibration)
 
     def load_hand_eye(self, folder: Path) -> HandEyeCalibration | None:
-        """Return the hand-eye calibration, None without one; like ``load_calibration``."""
+        """Read the hand-eye calibration like :meth:`load_calibration`; None without one."""
         if self.hand_eye is None:
             return None
         from smartcam.calibration import HandEyeCalibration
@@ -110,7 +110,7 @@ class RosCamera(Fields):
         return HandEyeCalibration.load(folder / self.hand_eye)
 
     def robot_pose(self) -> Transform | None:
-        """Return the pose of ``calibrated_at``, None if the file names none.
+        """Return the pose of ``calibrated_at``; None without it.
 
         Raises:
             CalibrationError: the numbers are not a pose.
@@ -119,12 +119,13 @@ class RosCamera(Fields):
             return None
         from smartcam.geometry import Transform
 
-        place, turn = self.calibrated_at[:3], self.calibrated_at[3:]
-        return Transform.from_quaternion("robot", self.flange_frame or "flange", place, turn)
+        position, quaternion = self.calibrated_at[:3], self.calibrated_at[3:]
+        flange = self.flange_frame or "flange"
+        return Transform.from_quaternion("robot", flange, position, quaternion)
 
 
 def node_names(cameras: list[str]) -> dict[str, str]:
-    """Return the name of each camera in the graph.
+    """Return the name of each camera's node in ROS.
 
     Raises:
         ValueError: two cameras have the same name.

@@ -1,4 +1,4 @@
-"""Read the section of a fleet file on standing by."""
+"""Define the section of a fleet file on standby agents."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from smartcam.fleet._file.ros import Fields
 
 
 class Standby(Fields):
-    """The settings of standing by for another agent's cameras."""
+    """The settings of a standby agent, which takes over cameras of a lost agent."""
 
     preference: int = Field(
         0, ge=0, le=3, description="rank among several that stand by: the lowest takes over first"
     )
 
 
-def standby_of(given: object) -> object:
+def expand_standby(value: object) -> object:
     """Return the section for ``standby: true`` or ``false``; other values unchanged."""
-    return {} if given is True else None if given is False else given
+    return {} if value is True else None if value is False else value

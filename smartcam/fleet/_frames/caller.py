@@ -31,30 +31,32 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 OPEN_TIMEOUT = 15.0
-"""Seconds of the timeout for an agent to open its device."""
+"""Seconds that an agent has to open its device."""
 
-ANSWER_TIME = 2.0
-"""Seconds beyond a trigger's timeout for the agent's reply."""
+ANSWER_TIMEOUT = 2.0
+"""Seconds that the agent's reply may come after a trigger's timeout."""
 
 MAX_LENSES = 16
 
 
 class StreamCounts:
-    """The counts of earlier frames in a stream's last reply."""
+    """The counts in a stream's last reply."""
 
     def __init__(self) -> None:
         self._last: tuple[int, int, int, int] | None = None
 
-    def since(self, reply: dict[str, Any], received: int = 1) -> tuple[int, int]:
-        """Return the numbers of skipped and lost frames since the last reply; ``received`` came."""
+    def count_new(self, reply: dict[str, Any], received_count: int = 1) -> tuple[int, int]:
+        """Return the numbers of frames skipped and lost since the last reply."""
         now = int(reply["stream"]), int(reply["sent"]), int(reply["skipped"]), int(reply["lost"])
         last, self._last = self._last, now
-        if last is None or last[0] != now[0]:  # the first reply, or of a new stream at the agent
+        if last is None or last[0] != now[0]:  # the agent has begun a new stream
             last = now[0], 0, 0, 0
         sent, skipped, lost = (
             max(0, new - old) for new, old in zip(now[1:], last[1:], strict=True)
         )
-        return skipped, lost + max(0, sent - received)  # frames that were sent and did not come
+        return skipped, lost + max(
+            0, sent - received_count
+        )  # frames that were sent, but did not arrive
 
 
 class FrameCaller:
@@ -69,8 +71,8 @@ class FrameCaller:
         self.name, self._caller = name, caller
         self._lenses: dict[tuple[int, int], CameraModel | None] = {}
 
-    async def about(self, request: StreamForm) -> StreamFormat:
-        """Return the format of the frames from the device, which is opened for that.
+    async def read_format(self, request: StreamForm) -> StreamFormat:
+        """Return the format of the requested frames; the agent opens its device for this.
 
         Raises:
             SmartCamError: the agent's error.
@@ -81,11 +83,13 @@ class FrameCaller:
         try:
             rates = tuple(float(rate) for rate in answer["rates"])
             size = int(answer["width"]), int(answer["height"])
-            return StreamFormat(find_format(request.pixels(str(answer["format"]))), *size, rates)
+            return StreamFormat(
+                find_format(request.pixel_format(str(answer["format"]))), *size, rates
+            )
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"{self.name}: invalid format of frames: {exc!r}") from exc
 
-    async def frame(
+    async def get_frame(
         self,
         encoding: FrameForm,
         timeout: float,
@@ -111,11 +115,11 @@ class FrameCaller:
         deadline = loop.time() + timeout
         arguments = {**encoding.fields(), "max_age": max_age, "fresh": fresh}
         if moment is not None:
-            # the agent's time then or a little later, so that no older frame passes
-            arguments["after"] = self._caller.clock_at_most(moment + self._ahead)
+            # the latest time that this moment can have on the agent's clock
+            arguments["after"] = self._caller.latest_agent_time(moment + self._clock_lead)
         try:
-            while True:  # asked again if a part was dropped, since the request changes nothing
-                _, frame = await self.ask("frame", deadline, arguments, StreamCounts())
+            while True:  # repeated if a part was dropped; this is safe, as nothing is triggered
+                _, frame = await self.request_frame("frame", deadline, arguments, StreamCounts())
                 if frame is not None:
                     return frame
                 if loop.time() >= deadline:
@@ -136,14 +140,14 @@ class FrameCaller:
         """Trigger the device, and return the trigger's picture.
 
         Raises:
-            FrameLostError: the picture was taken, but did not come completely.
+            FrameLostError: the picture was taken, but did not arrive completely.
             TriggerTimeoutError: the agent did not reply; whether it was triggered is unknown.
             SmartCamError: the agent's error.
         """
-        deadline = asyncio.get_running_loop().time() + timeout + ANSWER_TIME
+        deadline = asyncio.get_running_loop().time() + timeout + ANSWER_TIMEOUT
         arguments = {**encoding.fields(), "wait": wait}
         try:
-            _, frame = await self.ask(
+            _, frame = await self.request_frame(
                 "trigger_frame", deadline, arguments, StreamCounts(), timeout=timeout
             )
         except ResponseTimeoutError as exc:
@@ -154,7 +158,7 @@ class FrameCaller:
             )
         return frame
 
-    async def ask(
+    async def request_frame(
         self,
         do: str,
         deadline: float,
@@ -162,7 +166,7 @@ class FrameCaller:
         counts: StreamCounts,
         timeout: float | None = None,
     ) -> tuple[dict[str, Any], FleetFrame | None]:
-        """Send one request; return the reply, and the frame if it came completely.
+        """Send one request; return the reply, and the frame if it arrived completely.
 
         Args:
             do: ``frame``, ``trigger_frame``, or ``next_frame`` of a stream.
@@ -171,10 +175,10 @@ class FrameCaller:
             counts: counts of the stream.
             timeout: the user's timeout, seconds; by default the time until ``deadline``.
         """
-        answer, frames = await self.ask_all(do, deadline, arguments, counts, timeout)
+        answer, frames = await self.request_frames(do, deadline, arguments, counts, timeout)
         return answer, frames[-1] if frames else None
 
-    async def ask_all(
+    async def request_frames(
         self,
         do: str,
         deadline: float,
@@ -182,11 +186,11 @@ class FrameCaller:
         counts: StreamCounts,
         timeout: float | None = None,
     ) -> tuple[dict[str, Any], list[FleetFrame]]:
-        """Send one request like :meth:`ask`; of H.264 several encoded frames come together."""
+        """Send one request like :meth:`request_frame`; H.264 can have several frames in a reply."""
         caller = self._caller
         caller.require()
         number = caller.program.next_call()
-        incoming = caller.program.frames.expect(caller, number)
+        incoming = caller.program.frames.expect_frame(caller, number)
         sent_at = asyncio.get_running_loop().time()
         try:
             reply = await caller.call(do, deadline, arguments, number=number, timeout=timeout)
@@ -197,19 +201,21 @@ class FrameCaller:
             data = await incoming.complete_data(int(fields["size"]))
             if data is None:
                 return answer, []
-            caller.bound(float(answer["came"]), sent_at)
+            caller.bound_clock(float(answer["came"]), sent_at)
             units = answer.get("units", [fields])
             stream = "stream" in answer
-            skipped, lost = counts.since(answer, len(units)) if stream else (0, int(fields["lost"]))
-            epoch, place = int(reply.fields["epoch"]), 0
+            skipped, lost = (
+                counts.count_new(answer, len(units)) if stream else (0, int(fields["lost"]))
+            )
+            epoch, position = int(reply.fields["epoch"]), 0
             frames: list[FleetFrame] = []
             for unit in units:
-                end = place + int(unit["size"])
-                part = data if len(units) == 1 else memoryview(data)[place:end]
-                frames.append(await self._made(unit, part, lost, epoch, deadline))
-                place, lost = end, 0
-            if place != len(data):
-                raise ValueError(f"{len(data)} bytes of {place}")
+                end = position + int(unit["size"])
+                part = data if len(units) == 1 else memoryview(data)[position:end]
+                frames.append(await self._read_frame(unit, part, lost, epoch, deadline))
+                position, lost = end, 0
+            if position != len(data):
+                raise ValueError(f"{len(data)} bytes of {position}")
         except (KeyError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError):
                 raise
@@ -218,30 +224,30 @@ class FrameCaller:
             incoming.forget()
         return {**answer, "skipped": skipped}, frames
 
-    async def _made(
+    async def _read_frame(
         self, fields: dict[str, Any], data: Data, lost: int, epoch: int, deadline: float
     ) -> FleetFrame:
         """Return the frame for an agent's fields and bytes."""
-        earliest, latest = self._caller.here(float(fields["captured"]))
+        earliest, latest = self._caller.local_times(float(fields["captured"]))
         return from_fields(
             fields,
             data,
-            captured=(earliest + latest) / 2 - self._ahead,
-            doubt=(latest - earliest) / 2,
+            captured=(earliest + latest) / 2 - self._clock_lead,
+            uncertainty=(latest - earliest) / 2,
             lost=lost,
             source=self.name,
             camera_info=await self._lens(epoch, int(fields["lens"]), deadline),
         )
 
     @property
-    def _ahead(self) -> float:
-        """Lead of the loop's clock over the clock of frames, seconds."""
+    def _clock_lead(self) -> float:
+        """Seconds by which the loop's clock is ahead of frames' clock, ``time.monotonic()``."""
         if self._caller.program.bus.local:
             return 0.0  # frames keep their time
         return asyncio.get_running_loop().time() - time.monotonic()
 
     async def _lens(self, epoch: int, number: int, deadline: float) -> CameraModel | None:
-        """Return the lens with a frame's number."""
+        """Return the lens that a frame names by its number; None without one."""
         if not number:
             return None
         key = epoch, number
@@ -257,8 +263,8 @@ class FrameCaller:
                 del self._lenses[next(iter(self._lenses))]
         return self._lenses[key]
 
-    def leave(self, stream: int) -> None:
-        """End a stream."""
+    def end_stream(self, stream: int) -> None:
+        """Tell the agent that a stream has ended."""
         self._caller.notify("leave_frames", {"stream": stream})
 
     def next_stream(self) -> int:
@@ -267,7 +273,7 @@ class FrameCaller:
 
 
 def as_source_error(name: str, error: SmartCamError) -> FrameSourceError:
-    """Return an error as one of the kind that readers of frames expect."""
-    made = FrameSourceError(str(error), source=name)
-    made.__cause__ = error
-    return made
+    """Return an error as a :exc:`FrameSourceError`, which readers of frames expect."""
+    source_error = FrameSourceError(str(error), source=name)
+    source_error.__cause__ = error
+    return source_error

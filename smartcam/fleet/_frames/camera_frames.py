@@ -2,8 +2,9 @@
 
 A program with a stream requests one frame after the other. The request arrives before the next
 frame, so it costs no time; a program that stops requesting gets no frames. Between two requests the
-agent keeps a reader for the program, which skips and counts frames like any reader. The reader is
-closed with its program, or after a time without a request; the device stops with the last reader.
+agent keeps a reader for the program, which skips and counts frames like any reader. The agent
+closes the reader when the program leaves, or after a time without a request. The device stops with
+the last reader.
 """
 
 from __future__ import annotations
@@ -52,22 +53,22 @@ MAX_FRAME_CALLS_PER_PROGRAM = 16
 a frame."""
 
 MAX_ENCODINGS = 16
-"""Number of encodings whose last frame is kept for other viewers with the same encoding."""
+"""Number of encodings whose last frame is kept for other programs with the same encoding."""
 
 MAX_VIDEO_SETTINGS = 4
-"""Largest number of settings of H.264 that are encoded at one time."""
+"""Largest number of different H.264 settings that are encoded at the same time."""
 
 MAX_LENSES = 16
 
 
-class FramesOf(NamedTuple):
-    """The source of a camera's frames.
+class FrameSupply(NamedTuple):
+    """The origin of a camera's frames and pictures.
 
     Attributes:
-        make: function that returns the source; None: there is none.
+        make: function that returns the source of frames; None: there is none.
         url: address of the source, without a password; for people.
         reporter: observer of the camera's sessions that reports the picture of each result;
-            None: there is none.
+            None: no reports.
     """
 
     make: Callable[[], FrameSource] | None
@@ -75,7 +76,7 @@ class FramesOf(NamedTuple):
     reporter: Observer | None = None
 
 
-NO_FRAMES = FramesOf(None, None)
+NO_FRAME_SUPPLY = FrameSupply(None, None)
 
 
 class _Encoded(NamedTuple):
@@ -93,7 +94,7 @@ class SharedFrames:
         name: name of the camera.
         make: function that returns the camera's source; None: the camera has none.
         sender: sender of the frames' bytes.
-        encoder: encoder that makes frames small before they are sent.
+        encoder: encoder that compresses frames before they are sent.
         url: address of the source, without a password; for people.
         reports_pictures: whether observers of the camera get the picture of each result.
     """
@@ -105,11 +106,11 @@ class SharedFrames:
     url: str | None = None
     reports_pictures: bool = False
     _source: FrameSource | None = None
-    _opening: asyncio.Task[FrameSource] | None = None
-    _viewers: dict[tuple[str, int], FrameStream] = field(
+    _opening_task: asyncio.Task[FrameSource] | None = None
+    _streams: dict[tuple[str, int], FrameStream] = field(
         default_factory=dict[tuple[str, int], FrameStream]
     )
-    _asking: dict[str, int] = field(default_factory=dict[str, int])
+    _pending_calls: dict[str, int] = field(default_factory=dict[str, int])
     _videos: dict[FrameForm, SharedVideo] = field(default_factory=dict[FrameForm, "SharedVideo"])
     _encoded: dict[FrameForm, _Encoded] = field(default_factory=dict[FrameForm, _Encoded])
     _lenses: dict[int, CameraModel] = field(default_factory=dict[int, "CameraModel"])
@@ -117,14 +118,14 @@ class SharedFrames:
     _tasks: set[asyncio.Task[Any]] = field(default_factory=set["asyncio.Task[Any]"])
     _closed: bool = False
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ open and close
 
     async def close(self) -> None:
         """End all streams, and release the device. Idempotent."""
         self._closed = True
-        for viewer in self._viewers.values():
-            viewer.close()
-        self._viewers.clear()
+        for stream in self._streams.values():
+            stream.close()
+        self._streams.clear()
         for video in [*self._videos.values()]:
             await video.close()
         self._videos.clear()
@@ -143,28 +144,28 @@ class SharedFrames:
         return self._closed
 
     @property
-    def viewers(self) -> int:
+    def stream_count(self) -> int:
         """Number of streams."""
-        return len(self._viewers)
+        return len(self._streams)
 
     @property
     def statistics(self) -> SourceStatistics | None:
         """Statistics of the source; None if it is not open."""
         return None if self._source is None else self._source.statistics()
 
-    def forget(self, program: str) -> None:
-        """Drop the streams of a program that has left the bus."""
-        for key in [key for key in self._viewers if key[0] == program]:
-            self._viewers.pop(key).close()
+    def forget_program(self, program: str) -> None:
+        """Close the streams of a program that has left the bus."""
+        for key in [key for key in self._streams if key[0] == program]:
+            self._streams.pop(key).close()
 
     async def source(self) -> FrameSource:
-        """Return the source, opened if it is not open.
+        """Return the source; open it first if it is not open.
 
         Raises:
-            UnsupportedError: the camera has none.
-            FrameSourceError: the source cannot be opened; the next one tries again.
+            UnsupportedError: the camera has no source of frames.
+            FrameSourceError: the source cannot be opened; the next call tries again.
 
-        Cancellation: the source is opened nevertheless, for the next viewer.
+        Cancellation: the source is opened nevertheless, for the next call.
         """
         if self._source is not None:
             return self._source
@@ -175,9 +176,9 @@ class SharedFrames:
             )
         if self._closed:
             raise LocalProtocolError(f"{self.name}: the agent ends")
-        if self._opening is None or self._opening.done():
-            self._opening = self._begin(self._open(self.make()), "frames")
-        return await asyncio.shield(self._opening)
+        if self._opening_task is None or self._opening_task.done():
+            self._opening_task = self._start_task(self._open(self.make()), "frames")
+        return await asyncio.shield(self._opening_task)
 
     async def _open(self, source: FrameSource) -> FrameSource:
         await source.__aenter__()
@@ -186,31 +187,33 @@ class SharedFrames:
 
     # ------------------------------------------------------------------ calls
 
-    async def about(self, timeout: float) -> dict[str, Any]:
+    async def format_fields(self, timeout: float) -> dict[str, Any]:
         """Return the format of the camera's frames, as the device reports it."""
-        with self._within(timeout, "the device"):
+        with self._naming_timeout(timeout, "the device"):
             async with asyncio.timeout(timeout):
-                made = (await self.source()).format
+                source_format = (await self.source()).format
         return {
-            "format": made.format.name,
-            "width": made.width,
-            "height": made.height,
-            "rates": list(made.rates),
+            "format": source_format.format.name,
+            "width": source_format.width,
+            "height": source_format.height,
+            "rates": list(source_format.rates),
         }
 
-    async def frame(
+    async def send_frame(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> dict[str, Any]:
-        """Send the frame that :meth:`get` returns."""
+        """Send the frame that :meth:`get_frame` returns; return the fields of the reply."""
         asked_at = asyncio.get_running_loop().time()
-        frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
-        self._send([frame], order)
-        return {"came": asked_at, "frame": self._frame_fields(frame, took)}
+        frame, encoding_time = await self.get_frame(
+            order, max_age=max_age, after=after, fresh=fresh
+        )
+        self._send_bytes([frame], order)
+        return {"came": asked_at, "frame": self._frame_fields(frame, encoding_time)}
 
-    async def get(
+    async def get_frame(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> tuple[Frame, float]:
-        """Return one frame, and the seconds of its encoding.
+        """Return one frame, and the seconds that its encoding took.
 
         Args:
             order: the asking program, and the form of the frame.
@@ -218,43 +221,43 @@ class SharedFrames:
             after: time of the agent's clock after which the frame must be exposed.
             fresh: whether the frame must be exposed after this request.
         """
-        now = time.monotonic() + self.sender.ahead
-        with self._counted(order), self._within(order.timeout, "a frame"):
+        now = time.monotonic() + self.sender.clock_lead
+        with self._counting_call(order), self._naming_timeout(order.timeout, "a frame"):
             async with asyncio.timeout(order.timeout):
                 source = await self.source()
                 if fresh or after is not None:
                     moment = now if after is None else after
-                    frame = await source.after(moment - self.sender.ahead, timeout=None)
+                    frame = await source.after(moment - self.sender.clock_lead, timeout=None)
                 else:
                     age = math.inf if max_age is None else max_age
                     frame = await source.newest(max_age=age, timeout=None)
                 return await self._encode(frame, order.encoding)
 
-    async def trigger(self, order: FrameOrder, *, wait: bool) -> dict[str, Any]:
-        """Trigger the device, and send the picture that this trigger caused."""
+    async def send_triggered_frame(self, order: FrameOrder, *, wait: bool) -> dict[str, Any]:
+        """Trigger the device, and send this trigger's picture; return the fields of the reply."""
         asked_at = asyncio.get_running_loop().time()
-        frame, took = await self.triggered(order, wait=wait)
-        self._send([frame], order)
-        return {"came": asked_at, "frame": self._frame_fields(frame, took)}
+        frame, encoding_time = await self.trigger_frame(order, wait=wait)
+        self._send_bytes([frame], order)
+        return {"came": asked_at, "frame": self._frame_fields(frame, encoding_time)}
 
-    async def triggered(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
-        """Trigger the device; return its picture, and the seconds of its encoding."""
+    async def trigger_frame(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
+        """Trigger the device; return its picture, and the seconds that its encoding took."""
         loop = asyncio.get_running_loop()
-        end = loop.time() + order.timeout
-        with self._counted(order):
-            with self._within(order.timeout, "the device"):
+        deadline = loop.time() + order.timeout
+        with self._counting_call(order):
+            with self._naming_timeout(order.timeout, "the device"):
                 async with asyncio.timeout(order.timeout):
                     source = await self.source()
             frame = await source.trigger(
-                timeout=max(1e-3, end - loop.time()), when_busy="wait" if wait else "refuse"
+                timeout=max(1e-3, deadline - loop.time()), when_busy="wait" if wait else "refuse"
             )
             return await self._encode(frame, order.encoding)
 
     async def features(
         self, name: str | None, timeout: float, *, names_only: bool, value_only: bool
     ) -> dict[str, Any]:
-        """Return the features of the device, or one of them, as JSON."""
-        features = (await self._soon(timeout)).features
+        """Return the features of the device, or the feature with this name, for JSON."""
+        features = (await self._open_source_within(timeout)).features
         if names_only:
             return {"names": await features.names(timeout=timeout)}
         if name is None:
@@ -267,85 +270,89 @@ class SharedFrames:
 
     async def set_feature(self, name: str, value: Any, timeout: float) -> dict[str, Any]:
         """Set a feature; return the value that the device accepted."""
-        source = await self._soon(timeout)
+        source = await self._open_source_within(timeout)
         return {"value": await source.features[name].set(value, timeout=timeout)}
 
     async def execute_feature(self, name: str, timeout: float) -> None:
-        """Execute a command of the device, to its end."""
-        await (await self._soon(timeout)).features[name].execute(timeout=timeout)
+        """Execute a command of the device, and wait until it is done."""
+        await (await self._open_source_within(timeout)).features[name].execute(timeout=timeout)
 
-    async def _soon(self, timeout: float) -> FrameSource:
-        """Return the source, opened if it is not open."""
-        with self._within(timeout, "the device"):
+    async def _open_source_within(self, timeout: float) -> FrameSource:
+        """Return the source; open it first if it is not open, within a timeout."""
+        with self._naming_timeout(timeout, "the device"):
             async with asyncio.timeout(timeout):
                 return await self.source()
 
-    async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
-        """Send the new frames of a stream; an empty list after a time without a frame."""
+    async def send_next_frames(self, order: FrameOrder, stream_number: int) -> dict[str, Any]:
+        """Send the next frames of a stream, and return the fields of the reply.
+
+        If no frame comes in time, the reply is without frames.
+        """
         asked_at = asyncio.get_running_loop().time()
-        key = order.program, stream
-        with self._counted(order):
-            viewer = self._viewers.get(key)
-            if viewer is None:
-                viewer = await self._view(key, order)
-            if viewer.busy:
+        key = order.program, stream_number
+        with self._counting_call(order):
+            stream = self._streams.get(key)
+            if stream is None:
+                stream = await self._begin_stream(key, order)
+            if stream.busy:
                 raise LocalProtocolError(f"{self.name}: two requests for the frames of one stream")
-            if isinstance(viewer, VideoStream) != (order.encoding.name == VIDEO):
+            if isinstance(stream, VideoStream) != (order.encoding.name == VIDEO):
                 raise LocalProtocolError(f"{self.name}: a stream does not become {VIDEO}, nor back")
-            viewer.wake()
+            stream.mark_busy()
             try:
-                taken = await viewer.take(order)
+                taken = await stream.take_frames(order)
             except FrameTimeoutError:
                 raise
             except TimeoutError:
                 return {"came": asked_at}
             except StopAsyncIteration:
-                self._leave(key, viewer)
+                self._end_stream(key, stream)
                 return {"came": asked_at, "ended": True}
             except Exception:
-                self._leave(key, viewer)
+                self._end_stream(key, stream)
                 raise
             finally:
-                if self._viewers.get(key) is viewer:
-                    viewer.mark_idle(lambda: self._leave(key, viewer))
-        self._send([each.frame for each in taken], order)
+                if self._streams.get(key) is stream:
+                    stream.mark_idle(lambda: self._end_stream(key, stream))
+        self._send_bytes([each.frame for each in taken], order)
         return {
             "came": asked_at,
-            "stream": viewer.number,
-            **viewer.counts(),
+            "stream": stream.number,
+            **stream.counts(),
             **self._all_fields(taken),
         }
 
-    async def _view(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
-        """Begin a stream."""
-        with self._within(order.timeout, "the device"):
+    async def _begin_stream(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
+        """Return a new stream with this key, or the one that another call has begun meanwhile."""
+        with self._naming_timeout(order.timeout, "the device"):
             async with asyncio.timeout(order.timeout):
                 source = await self.source()
-        if key in self._viewers:
-            return self._viewers[key]
-        of_program = sum(program == key[0] for program, _ in self._viewers)
+        if key in self._streams:
+            return self._streams[key]
+        program_count = sum(program == key[0] for program, _ in self._streams)
         role = role_of(key[0])
-        like = sum(role_of(program) == role for program, _ in self._viewers)
-        if like >= MAX_STREAMS_PER_ROLE or of_program >= MAX_STREAMS_PER_PROGRAM:
+        role_count = sum(role_of(program) == role for program, _ in self._streams)
+        if role_count >= MAX_STREAMS_PER_ROLE or program_count >= MAX_STREAMS_PER_PROGRAM:
             raise LocalProtocolError(
-                f"{self.name}: {like} streams of frames of role {role}, {of_program} of them this "
-                "program's; no more are possible"
+                f"{self.name}: {role_count} streams of frames of role {role}, {program_count} of "
+                "them this program's; no more are possible"
             )
         number = next(self._numbers)
-        viewer: FrameStream
+        stream: FrameStream
         if order.encoding.name == VIDEO:
-            viewer = VideoStream(number, self._video(source, order.encoding), self._leave_video)
+            video = self._get_video(source, order.encoding)
+            stream = VideoStream(number, video, self._release_video)
         else:
-            viewer = PictureStream(number, source.reader(timeout=None), self._encode)
-        self._viewers[key] = viewer
-        return viewer
+            stream = PictureStream(number, source.reader(timeout=None), self._encode)
+        self._streams[key] = stream
+        return stream
 
-    def _video(self, source: FrameSource, form: FrameForm) -> SharedVideo:
-        """Return the H.264 stream of one setting, for one more viewer."""
+    def _get_video(self, source: FrameSource, form: FrameForm) -> SharedVideo:
+        """Return the shared H.264 of one setting, and count one more stream that uses it."""
         from smartcam.fleet._frames.video import SharedVideo
 
         video = self._videos.get(form)
-        if video is None or video.over:
+        if video is None or video.has_ended:
             if len(self._videos) >= MAX_VIDEO_SETTINGS:
                 raise LocalProtocolError(
                     f"{self.name}: {len(self._videos)} settings of H.264 are encoded; no more are "
@@ -354,45 +361,45 @@ class SharedFrames:
             rates = source.format.rates
             encoder = self.encoder.h264(min(rates) if rates else None, form.bitrate)
             video = self._videos[form] = SharedVideo(source, encoder, self.name)
-        video.viewers += 1
+        video.viewer_count += 1
         return video
 
-    def _leave_video(self, video: SharedVideo) -> None:
-        """Remove a viewer of an H.264 stream; end the stream with its last viewer."""
-        video.viewers -= 1
-        if video.viewers:
+    def _release_video(self, video: SharedVideo) -> None:
+        """Count one stream less that uses the shared H.264; close it after the last one."""
+        video.viewer_count -= 1
+        if video.viewer_count:
             return
         for form in [form for form, known in self._videos.items() if known is video]:
             del self._videos[form]
-        ending = video.end()
-        self._tasks.add(ending)
-        ending.add_done_callback(self._done)
+        closing = video.start_closing()
+        self._tasks.add(closing)
+        closing.add_done_callback(self._on_task_done)
 
-    def leave(self, program: str, stream: int) -> None:
-        """End a stream; does nothing if it is not known."""
-        viewer = self._viewers.get((program, stream))
-        if viewer is not None:
-            self._leave((program, stream), viewer)
+    def end_stream(self, program: str, stream_number: int) -> None:
+        """End a stream; does nothing if there is none with this number."""
+        stream = self._streams.get((program, stream_number))
+        if stream is not None:
+            self._end_stream((program, stream_number), stream)
 
-    def _leave(self, key: tuple[str, int], viewer: FrameStream) -> None:
-        if self._viewers.get(key) is viewer:
-            del self._viewers[key]
-        viewer.close()
-        if not self._viewers:
+    def _end_stream(self, key: tuple[str, int], stream: FrameStream) -> None:
+        if self._streams.get(key) is stream:
+            del self._streams[key]
+        stream.close()
+        if not self._streams:
             self._encoded.clear()
 
-    def lens(self, number: int) -> dict[str, Any]:
-        """Return the lens with a number from a frame; None if it is not known."""
+    def lens_fields(self, number: int) -> dict[str, Any]:
+        """Return the lens that a frame names by this number; None in the field if it is unknown."""
         lens = self._lenses.get(number)
         return {"lens": None if lens is None else lens.to_data()}
 
-    # ------------------------------------------------------------------ a frame
+    # ------------------------------------------------------------------ send and encode
 
-    def _send(self, frames: list[Frame], order: FrameOrder) -> None:
+    def _send_bytes(self, frames: list[Frame], order: FrameOrder) -> None:
         """Send the bytes of frames.
 
         Raises:
-            FrameFormatError: the frame is larger than a frame may be.
+            FrameFormatError: the frames are larger than :data:`MAX_FRAME_BYTES`.
         """
         size = sum(len(frame.data) for frame in frames)
         if size > MAX_FRAME_BYTES:
@@ -403,45 +410,48 @@ class SharedFrames:
         data = frames[0].data if len(frames) == 1 else b"".join(frame.data for frame in frames)
         self.sender.send(order.program, order.call, data)
 
-    def _frame_fields(self, frame: Frame, took: float) -> dict[str, Any]:
+    def _frame_fields(self, frame: Frame, encoding_time: float) -> dict[str, Any]:
         """Return the fields that describe a frame."""
-        return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
+        return to_fields(
+            frame, self.sender.clock_lead, encoding_time, self._lens_number(frame.camera_info)
+        )
 
     def _all_fields(self, taken: list[TakenFrame]) -> dict[str, Any]:
         """Return the fields that describe the frames of one reply."""
         if not taken[-1].number:
-            return {"frame": self._frame_fields(taken[-1].frame, taken[-1].took)}
+            return {"frame": self._frame_fields(taken[-1].frame, taken[-1].encoding_time)}
         units = [
-            {**self._frame_fields(each.frame, each.took), "number": each.number} for each in taken
+            {**self._frame_fields(each.frame, each.encoding_time), "number": each.number}
+            for each in taken
         ]
         return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
 
     async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
-        """Return a frame encoded, once for all equal requests, and the seconds that it took."""
+        """Return a frame encoded, and the seconds that this took; equal requests share the work."""
         if encoding.name == "raw":
             return frame, 0.0
         last = self._encoded.pop(encoding, None)
         if last is None or last.frame is not frame:
             last = _Encoded(
-                frame, self._begin(self.encoder.encoded(frame, encoding), encoding.name)
+                frame, self._start_task(self.encoder.encode(frame, encoding), encoding.name)
             )
         self._encoded[encoding] = last
         if len(self._encoded) > MAX_ENCODINGS:
             del self._encoded[next(iter(self._encoded))]
-        began = time.perf_counter()
-        made = await asyncio.shield(last.task)
-        return made, 0.0 if made is frame else time.perf_counter() - began
+        started_at = time.perf_counter()
+        encoded = await asyncio.shield(last.task)
+        return encoded, 0.0 if encoded is frame else time.perf_counter() - started_at
 
-    def _begin(self, work: Coroutine[Any, Any, T], name: str) -> asyncio.Task[T]:
-        """Start a task that other tasks await; it ends with the agent at the latest."""
+    def _start_task(self, work: Coroutine[Any, Any, T], name: str) -> asyncio.Task[T]:
+        """Start a task that other tasks await; :meth:`close` cancels it."""
         task = asyncio.get_running_loop().create_task(
             work, name=f"smartcam.fleet.{self.name}.{name}"
         )
         self._tasks.add(task)
-        task.add_done_callback(self._done)
+        task.add_done_callback(self._on_task_done)
         return task
 
-    def _done(self, task: asyncio.Task[Any]) -> None:
+    def _on_task_done(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled():
             task.exception()  # the waiting tasks got the error
@@ -459,26 +469,26 @@ class SharedFrames:
         return number
 
     @contextlib.contextmanager
-    def _counted(self, order: FrameOrder) -> Iterator[None]:
-        """Count the pending calls of a program."""
-        under_way = self._asking.get(order.program, 0)
-        if under_way >= MAX_FRAME_CALLS_PER_PROGRAM:
+    def _counting_call(self, order: FrameOrder) -> Iterator[None]:
+        """Count the block as a pending call of its program; refuse too many."""
+        pending_count = self._pending_calls.get(order.program, 0)
+        if pending_count >= MAX_FRAME_CALLS_PER_PROGRAM:
             raise LocalProtocolError(
-                f"{self.name}: {under_way} calls of this program for frames are under way"
+                f"{self.name}: {pending_count} calls of this program for frames are under way"
             )
-        self._asking[order.program] = under_way + 1
+        self._pending_calls[order.program] = pending_count + 1
         try:
             yield
         finally:
-            left = self._asking[order.program] - 1
-            if left:
-                self._asking[order.program] = left
+            pending_count = self._pending_calls[order.program] - 1
+            if pending_count:
+                self._pending_calls[order.program] = pending_count
             else:
-                del self._asking[order.program]
+                del self._pending_calls[order.program]
 
     @contextlib.contextmanager
-    def _within(self, seconds: float, operation: str) -> Iterator[None]:
-        """Raise a timeout in the block as an error that names the operation."""
+    def _naming_timeout(self, seconds: float, operation: str) -> Iterator[None]:
+        """Turn a ``TimeoutError`` of the block into an error that names the operation."""
         try:
             yield
         except TimeoutError as exc:

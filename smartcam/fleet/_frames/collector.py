@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 PART_TIMEOUT = 2.0
-"""Seconds without a further part after which the rest of a frame counts as dropped."""
+"""Seconds without a further part after which a frame counts as broken."""
 
 
-class Incoming:
+class IncomingFrame:
     """A frame whose bytes are being received.
 
     Args:
         collector: collector of the frame's parts.
-        caller: caller that reports to the agent which bytes have come.
+        caller: caller that confirms received bytes to the agent.
         call: number of the call that the frame answers.
     """
 
@@ -35,18 +35,18 @@ class Incoming:
         self._collector, self._caller, self._call = collector, caller, call
         self._data: Data = b""
         self._total: int | None = None
-        self._torn = False
-        self._wanted = False
-        self._stirred = asyncio.Event()
+        self._is_broken = False
+        self._is_awaited = False
+        self._changed = asyncio.Event()
 
-    def take(self, part: FramePart, data: Data) -> None:
-        """Add a part; a part that does not follow the last one ends the frame."""
-        if self._torn or self.complete:
+    def add_part(self, part: FramePart, data: Data) -> None:
+        """Add a part; if it does not follow the last one, the frame is broken."""
+        if self._is_broken or self.complete:
             return
-        have = len(self._data)
-        fits = part.offset == have and have + len(data) <= part.total
+        size = len(self._data)
+        fits = part.offset == size and size + len(data) <= part.total
         if not fits or self._total not in {None, part.total} or (not data and part.total):
-            self._torn = True
+            self._is_broken = True
         elif len(data) == part.total:
             self._total, self._data = part.total, data
         else:
@@ -54,11 +54,11 @@ class Incoming:
                 self._data = bytearray()
             self._total = part.total
             self._data += data
-        over = self._torn or self.complete
-        room = MAX_UNCOUNTED_BYTES if over else WINDOW_BYTES
-        if part.total > room and not self._caller.program.bus.local:
-            self._caller.come(self._call, None if over else len(self._data))
-        self._stirred.set()
+        is_finished = self._is_broken or self.complete
+        unconfirmed_limit = MAX_UNCOUNTED_BYTES if is_finished else WINDOW_BYTES
+        if part.total > unconfirmed_limit and not self._caller.program.bus.local:
+            self._caller.confirm_bytes(self._call, None if is_finished else len(self._data))
+        self._changed.set()
 
     @property
     def complete(self) -> bool:
@@ -66,17 +66,17 @@ class Incoming:
         return self._total is not None and len(self._data) == self._total
 
     async def complete_data(self, size: int) -> Data | None:
-        """Return the frame's bytes; None if some were lost, or do not come in time.
+        """Wait for the frame's bytes, and return them; None if parts are lost or come too late.
 
         Args:
-            size: number of bytes of the frame.
+            size: number of bytes that the frame must have.
         """
-        self._wanted = True
+        self._is_awaited = True
         try:
-            while not self.complete and not self._torn:
-                self._stirred.clear()
+            while not self.complete and not self._is_broken:
+                self._changed.clear()
                 async with asyncio.timeout(PART_TIMEOUT):
-                    await self._stirred.wait()
+                    await self._changed.wait()
         except TimeoutError:
             return None
         return self._data if self.complete and len(self._data) == size else None
@@ -84,8 +84,12 @@ class Incoming:
     def forget(self) -> None:
         """Drop the frame, since no call waits for it any more."""
         self._collector.forget(self._call)
-        if (self._wanted or self._total is not None) and not self.complete and not self._torn:
-            self._caller.come(self._call, None)
+        if (
+            (self._is_awaited or self._total is not None)
+            and not self.complete
+            and not self._is_broken
+        ):
+            self._caller.confirm_bytes(self._call, None)
 
 
 class FrameCollector:
@@ -98,19 +102,19 @@ class FrameCollector:
     def __init__(self, program: Program) -> None:
         self._program = program
         self._handle: Handle | None = None
-        self._incoming: dict[int, Incoming] = {}
+        self._incoming: dict[int, IncomingFrame] = {}
 
-    def expect(self, caller: Caller, call: int) -> Incoming:
-        """Return the incoming frame for the bytes that answer a call."""
+    def expect_frame(self, caller: Caller, call: int) -> IncomingFrame:
+        """Return a new incoming frame, which collects the bytes that answer a call."""
         if self._handle is None:
             program = self._program
             key = program.keys.frames(program.name)
-            self._handle = program.bus.subscribe_parts(key, self._take_part)
-        incoming = self._incoming[call] = Incoming(self, caller, call)
+            self._handle = program.bus.subscribe_parts(key, self._on_part)
+        incoming = self._incoming[call] = IncomingFrame(self, caller, call)
         return incoming
 
     def forget(self, call: int) -> None:
-        """Drop a frame for which no call waits any more, and further parts of it."""
+        """Drop a frame for which no call waits any more; its further parts are ignored."""
         self._incoming.pop(call, None)
 
     def close(self) -> None:
@@ -119,7 +123,7 @@ class FrameCollector:
         if handle is not None:
             handle.close()
 
-    def _take_part(self, key: str, head: bytes, data: Data) -> None:
+    def _on_part(self, key: str, head: bytes, data: Data) -> None:
         try:
             part = decode_part(head)
         except ProtocolError as exc:
@@ -127,4 +131,4 @@ class FrameCollector:
             return
         incoming = self._incoming.get(part.call)
         if incoming is not None:
-            incoming.take(part, data)
+            incoming.add_part(part, data)

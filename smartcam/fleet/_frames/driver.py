@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 _NUMBERS = {"quality": (1, 100), "bitrate": (1e4, 1e9), "latency": (1e-3, 60.0)}
-"""Smallest and largest value of each number in a stream's URL."""
+"""Smallest and largest value of each parameter of a URL that is a number."""
 
 
 class FleetFrameDriver(SharedFrameDriver):
@@ -28,7 +28,7 @@ class FleetFrameDriver(SharedFrameDriver):
     """
 
     def __init__(self, address: FrameAddress) -> None:
-        url, options = _split(address.url)
+        url, options = _split_options(address.url)
         numbers = {
             name: address.number(name, options[name], least, most)
             for name, (least, most) in _NUMBERS.items()
@@ -43,16 +43,16 @@ class FleetFrameDriver(SharedFrameDriver):
             f"{address.shown!r}",
         )
         self._url = url
-        self._camera = self._make()
+        self._camera = self._make_camera()
         super().__init__(address, self._camera.frame_caller, request)
 
-    def _make(self) -> FleetCamera[Any]:
+    def _make_camera(self) -> FleetCamera[Any]:
         return fleet_camera(self._url, {}, ())
 
     async def open(self) -> StreamFormat:
         """Connect to the agent, which opens the device."""
         if self._camera.ended:  # the driver was closed before
-            self._camera = self._make()
+            self._camera = self._make_camera()
             self._frames = self._camera.frame_caller
         try:
             await self._camera.follow(self._camera.settings.connect_timeout, session=False)
@@ -66,10 +66,10 @@ class FleetFrameDriver(SharedFrameDriver):
         await self._camera.close()
 
 
-def _split(url: str) -> tuple[str, dict[str, str]]:
-    """Return a fleet URL, and the options for frames from its query."""
+def _split_options(url: str) -> tuple[str, dict[str, str]]:
+    """Return a fleet URL without the options for frames in its query, and these options."""
     parts = urlsplit(url)
     pairs = parse_qsl(parts.query, keep_blank_values=True)
-    own_options = {key: value for key, value in pairs if key in {"encoding", *_NUMBERS}}
-    query = urlencode([(key, value) for key, value in pairs if key not in own_options])
-    return urlunsplit(parts._replace(query=query)), own_options
+    frame_options = {key: value for key, value in pairs if key in {"encoding", *_NUMBERS}}
+    query = urlencode([(key, value) for key, value in pairs if key not in frame_options])
+    return urlunsplit(parts._replace(query=query)), frame_options

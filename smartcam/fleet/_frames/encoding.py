@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from smartcam.frames import Codecs, Frame
     from smartcam.frames._inside import H264Encoder
 
-FORMATS = {"jpeg": "MJPEG", "png": "PNG", "jpegxl": "JPEGXL", "h264": "H264"}
-"""Pixel format of frames in each encoding."""
+ENCODED_FORMATS = {"jpeg": "MJPEG", "png": "PNG", "jpegxl": "JPEGXL", "h264": "H264"}
+"""Name of the pixel format that frames have in each encoding."""
 
 
 class FrameEncoder:
@@ -19,16 +19,16 @@ class FrameEncoder:
     def __init__(self) -> None:
         self._codecs: Codecs | None = None
 
-    async def encoded(self, frame: Frame, encoding: FrameForm) -> Frame:
-        """Return a frame encoded; unchanged if its camera has encoded it so.
+    async def encode(self, frame: Frame, encoding: FrameForm) -> Frame:
+        """Return a frame in an encoding; unchanged if the camera has already encoded it so.
 
         Raises:
-            FrameFormatError: the codec does not support its pixels, or its bytes are wrong.
+            FrameFormatError: the codec does not support the frame's pixels, or its bytes are wrong.
             MissingExtraError: the codec is not installed.
         """
-        if frame.format.name == FORMATS[encoding.name] and encoding.quality is None:
+        if frame.format.name == ENCODED_FORMATS[encoding.name] and encoding.quality is None:
             return frame
-        codecs = self._threads()
+        codecs = self._codecs_with_threads()
         if encoding.name == "jpeg":
             if encoding.quality is None:
                 return await codecs.jpeg(frame)
@@ -36,19 +36,19 @@ class FrameEncoder:
         return await (codecs.png if encoding.name == "png" else codecs.jpegxl)(frame)
 
     def h264(self, fps: float | None, bitrate: int | None) -> H264Encoder:
-        """Return an encoder of one stream, in the same threads.
+        """Return an encoder of one stream, which works in the same threads.
 
         Args:
-            fps: frames per second, as far as is known.
-            bitrate: bits per second; None: of even quality.
+            fps: frames per second; None: unknown.
+            bitrate: bits per second; None: constant quality.
 
         Raises:
             MissingExtraError: the codec is not installed.
         """
         rate = 30.0 if fps is None else min(1000.0, max(0.01, fps))
-        return self._threads().h264_encoder(fps=rate, bitrate=bitrate)
+        return self._codecs_with_threads().h264_encoder(fps=rate, bitrate=bitrate)
 
-    def _threads(self) -> Codecs:
+    def _codecs_with_threads(self) -> Codecs:
         if self._codecs is None:
             from smartcam.frames import Codecs  # with numpy, which not every agent needs
 

@@ -32,7 +32,7 @@ def feature_fields(feature: Feature) -> dict[str, Any]:
 
 
 def read_feature(data: object, owner: str) -> Feature:
-    """Return the feature in an agent's fields.
+    """Return the feature that an agent's fields describe.
 
     Raises:
         RemoteProtocolError: the fields are not a valid feature.
@@ -98,16 +98,16 @@ class FleetFeatures(DeviceFeatures):
 
     async def describe_all(self) -> dict[str, Feature]:
         """Return all features with their current values and ranges."""
-        return {feature.name: feature for feature in await self._described()}
+        return {feature.name: feature for feature in await self._describe()}
 
     async def describe(self, name: str) -> Feature:
         """Return a feature with its current value and range."""
-        features = await self._described(name=name)
+        features = await self._describe(name=name)
         if len(features) != 1:
             raise RemoteProtocolError(f"{self._name}: expected one feature, got {len(features)}")
         return features[0]
 
-    async def _described(self, **arguments: Any) -> list[Feature]:
+    async def _describe(self, **arguments: Any) -> list[Feature]:
         answer = await self._call("features", **arguments)
         return [read_feature(feature, self._name) for feature in self._list(answer, "features")]
 

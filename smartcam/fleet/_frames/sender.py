@@ -1,9 +1,9 @@
 """Send an agent's frames, never more bytes at a time than a program's window allows.
 
-Each program has a window of sent bytes that it has not confirmed. It confirms received bytes, and
-then gets more. So a program that is slow, stopped or dead fills only its own queue, delays no other
-program, and skips frames that it does not take in time. There is no task for it: each confirmation
-sends the next part.
+The window limits the sent bytes that a program has not confirmed yet. A program confirms received
+bytes, and then gets more. So a program that is slow, stopped or dead fills only its own queue,
+delays no other program, and skips frames that it does not take in time. No task does this: each
+confirmation sends the next part.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.keys import Keys
 
 PART_BYTES = 1 << 17
-"""Bytes of a part: the loop takes less than 0.1 ms to pass them to the engine."""
+"""Bytes of a part. The loop takes less than 0.1 ms to pass a part to the engine."""
 
 WINDOW_BYTES = 3 * PART_BYTES
-"""Unconfirmed bytes of one program. The engine's queue has room for 16 packets of 64 kB, and drops
-further ones; two programs that are connected through one router share that queue."""
+"""Largest number of unconfirmed bytes of one program. The engine's queue has room for 16 packets of
+64 kB, and drops further ones; two programs that are connected through one router share that
+queue."""
 
 MAX_UNCOUNTED_BYTES = 1 << 16
-"""Largest number of bytes of a frame that is one packet, and not counted, since it is not
-confirmed."""
+"""Largest number of bytes of a frame that is sent as one packet. It is neither confirmed nor
+counted in the window."""
 
 MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes of frames that may wait for one program; beyond it the oldest frame that
-was not begun is dropped."""
+has not been sent in part is dropped."""
 
-STALE_AFTER = 10.0
+CONFIRMATION_TIMEOUT = 10.0
 """Seconds without a confirmation after which a frame is dropped."""
 
 
@@ -45,13 +46,13 @@ class _Transfer:
 
     call: int
     data: memoryview
-    moved_at: float
-    sent: int = 0
-    come: int = 0
+    confirmed_at: float
+    sent_bytes: int = 0
+    confirmed_bytes: int = 0
 
     @property
-    def under_way(self) -> int:
-        return self.sent - self.come
+    def unconfirmed_bytes(self) -> int:
+        return self.sent_bytes - self.confirmed_bytes
 
 
 @dataclass(eq=False)
@@ -63,11 +64,11 @@ class _Window:
     )
 
     @property
-    def under_way(self) -> int:
-        return sum(transfer.under_way for transfer in self.transfers.values())
+    def unconfirmed_bytes(self) -> int:
+        return sum(transfer.unconfirmed_bytes for transfer in self.transfers.values())
 
     @property
-    def waiting(self) -> int:
+    def waiting_bytes(self) -> int:
         return sum(len(transfer.data) for transfer in self.transfers.values())
 
 
@@ -84,67 +85,71 @@ class FrameSender:
         self._windows: dict[str, _Window] = {}
 
     @property
-    def ahead(self) -> float:
-        """Lead of the agent's clock over the clock of frames, seconds.
+    def clock_lead(self) -> float:
+        """Seconds by which the loop's clock is ahead of ``time.monotonic()``, the clock of frames.
 
-        If all ends are in one process, frames keep their time.
+        0 if all programs are in this process, where frames keep their time.
         """
         if self._bus.local:
             return 0.0
         return asyncio.get_running_loop().time() - time.monotonic()
 
     def send(self, program: str, call: int, data: Data) -> None:
-        """Send a frame's bytes as the answer to a call, as far as there is room now."""
+        """Send a frame's bytes as the answer to a call: now as many as the window allows."""
         total = len(data)
         if self._bus.local or total <= MAX_UNCOUNTED_BYTES:
-            self._put(program, FramePart(call, 0, total), data)
+            self._send_part(program, FramePart(call, 0, total), data)
             return
         window = self._windows.setdefault(program, _Window())
         now = asyncio.get_running_loop().time()
         for transfer in [*window.transfers.values()]:
-            # a frame that was begun stays, unless it is old
-            full = window.waiting + total > MAX_WAITING_BYTES and not transfer.under_way
-            if full or now - transfer.moved_at > STALE_AFTER:
+            # a frame that was sent in part stays, unless its confirmation is overdue
+            is_dropped = (
+                window.waiting_bytes + total > MAX_WAITING_BYTES and not transfer.unconfirmed_bytes
+            )
+            if is_dropped or now - transfer.confirmed_at > CONFIRMATION_TIMEOUT:
                 del window.transfers[transfer.call]
         window.transfers[call] = _Transfer(call, memoryview(data), now)
-        self._push(program, window)
+        self._send_parts(program, window)
 
-    def come(self, program: str, call: int, offset: int | None) -> None:
-        """Note the confirmed bytes of a frame; None: all, or no more are wanted."""
+    def confirm(self, program: str, call: int, offset: int | None) -> None:
+        """Note how many bytes of a frame the program has; None: it wants no more of them."""
         window = self._windows.get(program)
         transfer = None if window is None else window.transfers.get(call)
         if window is None or transfer is None:
             return
-        transfer.moved_at = asyncio.get_running_loop().time()
-        transfer.come = max(transfer.come, min(offset or 0, transfer.sent))
-        if offset is None or transfer.come == len(transfer.data):
+        transfer.confirmed_at = asyncio.get_running_loop().time()
+        transfer.confirmed_bytes = max(
+            transfer.confirmed_bytes, min(offset or 0, transfer.sent_bytes)
+        )
+        if offset is None or transfer.confirmed_bytes == len(transfer.data):
             del window.transfers[call]
         if window.transfers:
-            self._push(program, window)
+            self._send_parts(program, window)
         else:
             del self._windows[program]
 
-    def forget(self, program: str) -> None:
-        """Drop the frames of a lost program."""
+    def forget_program(self, program: str) -> None:
+        """Drop the frames of a program that has left the bus."""
         self._windows.pop(program, None)
 
     def close(self) -> None:
         """Stop sending."""
         self._windows.clear()
 
-    def _push(self, program: str, window: _Window) -> None:
-        """Send parts while there is room, the oldest frame's first."""
-        room = WINDOW_BYTES - window.under_way
+    def _send_parts(self, program: str, window: _Window) -> None:
+        """Send parts while the window allows it; those of the oldest frame first."""
+        room = WINDOW_BYTES - window.unconfirmed_bytes
         for transfer in window.transfers.values():
-            while transfer.sent < len(transfer.data):
-                part = transfer.data[transfer.sent : transfer.sent + PART_BYTES]
+            while transfer.sent_bytes < len(transfer.data):
+                part = transfer.data[transfer.sent_bytes : transfer.sent_bytes + PART_BYTES]
                 if len(part) > room:
                     return
                 room -= len(part)
-                self._put(
-                    program, FramePart(transfer.call, transfer.sent, len(transfer.data)), part
+                self._send_part(
+                    program, FramePart(transfer.call, transfer.sent_bytes, len(transfer.data)), part
                 )
-                transfer.sent += len(part)
+                transfer.sent_bytes += len(part)
 
-    def _put(self, program: str, part: FramePart, data: Data) -> None:
+    def _send_part(self, program: str, part: FramePart, data: Data) -> None:
         self._bus.put_part(self._keys.frames(program), encode_part(part), data)

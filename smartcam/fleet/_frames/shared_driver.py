@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._frames.caller import FrameCaller
     from smartcam.fleet._frames.stream_form import StreamForm
-    from smartcam.fleet._frames.units import VideoUnits
+    from smartcam.fleet._frames.units import VideoReceiver
     from smartcam.fleet._frames.wire import FleetFrame
     from smartcam.frames import (
         AwaitedTrigger,
@@ -39,14 +39,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 ANSWER_TIMEOUT = 4.0
-"""Seconds of the timeout for the answer to a stream's request, beyond its wait for a frame: for
-the encoding and the transfer."""
+"""Seconds for encoding and transfer that a stream's request has beyond its wait for a frame."""
 
 MAX_UNANSWERED_REQUESTS = 3
 """Number of consecutive requests without an answer after which a stream has ended."""
 
 MAX_BROKEN_FRAMES = 10
-"""Number of consecutive incomplete frames after which a stream has ended, too."""
+"""Number of consecutive incomplete frames after which a stream has ended."""
 
 
 class SharedFrameDriver(FrameDriver):
@@ -64,7 +63,7 @@ class SharedFrameDriver(FrameDriver):
         super().__init__(address)
         self._frames, self._request = frames, request
         self._task: asyncio.Task[None] | None = None
-        self._video: VideoUnits | None = None
+        self._video: VideoReceiver | None = None
 
     @property
     def name(self) -> str:
@@ -75,14 +74,14 @@ class SharedFrameDriver(FrameDriver):
         """Make the agent open the device.
 
         Raises:
-            FrameSourceError: the agent cannot open it, or there is no agent.
+            FrameSourceError: the agent cannot open the device, or there is no agent.
             UnsupportedError: the camera has no frames.
             MissingExtraError: the package that decodes H.264 is not installed here.
         """
         if self._request.form.name == VIDEO and self._request.decode:
             load("av")
         try:
-            return await self._frames.about(self._request)
+            return await self._frames.read_format(self._request)
         except (FrameSourceError, UnsupportedError, ConfigurationError):
             raise
         except SmartCamError as exc:
@@ -119,14 +118,14 @@ class SharedFrameDriver(FrameDriver):
     async def start(self, sink: FrameSink) -> None:
         """Start to request one frame after the other."""
         if self._request.form.name == VIDEO:
-            from smartcam.fleet._frames.units import VideoUnits
+            from smartcam.fleet._frames.units import VideoReceiver
 
-            self._video = VideoUnits(decode=self._request.decode)
+            self._video = VideoReceiver(decode=self._request.decode)
         stream = self._frames.next_stream()
         self._task = asyncio.get_running_loop().create_task(
-            self._ask(sink, stream), name=f"frames of {self.name}"
+            self._run(sink, stream), name=f"frames of {self.name}"
         )
-        self._task.add_done_callback(lambda _: self._frames.leave(stream))
+        self._task.add_done_callback(lambda _: self._frames.end_stream(stream))
 
     async def stop(self) -> None:
         """Stop requesting frames."""
@@ -144,46 +143,46 @@ class SharedFrameDriver(FrameDriver):
         """Stop requesting frames."""
         await self.stop()
 
-    async def _ask(self, sink: FrameSink, stream: int) -> None:
+    async def _run(self, sink: FrameSink, stream: int) -> None:
         try:
-            end = await self._until_end(sink, stream)
+            end = await self._receive_until_end(sink, stream)
         except Exception as exc:
             logger.exception("%s ! its frames end", self.name)
             end = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
         sink.ended(end)
 
-    async def _until_end(self, sink: FrameSink, stream: int) -> FrameSourceError | None:
-        """Receive frames until the end, and return its reason."""
+    async def _receive_until_end(self, sink: FrameSink, stream: int) -> FrameSourceError | None:
+        """Receive frames until the stream ends; return the error that ended it."""
         loop = asyncio.get_running_loop()
-        counts, silent, torn = StreamCounts(), 0, 0
+        counts, unanswered_count, broken_count = StreamCounts(), 0, 0
         while True:
             try:
                 deadline = loop.time() + HOLD_TIMEOUT + ANSWER_TIMEOUT
-                answer, frames = await self._frames.ask_all(
+                answer, frames = await self._frames.request_frames(
                     "next_frame", deadline, self._arguments(stream), counts
                 )
             except FrameSourceError as exc:
                 return exc
             except ResponseTimeoutError as exc:
-                silent += 1
-                if silent >= MAX_UNANSWERED_REQUESTS:
+                unanswered_count += 1
+                if unanswered_count >= MAX_UNANSWERED_REQUESTS:
                     return as_source_error(self.name, exc)
                 continue
             except SmartCamError as exc:
                 return as_source_error(self.name, exc)
-            silent = 0
+            unanswered_count = 0
             if frames:
-                torn = 0
+                broken_count = 0
                 if answer["skipped"]:
                     sink.skipped(answer["skipped"])
-                await self._give(sink, answer, frames)
+                await self._pass_frames(sink, answer, frames)
             elif answer.get("ended"):
                 return None
             elif "frame" in answer:
-                torn += 1
-                if torn >= MAX_BROKEN_FRAMES:
+                broken_count += 1
+                if broken_count >= MAX_BROKEN_FRAMES:
                     return FrameSourceError(
-                        f"{self.name}: {torn} frames in a row did not come here whole",
+                        f"{self.name}: {broken_count} frames in a row did not come here whole",
                         source=self.name,
                     )
 
@@ -194,15 +193,15 @@ class SharedFrameDriver(FrameDriver):
         if rate is not None:
             arguments |= {"quality": rate.quality, "rest": rate.pause}
         if self._video is not None:
-            arguments["have"] = self._video.have
+            arguments["have"] = self._video.last_number
         return arguments
 
-    async def _give(
+    async def _pass_frames(
         self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]
     ) -> None:
         """Pass received frames to the readers."""
         if self._video is not None:
-            await self._video.give(sink, answer, frames)
+            await self._video.give_frames(sink, answer, frames)
             return
         frame, rate = frames[-1], self._request.rate
         if rate is not None:

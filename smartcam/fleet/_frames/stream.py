@@ -1,4 +1,4 @@
-"""The streams of frames at an agent, which choose the next frames for programs."""
+"""Define streams of frames at an agent, which choose the next frame for a program."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameReader
 
 IDLE_TIMEOUT = 3.0
-"""Seconds without a request after which a stream has ended."""
+"""Seconds without a request after which a stream is closed."""
 
 HOLD_TIMEOUT = 1.0
-"""Seconds for which a request waits for a frame; then the answer is that there is none."""
+"""Seconds for which a request waits for a frame; after that, it is answered without one."""
 
 
 class FrameOrder(NamedTuple):
-    """A request for a frame: the program, and the form.
+    """A program's request for a frame.
 
     Attributes:
         program: name of the program.
-        call: number of the program's call.
+        call: number of the call among the program's calls.
         encoding: form of the frame.
         timeout: seconds of the call's timeout.
         min_interval: least seconds from one frame of a stream to the next.
-        have: number, for H.264, of the last encoded frame that the program has; 0 for none.
+        have: number of the last H.264 frame that the program has; 0 for none.
     """
 
     program: str
@@ -44,16 +44,16 @@ class FrameOrder(NamedTuple):
 
 
 class TakenFrame(NamedTuple):
-    """A frame for a program.
+    """A frame that was taken from a stream for a program.
 
     Attributes:
         frame: the encoded frame.
-        took: seconds to encode it.
-        number: place of a frame of H.264 in the stream; otherwise 0.
+        encoding_time: seconds to encode the frame.
+        number: number of a frame of H.264 in its stream; otherwise 0.
     """
 
     frame: Frame
-    took: float
+    encoding_time: float
     number: int = 0
 
 
@@ -64,41 +64,42 @@ class FrameStream(ABC):
     Attributes:
         number: number of the stream.
         busy: whether a request of the stream is running.
+        idle_timer: timer that closes an idle stream; None while the stream is busy.
     """
 
     number: int
-    idle: asyncio.TimerHandle | None = field(default=None, kw_only=True)
+    idle_timer: asyncio.TimerHandle | None = field(default=None, kw_only=True)
     busy: bool = field(default=False, kw_only=True)
 
     def mark_idle(self, close: Callable[[], None]) -> None:
-        """Count the stream as idle; ``close`` is called if it stays so."""
+        """Count the stream as idle; call ``close`` after :data:`IDLE_TIMEOUT` without a request."""
         self.busy = False
-        self.idle = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, close)
+        self.idle_timer = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, close)
 
-    def wake(self) -> None:
-        """Count the stream as busy with a request."""
+    def mark_busy(self) -> None:
+        """Count the stream as busy with a request; stop the timer of an idle stream."""
         self.busy = True
-        if self.idle is not None:
-            self.idle.cancel()
-            self.idle = None
+        if self.idle_timer is not None:
+            self.idle_timer.cancel()
+            self.idle_timer = None
 
     @abstractmethod
-    async def take(self, order: FrameOrder) -> list[TakenFrame]:
+    async def take_frames(self, order: FrameOrder) -> list[TakenFrame]:
         """Return the next frame, or several frames of H.264.
 
         Raises:
-            TimeoutError: there is no frame for now.
+            TimeoutError: no frame came in time; the stream goes on.
             StopAsyncIteration: the stream has ended.
             SmartCamError: the stream has ended with this error.
         """
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
-        """Return the numbers of sent, skipped and lost frames, for the next reply."""
+        """Return the numbers of frames sent, skipped and lost, for the next reply."""
 
     def close(self) -> None:
         """End the stream. Idempotent."""
-        self.wake()
+        self.mark_busy()
 
 
 @dataclass(eq=False)
@@ -107,18 +108,20 @@ class PictureStream(FrameStream):
 
     Args:
         reader: reader of the source.
-        encode: function that encodes a frame and returns the seconds that this took.
+        encode: function that returns a frame encoded, and the seconds that this took.
     """
 
     reader: FrameReader
     encode: Callable[[Frame, FrameForm], Awaitable[tuple[Frame, float]]]
     pace: FramePace = field(default_factory=FramePace)
 
-    async def take(self, order: FrameOrder) -> list[TakenFrame]:
+    async def take_frames(self, order: FrameOrder) -> list[TakenFrame]:
         loop, reader = asyncio.get_running_loop(), self.reader
-        since, until = self.pace.window(loop.time(), reader.last_arrival, order.min_interval)
+        oldest_arrival, wait_until = self.pace.choose_window(
+            loop.time(), reader.last_arrival, order.min_interval
+        )
         async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
-            await reader.fresh(since, until)
+            await reader.fresh(oldest_arrival, wait_until)
             frame = await anext(reader)
         self.pace.note_taken(reader.last_arrival, reader.statistics().offered)
         async with asyncio.timeout(order.timeout):
@@ -137,37 +140,38 @@ class PictureStream(FrameStream):
 
 @dataclass(eq=False)
 class VideoStream(FrameStream):
-    """A stream of H.264: all encoded frames after the frames that the program has.
+    """A stream of H.264, of which a program gets all encoded frames, in order.
 
     Args:
         video: the encoder's stream, shared with other viewers.
-        leave: function that is called at the end; None after it.
+        release_video: function that is called once when this stream is closed; None afterwards.
     """
 
     video: SharedVideo
-    leave: Callable[[SharedVideo], None] | None
-    _highest: int = 0
-    _sent: int = 0
-    _first: tuple[int, int] | None = None  # frames offered and lost before the first one
-    _last: tuple[int, int] = (0, 0)
+    release_video: Callable[[SharedVideo], None] | None
+    _highest_number: int = 0
+    _sent_count: int = 0
+    _first_counts: tuple[int, int] | None = None  # frames offered and lost before the first frame
+    _last_counts: tuple[int, int] = (0, 0)
 
-    async def take(self, order: FrameOrder) -> list[TakenFrame]:
+    async def take_frames(self, order: FrameOrder) -> list[TakenFrame]:
         async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
-            units = await self.video.after(order.have)
-        if self._first is None:
-            self._first = units[0].offered - 1, units[0].lost
-        self._sent += sum(unit.number > self._highest for unit in units)
-        self._highest = max(self._highest, units[-1].number)
-        self._last = units[-1].offered, units[-1].lost
-        return [TakenFrame(unit.frame, unit.took, unit.number) for unit in units]
+            units = await self.video.next_units(order.have)
+        if self._first_counts is None:
+            self._first_counts = units[0].offered_count - 1, units[0].lost_count
+        self._sent_count += sum(unit.number > self._highest_number for unit in units)
+        self._highest_number = max(self._highest_number, units[-1].number)
+        self._last_counts = units[-1].offered_count, units[-1].lost_count
+        return [TakenFrame(unit.frame, unit.encoding_time, unit.number) for unit in units]
 
     def counts(self) -> dict[str, int]:
-        offered, lost = self._first or (0, 0)
-        skipped = self._last[0] - offered - self._sent
-        return {"sent": self._sent, "skipped": skipped, "lost": self._last[1] - lost}
+        first_offered, first_lost = self._first_counts or (0, 0)
+        skipped = self._last_counts[0] - first_offered - self._sent_count
+        lost = self._last_counts[1] - first_lost
+        return {"sent": self._sent_count, "skipped": skipped, "lost": lost}
 
     def close(self) -> None:
         super().close()
-        leave, self.leave = self.leave, None
-        if leave is not None:
-            leave(self.video)
+        release_video, self.release_video = self.release_video, None
+        if release_video is not None:
+            release_video(self.video)

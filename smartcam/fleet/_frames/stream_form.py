@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._frames.encoding import FORMATS
+from smartcam.fleet._frames.encoding import ENCODED_FORMATS
 from smartcam.fleet._frames.wire import VIDEO, FrameForm
 from smartcam.frames import RateControl, find_format
 
@@ -14,9 +14,9 @@ class StreamForm(NamedTuple):
     """A program's request for a stream.
 
     Attributes:
-        form: form in which frames come.
+        form: form of the frames.
         rate: control of the stream's bit rate or latency; None for no control.
-        decode: whether H.264 becomes pictures again.
+        decode: whether the program decodes H.264 to pictures.
     """
 
     form: FrameForm = FrameForm()
@@ -34,10 +34,10 @@ class StreamForm(NamedTuple):
         *,
         decode: bool = True,
     ) -> StreamForm:
-        """Return a checked request of ``caller``, with arguments of :meth:`smartcam.Camera.frames`.
+        """Check arguments of :meth:`smartcam.Camera.frames`, and return the request.
 
         Raises:
-            ConfigurationError: the arguments do not fit together, or one is out of range.
+            ConfigurationError: arguments exclude each other, or one is out of range.
         """
         if bitrate is None and latency is None:
             return cls(FrameForm.checked(encoding, quality, caller, stream=True), None, decode)
@@ -57,15 +57,16 @@ class StreamForm(NamedTuple):
             )
         return cls(FrameForm("jpeg"), RateControl(bitrate, latency), decode)
 
-    def pixels(self, given: str) -> str:
-        """Return the format of received frames from the camera's format."""
+    def pixel_format(self, camera_format: str) -> str:
+        """Return the name of the received frames' pixel format, for the camera's pixel format."""
         if self.form.name != VIDEO or not self.decode:
-            return FORMATS.get(self.form.name, given)
+            return ENCODED_FORMATS.get(self.form.name, camera_format)
         from smartcam.frames._inside import colour_properties, format_of
 
-        if given in _ENCODED_AS_LIMITED:
+        if camera_format in _ENCODED_AS_LIMITED:
             return "I420"
-        return format_of("yuv420p", *colour_properties(find_format(given))).name
+        return format_of("yuv420p", *colour_properties(find_format(camera_format))).name
 
 
 _ENCODED_AS_LIMITED = {"MJPEG", "RGB8", "BGR8"}
+"""Pixel formats that become H.264 of limited range."""

@@ -17,24 +17,25 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 TAKE_TIMEOUT = 1.0
-"""Seconds that readers have for an encoded frame before the next one of the same answer."""
+"""Seconds to wait for readers before they get the next encoded frame of the same answer."""
 
 
-class VideoUnits:
-    """Receives encoded frames, and gives pictures to the readers.
+class VideoReceiver:
+    """Receives encoded frames, and gives decoded pictures to the readers.
 
     Args:
-        decode: False to give the encoded frames instead.
+        decode: False to give the encoded frames without decoding them.
 
     Attributes:
-        have: number of the last encoded frame that was decoded; 0: no frame was.
+        last_number: number of the last encoded frame that was given on; 0: the next frame must be
+            a key frame.
 
     Raises:
         MissingExtraError: the package that decodes is not installed.
     """
 
     def __init__(self, *, decode: bool) -> None:
-        self.have = 0
+        self.last_number = 0
         self._codecs = Codecs(threads=1)
         self._codecs.begin()
         self._decoder = self._codecs.h264_decoder() if decode else None
@@ -43,7 +44,9 @@ class VideoUnits:
         """End the thread. Idempotent."""
         await self._codecs.close()
 
-    async def give(self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]) -> None:
+    async def give_frames(
+        self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]
+    ) -> None:
         """Give received frames in order; frames that cannot be decoded count as lost.
 
         Raises:
@@ -53,29 +56,29 @@ class VideoUnits:
             numbers = [int(unit["number"]) for unit in answer["units"]]
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"the agent's reply on H.264 is not valid: {exc!r}") from exc
-        for place, (number, frame) in enumerate(zip(numbers, frames, strict=True)):
+        for index, (number, frame) in enumerate(zip(numbers, frames, strict=True)):
             if self._decoder is None:
-                self.have = number
-                await self._give_encoded(sink, frame, last=place == len(frames) - 1)
+                self.last_number = number
+                await self._give_encoded(sink, frame, is_last=index == len(frames) - 1)
                 continue
             try:
-                if number != self.have + 1:
+                if number != self.last_number + 1:
                     self._decoder.lost()
                 picture = await self._decoder.decode(frame)
             except FrameFormatError as exc:
                 logger.warning("%s", exc)
                 picture = None
             if picture is None:  # the next received frame is a key frame
-                self.have = 0
-                sink.lost(len(frames) - place)
+                self.last_number = 0
+                sink.lost(len(frames) - index)
                 return
-            self.have = number
+            self.last_number = number
             sink.frame(picture)
 
-    async def _give_encoded(self, sink: FrameSink, frame: FleetFrame, *, last: bool) -> None:
-        """Give an encoded frame; readers take it before the next one, unless they are slow."""
+    async def _give_encoded(self, sink: FrameSink, frame: FleetFrame, *, is_last: bool) -> None:
+        """Give an encoded frame; unless it is the last, wait until the readers have taken it."""
         sink.frame(frame)
-        if not last:
+        if not is_last:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(TAKE_TIMEOUT):
                     await sink.wait_taken()

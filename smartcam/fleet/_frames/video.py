@@ -1,8 +1,9 @@
-"""Encode a camera's frames as H.264 at its agent: one encoder per setting for all programs.
+"""Encode a camera's frames as H.264 at its agent.
 
-A frame of H.264 needs those before it. So the last few are kept, and a request gets all frames
-since the program's last one; a program that is too late gets nothing until the next key frame,
-which is made for it, but at most once in :data:`KEY_EVERY` seconds.
+Programs that request the same settings share one encoder. To decode a frame of H.264, a program
+needs all frames since the last key frame. So the agent keeps the last few encoded frames, and a
+program gets all frames after its last one. A program that lags too far gets nothing until the next
+key frame. It is made for this program, but at most once in :data:`MIN_KEY_INTERVAL` seconds.
 """
 
 from __future__ import annotations
@@ -19,35 +20,35 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource
     from smartcam.frames._inside import H264Encoder
 
-LATE_SECONDS = 0.3
-"""Seconds for which an encoded frame is kept for programs that have the frames before it."""
+MAX_LAG = 0.3
+"""Largest age of an encoded frame that is still sent, unless it is the newest, seconds."""
 
 MAX_UNITS_KEPT = 64
 
-KEY_EVERY = 1.0
-"""Least seconds from one key frame to the next."""
+MIN_KEY_INTERVAL = 1.0
+"""Least time from one key frame to the next, seconds."""
 
 
 class VideoUnit(NamedTuple):
     """An encoded frame.
 
     Attributes:
-        number: number of the unit, one more than the number of the unit before.
+        number: number of this encoded frame; each is one more than the previous number.
         frame: the encoded frame.
-        took: seconds to encode it.
-        key: whether the unit can be decoded without the units before it.
-        made: time of the loop's clock at which the unit was made.
-        offered: number of frames that the source gave until then.
-        lost: number of frames that the source lost until then.
+        encoding_time: seconds to encode the frame.
+        is_key_frame: whether the frame can be decoded without earlier frames.
+        encoded_at: time of the loop's clock at which the frame was encoded.
+        offered_count: number of frames that the source had given at that time.
+        lost_count: number of frames that the source had lost at that time.
     """
 
     number: int
     frame: Frame
-    took: float
-    key: bool
-    made: float
-    offered: int
-    lost: int
+    encoding_time: float
+    is_key_frame: bool
+    encoded_at: float
+    offered_count: int
+    lost_count: int
 
 
 class SharedVideo:
@@ -55,7 +56,7 @@ class SharedVideo:
 
     Args:
         source: source of the frames.
-        encoder: encoder for this stream alone.
+        encoder: encoder that no other stream uses.
         name: name of the camera.
     """
 
@@ -63,77 +64,83 @@ class SharedVideo:
         self._encoder = encoder
         self._reader = source.reader(timeout=None)
         self._units: collections.deque[VideoUnit] = collections.deque(maxlen=MAX_UNITS_KEPT)
-        self._stirred = asyncio.Event()
-        self._over: tuple[Exception | None] | None = None
+        self._changed = asyncio.Event()
+        self._end_cause: tuple[Exception | None] | None = None  # (None,): the source ended
         self._name = name
-        self._last_key = -KEY_EVERY
-        self._key_wanted = False
-        self.viewers = 0
+        self._last_key_at = -MIN_KEY_INTERVAL
+        self._needs_key_frame = False
+        self.viewer_count = 0
         self._task = asyncio.get_running_loop().create_task(
             self._run(), name=f"smartcam.fleet.{name}.h264"
         )
-        self._task.add_done_callback(self._ended)
+        self._task.add_done_callback(self._on_task_done)
 
-    def _ended(self, _: asyncio.Task[None]) -> None:
-        """Wake the readers at the task's end, even of a task that was cancelled before it began."""
-        if self._over is None:
-            self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
+    def _on_task_done(self, _: asyncio.Task[None]) -> None:
+        """Wake the waiting programs, even if the task was cancelled before its first step."""
+        if self._end_cause is None:
+            self._end_cause = (
+                FrameSourceError(f"{self._name}: its video ended", source=self._name),
+            )
         self._reader.close()
         self._units.clear()
-        self._stirred.set()
+        self._changed.set()
 
     @property
-    def over(self) -> bool:
+    def has_ended(self) -> bool:
         """True once no more frames come."""
-        return self._over is not None
+        return self._end_cause is not None
 
     async def close(self) -> None:
-        """Stop encoding, and wake waiting readers. Idempotent."""
-        await asyncio.wait([self.end()])
+        """Stop encoding, and wake waiting programs. Idempotent."""
+        await asyncio.wait([self.start_closing()])
 
-    def end(self) -> asyncio.Task[None]:
-        """Start to close; return the task, which then ends."""
-        if self._over is None:
-            self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
+    def start_closing(self) -> asyncio.Task[None]:
+        """Cancel the encoding task without waiting for its end; return the task."""
+        if self._end_cause is None:
+            self._end_cause = (
+                FrameSourceError(f"{self._name}: its video ended", source=self._name),
+            )
         self._reader.close()
-        self._stirred.set()
+        self._changed.set()
         self._task.cancel()
         return self._task
 
-    async def after(self, have: int) -> list[VideoUnit]:
-        """Wait for encoded frames after a frame, or from a key frame on; return them.
+    async def next_units(self, have: int) -> list[VideoUnit]:
+        """Return the encoded frames for a program, which can decode them all; wait for the first.
+
+        The first one follows the program's last frame, or is a key frame.
 
         Args:
-            have: number of the last frame that the reader has; 0: none.
+            have: number of the last frame that the program has; 0: none.
 
         Raises:
             FrameSourceError: the source ended with this error.
-            FrameFormatError: its frames cannot become video.
+            FrameFormatError: the source's frames cannot be encoded.
             StopAsyncIteration: the video ended.
         """
         while True:
-            if following := self._following(have):
-                return following
-            if self._over is not None:
-                if self._over[0] is not None:
-                    raise self._over[0]
+            if units := self._kept_units(have):
+                return units
+            if self._end_cause is not None:
+                if self._end_cause[0] is not None:
+                    raise self._end_cause[0]
                 raise StopAsyncIteration
-            self._stirred.clear()
-            await self._stirred.wait()
+            self._changed.clear()
+            await self._changed.wait()
 
-    def _following(self, have: int) -> list[VideoUnit]:
+    def _kept_units(self, have: int) -> list[VideoUnit]:
         kept = self._units
         if not kept or kept[-1].number == have:
             return []
-        fresh = asyncio.get_running_loop().time() - LATE_SECONDS
+        oldest_allowed = asyncio.get_running_loop().time() - MAX_LAG
         units: list[VideoUnit] = []
         for unit in reversed(kept):
-            if unit.made < fresh and units:
-                break  # the reader is too late for all of these
+            if unit.encoded_at < oldest_allowed and units:
+                break  # the program lags too far
             units.append(unit)
-            if unit.key or unit.number == have + 1:
+            if unit.is_key_frame or unit.number == have + 1:
                 return units[::-1]
-        self._key_wanted = True
+        self._needs_key_frame = True
         return []
 
     async def _run(self) -> None:
@@ -141,25 +148,27 @@ class SharedVideo:
             async for frame in self._reader:
                 account = self._reader.statistics()
                 await self._encode(frame, account.offered, account.lost)
-            self._over = self._over or (None,)
+            self._end_cause = self._end_cause or (None,)
         except asyncio.CancelledError:
             raise
-        except Exception as error:  # noqa: BLE001 - passed to the viewers
-            self._over = (error,)
+        except Exception as error:  # noqa: BLE001 - next_units() raises it
+            self._end_cause = (error,)
 
-    async def _encode(self, frame: Frame, offered: int, lost: int) -> None:
+    async def _encode(self, frame: Frame, offered_count: int, lost_count: int) -> None:
         from smartcam.frames._inside import entry_point
 
         loop = asyncio.get_running_loop()
-        if self._key_wanted and loop.time() - self._last_key >= KEY_EVERY:
+        if self._needs_key_frame and loop.time() - self._last_key_at >= MIN_KEY_INTERVAL:
             self._encoder.begin_anew()
-        began = time.perf_counter()
-        made = await self._encoder.encode(frame)
-        took = time.perf_counter() - began
-        key, _ = entry_point(bytes(made.data))
-        if key:
-            self._last_key, self._key_wanted = loop.time(), False
+        started_at = time.perf_counter()
+        encoded = await self._encoder.encode(frame)
+        encoding_time = time.perf_counter() - started_at
+        is_key_frame, _ = entry_point(bytes(encoded.data))
+        if is_key_frame:
+            self._last_key_at, self._needs_key_frame = loop.time(), False
         number = self._units[-1].number + 1 if self._units else secrets.randbits(31) + 1
-        unit = VideoUnit(number, made, took, key, loop.time(), offered, lost)
+        unit = VideoUnit(
+            number, encoded, encoding_time, is_key_frame, loop.time(), offered_count, lost_count
+        )
         self._units.append(unit)
-        self._stirred.set()
+        self._changed.set()

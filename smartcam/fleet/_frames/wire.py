@@ -1,8 +1,8 @@
 """Encode and decode frames on the bus: their fields, and the parts of their bytes.
 
 The reply to a call for a frame has all its fields, without its bytes. The bytes are sent under
-their own key, in parts, since the engine drops messages that are longer than its queue; a part
-without room is dropped, and never waits.
+their own key, in parts, since the engine drops messages that are longer than its queue. If the
+queue is full, a part is dropped; it never waits.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ MAX_FRAME_BYTES = 1 << 28
 """Largest number of bytes of a frame: 14,000 x 10,000 pixels of 16 bits."""
 
 ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
-"""Encodings of frames; raw is the camera's own."""
+"""Encodings of frames; raw: the camera's own encoding."""
 
 
 VIDEO = "h264"
-"""Further encoding, for streams only."""
+"""Encoding that only streams can have, since its frames depend on each other."""
 
 MIN_BITRATE, MAX_BITRATE = 10_000, 1_000_000_000
 """Smallest and largest bit rate of H.264, bits per second."""
@@ -40,7 +40,7 @@ class FrameForm(NamedTuple):
 
     Attributes:
         name: one of :data:`ENCODINGS`, or :data:`VIDEO`.
-        quality: quality of JPEG, 1 to 100; None for the codec's own.
+        quality: quality of JPEG, 1 to 100; None for the codec's default.
         bitrate: bit rate of H.264, bits per second; None for even quality.
     """
 
@@ -58,17 +58,17 @@ class FrameForm(NamedTuple):
         bitrate: object = None,
         stream: bool = False,
     ) -> FrameForm:
-        """Return the form of frames for checked arguments.
+        """Check arguments, and return the form of frames that they describe.
 
         Args:
             name: the encoding.
-            quality: quality of a JPEG; None: not given.
+            quality: quality of a JPEG; None for the codec's default.
             caller: name of the caller, for error texts.
-            bitrate: bits per second; None: not given.
+            bitrate: bits per second; None for even quality.
             stream: whether the request is for a stream; only streams may have :data:`VIDEO`.
 
         Raises:
-            ConfigurationError: there is no such encoding, or it has no such quality or bit rate.
+            ConfigurationError: an argument is unknown, out of range, or not for this encoding.
         """
         known = (*ENCODINGS, VIDEO) if stream else ENCODINGS
         if name not in known:
@@ -77,13 +77,13 @@ class FrameForm(NamedTuple):
                 f"{caller}: encoding: expected {', '.join(known)}, got {name!r:.40}"
                 f"{why if name == VIDEO else ''}"
             )
-        for option, value, of, least, most in (
+        for option, value, needed, least, most in (
             ("quality", quality, "jpeg", 1, 100),
             ("bitrate", bitrate, VIDEO, MIN_BITRATE, MAX_BITRATE),
         ):
             if value is None:
                 continue
-            if name != of:
+            if name != needed:
                 raise ConfigurationError(f"{caller}: {option}: {name} has none, got {value!r:.40}")
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise ConfigurationError(
@@ -102,8 +102,8 @@ class FleetFrame(Frame):
     """A frame that came over the bus.
 
     Attributes:
-        encoding_time: seconds that its agent took to encode it; 0 if it has the camera's own
-            encoding, or was encoded for another program before.
+        encoding_time: seconds that the agent took to encode this frame; 0 if it has the camera's
+            own encoding, or was already encoded for another program.
         rate: state of the control of the stream's bit rate or latency; None without control.
     """
 
@@ -111,12 +111,14 @@ class FleetFrame(Frame):
     rate: RateStatistics | None = None
 
 
-def to_fields(frame: Frame, ahead: float, encoding_time: float, lens_number: int) -> dict[str, Any]:
-    """Return the fields that describe a frame, as JSON.
+def to_fields(
+    frame: Frame, clock_lead: float, encoding_time: float, lens_number: int
+) -> dict[str, Any]:
+    """Return the fields that describe a frame, for JSON.
 
     Args:
         frame: the frame.
-        ahead: seconds by which the agent's clock is ahead of ``time.monotonic()``.
+        clock_lead: seconds by which the agent's clock is ahead of ``time.monotonic()``.
         encoding_time: as in :class:`FleetFrame`.
         lens_number: number of the frame's ``camera_info``; 0 for none.
     """
@@ -125,7 +127,7 @@ def to_fields(frame: Frame, ahead: float, encoding_time: float, lens_number: int
         "width": frame.width,
         "height": frame.height,
         "stride": frame.stride,
-        "captured": frame.captured + ahead,
+        "captured": frame.captured + clock_lead,
         "utc": frame.utc,
         "moment": frame.moment.name,
         "duration": frame.duration,
@@ -136,11 +138,11 @@ def to_fields(frame: Frame, ahead: float, encoding_time: float, lens_number: int
         "size": len(frame.data),
         "encoding_time": encoding_time,
         "lens": lens_number,
-        **_more(frame, ahead),
+        **_optional_fields(frame, clock_lead),
     }
 
 
-def _more(frame: Frame, ahead: float) -> dict[str, Any]:
+def _optional_fields(frame: Frame, clock_lead: float) -> dict[str, Any]:
     """Return the fields that only some frames have."""
     more: dict[str, Any] = {}
     chunks = {
@@ -155,14 +157,14 @@ def _more(frame: Frame, ahead: float) -> dict[str, Any]:
     if frame.trigger is not None:
         more["trigger"] = {
             "number": frame.trigger.number,
-            "fired": frame.trigger.fired + ahead,
+            "fired": frame.trigger.fired + clock_lead,
             "evidence": [*frame.trigger.evidence],
         }
     return more
 
 
-def _read_more(fields: dict[str, Any], captured: float, caller: str) -> dict[str, Any]:
-    """Return the fields from :func:`_more`, by this side's clock."""
+def _read_optional_fields(fields: dict[str, Any], captured: float, caller: str) -> dict[str, Any]:
+    """Read the fields from :func:`_optional_fields`; their times become this side's."""
     chunks, remark, trigger = (
         fields.get("chunks", {}),
         fields.get("remark", ""),
@@ -189,18 +191,18 @@ def from_fields(
     data: Data,
     *,
     captured: float,
-    doubt: float,
+    uncertainty: float,
     lost: int,
     source: str,
     camera_info: CameraModel | None,
 ) -> FleetFrame:
-    """Return the frame of an agent's fields and these arguments.
+    """Return the frame that an agent's fields and these arguments describe.
 
     Args:
         sent: fields from :func:`to_fields`.
         data: bytes of the frame.
         captured: time of the capture by this side's ``time.monotonic()``.
-        doubt: seconds by which ``captured`` may be wrong.
+        uncertainty: seconds by which ``captured`` may be wrong.
         lost: number of frames lost before this one.
         source: the camera's name.
         camera_info: model of the camera's lens; None for none.
@@ -223,7 +225,7 @@ def from_fields(
             "device_time": None if device is None else float(device),
             "sequence": int(sent["sequence"]),
             "encoding_time": float(sent["encoding_time"]),
-            **_read_more(sent, captured, source),
+            **_read_optional_fields(sent, captured, source),
         }
     except (KeyError, TypeError, ValueError) as exc:
         raise RemoteProtocolError(f"{source}: the agent's frame is not valid: {exc!r}") from exc
@@ -234,7 +236,7 @@ def from_fields(
         height=height,
         stride=stride,
         captured=captured,
-        duration=duration + doubt,
+        duration=duration + uncertainty,
         lost=lost,
         source=source,
         camera_info=camera_info,
@@ -242,17 +244,17 @@ def from_fields(
     )
 
 
-_PART = struct.Struct("<4sQQQ")
-_IS_PART = b"scf1"
+_PART_HEAD = struct.Struct("<4sQQQ")
+_PART_MAGIC = b"scf1"
 
 
 class FramePart(NamedTuple):
-    """The place of a part in its frame.
+    """The position of a part in its frame.
 
     Attributes:
         call: number of the call that the frame answers.
-        offset: place of the part's first byte in the frame's bytes.
-        total: bytes of the frame.
+        offset: index of the part's first byte in the frame's bytes.
+        total: number of bytes of the whole frame.
     """
 
     call: int
@@ -262,19 +264,19 @@ class FramePart(NamedTuple):
 
 def encode_part(part: FramePart) -> bytes:
     """Return the head of a part as bytes."""
-    return _PART.pack(_IS_PART, *part)
+    return _PART_HEAD.pack(_PART_MAGIC, *part)
 
 
 def decode_part(head: bytes) -> FramePart:
-    """Return the part of a frame from its head.
+    """Return the position of a part from its head.
 
     Raises:
         RemoteProtocolError: the head is not valid.
     """
     try:
-        magic, call, offset, total = _PART.unpack(head)
+        magic, call, offset, total = _PART_HEAD.unpack(head)
     except struct.error as exc:
         raise RemoteProtocolError(f"a part of a frame is broken: {exc}") from exc
-    if magic != _IS_PART or total > MAX_FRAME_BYTES:
+    if magic != _PART_MAGIC or total > MAX_FRAME_BYTES:
         raise RemoteProtocolError(f"a part of a frame of {total} bytes begins with {magic!r}")
     return FramePart(call, offset, total)

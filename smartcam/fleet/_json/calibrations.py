@@ -1,4 +1,4 @@
-"""Serve the thesis' five calibration services in JSON, on the fleet's bus."""
+"""Serve the five calibration services of the thesis' interface in JSON, on the fleet's bus."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import UnsupportedError
 from smartcam.fleet._frames.stream import FrameOrder
 from smartcam.fleet._frames.wire import FrameForm
-from smartcam.fleet._json.services import Service, triggered
+from smartcam.fleet._json.services import Service, trigger_camera
 from smartcam.fleet._json.thesis import BusFields
-from smartcam.fleet._program.reading import interpreted
+from smartcam.fleet._program.reading import interpret_run
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 GATE_TIMEOUT = 10.0
-"""Seconds of the timeout for another program's reservation to end."""
+"""Seconds to wait for the end of another program's reservation."""
 
 PICTURE_TIMEOUT = 20.0
-"""Seconds of the timeout for a picture of the camera itself."""
+"""Seconds to wait for a picture from the camera."""
 
 
 class JsonCalibrationCamera:
@@ -56,10 +56,12 @@ class JsonCalibrationCamera:
 
     async def localize(self) -> list[Localization]:
         """Trigger; return the localizations in the camera's own frame."""
-        reading = self._topics.reading(self._spec)
-        async with self._allowed():
-            (run,) = await triggered(self._within(DEFAULT_TRIGGER_TIMEOUT), reading, None)
-        return checked_localizations(interpreted(run, reading, self.name)[0], self.name)
+        reading = self._topics.make_interpretation(self._spec)
+        async with self._entered_gate():
+            (run,) = await trigger_camera(
+                self._work_with_timeout(DEFAULT_TRIGGER_TIMEOUT), reading, None
+            )
+        return checked_localizations(interpret_run(run, reading, self.name)[0], self.name)
 
     async def take_picture(self) -> Any:
         """Return the grey levels of a picture of the camera."""
@@ -67,7 +69,7 @@ class JsonCalibrationCamera:
         if host.frames.make is not None:
             timeout = min(self._work.timeout, PICTURE_TIMEOUT)
             order = FrameOrder("", self._work.owner.call, FrameForm(), timeout)
-            frame, _ = await host.frames.get(order, max_age=None, after=None, fresh=True)
+            frame, _ = await host.frames.get_frame(order, max_age=None, after=None, fresh=True)
             return await asyncio.to_thread(frame.grey)
         if not host.camera.capabilities.read_image:
             raise UnsupportedError(
@@ -76,14 +78,14 @@ class JsonCalibrationCamera:
             )
         with from_part("calibration", "the calibration services need"):
             from smartcam.calibration._inside import decode_picture
-        async with self._allowed():
-            await triggered(self._within(DEFAULT_TRIGGER_TIMEOUT), None, None)
+        async with self._entered_gate():
+            await trigger_camera(self._work_with_timeout(DEFAULT_TRIGGER_TIMEOUT), None, None)
             data = await host.require().read_image(timeout=PICTURE_TIMEOUT)
         return await asyncio.to_thread(decode_picture, data, self.name)
 
     @contextlib.asynccontextmanager
-    async def _allowed(self) -> AsyncIterator[None]:
-        """Keep other programs from reserving the camera meanwhile."""
+    async def _entered_gate(self) -> AsyncIterator[None]:
+        """Keep other programs from reserving the camera during the block."""
         program = f"{self._work.request.program or 'a program'} without smartcam"
         await self._host.enter(program, "a calibration", GATE_TIMEOUT)
         try:
@@ -91,13 +93,13 @@ class JsonCalibrationCamera:
         finally:
             self._host.gate.leave(program)
 
-    def _within(self, seconds: float) -> Work:
-        """Return the work with a timeout."""
+    def _work_with_timeout(self, seconds: float) -> Work:
+        """Return the running service with a timeout of at most ``seconds``."""
         return self._work._replace(timeout=min(self._work.timeout, seconds))
 
 
 class JsonCalibrationFace:
-    """The part of an agent's camera that the five services use.
+    """An agent's camera as the five calibration services use it.
 
     Args:
         work: the running service.
@@ -118,20 +120,28 @@ class JsonCalibrationFace:
         return JsonCalibrationCamera(self._work)
 
 
-def _on_bus(name: str) -> Service:
-    """Return one of the five as a service of the bus."""
-    five: WizardService = CALIBRATION[name]
-    request: Any = create_model(five.request.__name__, __base__=(five.request, BusFields))
+def _bus_service(name: str) -> Service:
+    """Return one of the five services as a service of the bus."""
+    wizard_service: WizardService = CALIBRATION[name]
+    request: Any = create_model(
+        wizard_service.request.__name__, __base__=(wizard_service.request, BusFields)
+    )
 
-    async def do(work: Work) -> dict[str, Any]:
+    async def carry_out(work: Work) -> dict[str, Any]:
         call = CalibrationCall(JsonCalibrationFace(work), work.request, work.timeout)
-        fields = {key: plain(value) for key, value in (await five.do(call)).items()}
+        fields = {key: plain(value) for key, value in (await wizard_service.do(call)).items()}
         return {**fields, "kind": "CalibrationError"} if fields.get("error") else fields
 
-    nothing: dict[str, Any] = {"pose": None} if name == "TransformPixelPose" else {}
-    # a trigger waits by itself for the end of a reservation, and abort needs no wait
-    return Service(request, do, command=False, timeout=five.timeout, nothing=nothing)
+    empty_fields: dict[str, Any] = {"pose": None} if name == "TransformPixelPose" else {}
+    # the triggers of a service wait for the end of a reservation by themselves
+    return Service(
+        request,
+        carry_out,
+        command=False,
+        timeout=wizard_service.timeout,
+        empty_fields=empty_fields,
+    )
 
 
-CALIBRATIONS: dict[str, Service] = {name: _on_bus(name) for name in CALIBRATION}
+CALIBRATIONS: dict[str, Service] = {name: _bus_service(name) for name in CALIBRATION}
 """The five services by name."""

@@ -1,7 +1,7 @@
 """Serve programs without smartcam: list an agent's cameras, and carry out services.
 
-Every question is answered, except those about another agent's cameras, which that agent answers. A
-service runs in a task of the agent, which ends with its deadline and with the agent.
+An agent answers every question, except those about another agent's cameras. A service runs in a
+task of the agent, which is cancelled after the service's timeout, or when the agent ends.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from smartcam.fleet._agent.pulse import Pulse
 from smartcam.fleet._agent.shared import Owner
 from smartcam.fleet._bus.address import check_name
 from smartcam.fleet._bus.bus import always
-from smartcam.fleet._bus.errors import late
+from smartcam.fleet._bus.errors import late_call_error
 from smartcam.fleet._bus.keys import meets
 from smartcam.fleet._json.calibrations import CALIBRATIONS
 from smartcam.fleet._json.services import SERVICES, UNKNOWN, PlainRequest, Service, Work
 from smartcam.fleet._json.thesis import SETUP, STOP, new_camera
 from smartcam.fleet._json.thesis import THESIS as CAMERA_SERVICES
 from smartcam.fleet._json.topics import Topics, as_json
-from smartcam.fleet._program.reading import failure
+from smartcam.fleet._program.reading import error_fields
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 THESIS = {**CAMERA_SERVICES, **CALIBRATIONS}
-"""The services of the thesis' interface by name."""
+"""The services of the interface that the thesis on smart cameras defines, by name."""
 
 MAX_REQUEST_BYTES = 1 << 18
 """Largest number of bytes of a request."""
@@ -60,32 +60,34 @@ MAX_WAITING_REPEATS = 16
 """Largest number of questions that wait for the answer of one call."""
 
 MAX_ANSWERS_REMEMBERED, MAX_ANSWER_BYTES_REMEMBERED = 4096, 1 << 24
-"""Largest number of remembered answers of commands with an id, and of their bytes; the same for
-questions, separately, so that a viewer cannot displace the answers of commands."""
+"""Largest number of remembered answers of commands with an id, and of their bytes. Answers of
+questions have the same bounds, but separately, so that a viewer cannot displace those of
+commands."""
 
 MAX_CAMERAS_ADDED = 100
 """Largest number of cameras that Setup adds."""
 
 CANCEL_GRACE = 0.5
-"""Seconds beyond a service's timeout after which its task is cancelled."""
+"""Seconds after a service's timeout at which its task is cancelled."""
 
 SETUP_WAIT = 600.0
-"""Seconds for which Setup waits for a camera; its own timeout is shorter."""
+"""Largest number of seconds for which Setup waits for a camera; mostly its own timeout is
+shorter."""
 
 PRESENCE_TIMEOUT = 2.0
-"""Seconds of the timeout for a question about presences on the bus."""
+"""Seconds for the answer to a question about presences on the bus."""
 
 
-class _Order(NamedTuple):
-    """A decoded question.
+class _ServiceQuestion(NamedTuple):
+    """A decoded question for a service.
 
     Attributes:
         camera: name of the camera of the service.
         name: name of the service.
         service: the service.
-        fields: fields of the request; None if they cannot be read.
+        fields: fields of the request; None if the request cannot be read.
         error: error of the request; None if there is none.
-        waited: seconds for which the request may have waited before it was received.
+        max_wait: longest time that the request may have waited before it was received, seconds.
     """
 
     camera: str
@@ -93,11 +95,11 @@ class _Order(NamedTuple):
     service: Service
     fields: dict[str, Any] | None
     error: SmartCamError | None
-    waited: float = 0.0
+    max_wait: float = 0.0
 
     @property
-    def operates(self) -> bool:
-        """True if only operators may use the service; otherwise viewers may, too."""
+    def is_for_operators(self) -> bool:
+        """True if only operators may use the service; False if viewers may, too."""
         return self.service.command or self.name not in SERVICES
 
     def request(self) -> Any:
@@ -108,17 +110,17 @@ class _Order(NamedTuple):
         """
         if self.error is not None:
             raise self.error
-        given = {key: value for key, value in (self.fields or {}).items() if value is not None}
-        return validated(self.service.request, given, f"{self.camera}: {self.name}")
+        fields = {key: value for key, value in (self.fields or {}).items() if value is not None}
+        return validated(self.service.request, fields, f"{self.camera}: {self.name}")
 
-    def failed(self, error: BaseException) -> dict[str, Any]:
+    def error_answer(self, error: BaseException) -> dict[str, Any]:
         """Return the answer for an error."""
-        return {**failure(error), **self.service.nothing}
+        return {**error_fields(error), **self.service.empty_fields}
 
-    def what(self, request: PlainRequest) -> object:
-        """Return a key of the work, equal for a repetition of the same call."""
-        same = request.model_copy(update={"timeout": None, "epoch": None})
-        return self.camera, self.service, same
+    def call_key(self, request: PlainRequest) -> object:
+        """Return a key of the call, which is equal for a repetition of the same call."""
+        without_limits = request.model_copy(update={"timeout": None, "epoch": None})
+        return self.camera, self.service, without_limits
 
 
 @dataclass(eq=False)
@@ -126,33 +128,33 @@ class _PlainCall:
     """A running or remembered call.
 
     Attributes:
-        what: key of the work, by which a repetition of the call is recognized.
+        key: key by which a repetition of the call is recognized.
         waiting: questions that wait for the call's answer.
         answer: the answer; None while the call runs.
     """
 
-    what: object
+    key: object
     waiting: list[BusQuestion] = field(default_factory=list["BusQuestion"])
     answer: bytes | None = None
 
 
 class _KnownAnswers:
-    """Calls of one kind with an id, running or remembered."""
+    """Calls with an id, running or remembered; of commands, or of questions."""
 
     def __init__(self) -> None:
         self._calls: dict[tuple[str, str], _PlainCall] = {}  # oldest first
         self._bytes = 0
 
-    def of(self, request: PlainRequest) -> _PlainCall | None:
+    def find_call(self, request: PlainRequest) -> _PlainCall | None:
         """Return the call with a request's id."""
         return self._calls.get((request.program, str(request.id)))
 
-    def begin(self, request: PlainRequest, call: _PlainCall) -> None:
+    def add_call(self, request: PlainRequest, call: _PlainCall) -> None:
         """Remember a running call."""
         self._calls[request.program, str(request.id)] = call
 
-    def end(self, answer: bytes) -> None:
-        """Keep a further answer, and drop the oldest beyond the bounds; running calls stay."""
+    def count_answer(self, answer: bytes) -> None:
+        """Count a further answer, and drop the oldest answers beyond the bounds."""
         self._bytes += len(answer)
         for key in [*self._calls]:
             if (
@@ -166,8 +168,8 @@ class _KnownAnswers:
                 del self._calls[key]
 
 
-class Plain:
-    """The part of an agent for programs without smartcam.
+class PlainServices:
+    """The services of an agent for programs without smartcam.
 
     Args:
         agent: the agent.
@@ -186,29 +188,33 @@ class Plain:
         self._calibrations = calibrations
         self.topics = Topics(agent.name, agent.epoch, keys, bus)
         self._pulse = Pulse()
-        self._declared: list[Handle] = []
-        self._program = agent.next_program()
-        self._numbers = 0
-        # running calls by camera, and whether only operators may make them
-        self._under_way: collections.Counter[tuple[str, bool]] = collections.Counter()
-        self._known_answers = {operates: _KnownAnswers() for operates in (True, False)}
-        self._added: dict[str, PlainRequest] = {}  # cameras added by Setup, with their requests
+        self._handles: list[Handle] = []
+        self._program = agent.new_program_number()
+        self._last_call_number = 0
+        # numbers of running calls, by camera and by whether they are for operators
+        self._running_counts: collections.Counter[tuple[str, bool]] = collections.Counter()
+        self._known_answers = {
+            is_for_operators: _KnownAnswers() for is_for_operators in (True, False)
+        }
+        self._added_cameras: dict[
+            str, PlainRequest
+        ] = {}  # requests of the Setups that added cameras
 
     def open(self) -> None:
         """Start to answer."""
         keys, answer = self._keys, self._bus.answer
         self.topics.open()
         self._pulse.open()
-        self._declared = [
+        self._handles = [
             answer(keys.listing("**"), self._on_listing, patient=always),
-            answer(keys.service("*", "**"), self._on_service, patient=_only_looks),
+            answer(keys.service("*", "**"), self._on_service, patient=_is_read_only),
             answer(keys.thesis("*"), self._on_thesis),
         ]
 
     def close(self) -> None:
         """Stop answering; running calls end with the agent's tasks."""
-        declared, self._declared = self._declared, []
-        for handle in declared:
+        handles, self._handles = self._handles, []
+        for handle in handles:
             handle.close()
         self._pulse.close()
         self.topics.close()
@@ -216,7 +222,7 @@ class Plain:
     @property
     def busy(self) -> bool:
         """True while a command runs."""
-        return any(operates for _, operates in self._under_way)
+        return any(is_for_operators for _, is_for_operators in self._running_counts)
 
     # ------------------------------------------------------------------ questions
 
@@ -240,8 +246,10 @@ class Plain:
                 f"{camera}: there is no service {name!r:.80}{did_you_mean(name, SERVICES)}; there "
                 f"are {', '.join(SERVICES)}"
             )
-        waited = self._pulse.waited()
-        self._take(question, _Order(camera, name, service, fields, error, waited))
+        max_wait = self._pulse.max_wait()
+        self._accept_question(
+            question, _ServiceQuestion(camera, name, service, fields, error, max_wait)
+        )
 
     def _on_thesis(self, question: BusQuestion) -> None:
         if "*" in question.key:
@@ -261,81 +269,86 @@ class Plain:
                 f"{name}: expected camera_name, the name of a camera, got {camera!r:.80}"
             )
         if error is not None and (not isinstance(camera, str) or not camera):
-            _reply(question, _Order("", name, service, fields, error).failed(error))
+            _reply(question, _ServiceQuestion("", name, service, fields, error).error_answer(error))
             return
-        waited = self._pulse.waited()
-        self._take(question, _Order(str(camera), name, service, fields, error, waited))
+        max_wait = self._pulse.max_wait()
+        self._accept_question(
+            question, _ServiceQuestion(str(camera), name, service, fields, error, max_wait)
+        )
 
     def _refuse_pattern(self, question: BusQuestion) -> None:
-        """Refuse a command to a pattern of cameras."""
+        """Refuse a question to a pattern of cameras."""
         error = ConfigurationError(
             f"{question.key!r:.200}: expected a key with exactly one camera and one service in it, "
             "without *; nothing was done"
         )
-        _reply(question, failure(error))
+        _reply(question, error_fields(error))
 
-    def _take(self, question: BusQuestion, order: _Order) -> None:
+    def _accept_question(self, question: BusQuestion, order: _ServiceQuestion) -> None:
         if order.camera in self._agent.hosts:
-            self._begin(question, order)
+            self._start_call(question, order)
             return
         try:
             check_name(order.camera)
         except ConfigurationError as error:
-            _reply(question, order.failed(error))  # every agent gives the same answer
+            _reply(question, order.error_answer(error))  # every agent gives the same answer
             return
-        if self._is_full(question, order):
+        if self._refuse_if_full(question, order):
             return
-        self._start(self._for_stranger(question, order), order)
+        self._start_task(self._answer_unknown_camera(question, order), order)
 
-    def _is_full(self, question: BusQuestion, order: _Order) -> bool:
-        """Refuse a question beyond the bound of its camera, or of all unknown cameras."""
-        full = self._under_way[self._place(order)] >= MAX_CONCURRENT_CALLS
-        if full:
-            kind = "commands" if order.operates else "questions"
-            full_of = f"{MAX_CONCURRENT_CALLS} {kind} are under way"
-            text = f"{order.camera}: {full_of}; {order.name} was not done"
-            _reply(question, order.failed(LocalProtocolError(text)))
-        return full
+    def _refuse_if_full(self, question: BusQuestion, order: _ServiceQuestion) -> bool:
+        """Refuse a question if too many are running for its camera; return whether it was refused.
 
-    def _start(self, work: Any, order: _Order) -> None:
+        All unknown cameras are counted together.
+        """
+        is_full = self._running_counts[self._count_key(order)] >= MAX_CONCURRENT_CALLS
+        if is_full:
+            kind = "commands" if order.is_for_operators else "questions"
+            running = f"{MAX_CONCURRENT_CALLS} {kind} are under way"
+            text = f"{order.camera}: {running}; {order.name} was not done"
+            _reply(question, order.error_answer(LocalProtocolError(text)))
+        return is_full
+
+    def _start_task(self, work: Any, order: _ServiceQuestion) -> None:
         """Run work for a camera in a counted task."""
-        place, counts = self._place(order), self._under_way
-        counts[place] += 1
+        key, counts = self._count_key(order), self._running_counts
+        counts[key] += 1
 
-        def done(_: object) -> None:
-            counts[place] -= 1
-            if not counts[place]:
-                del counts[place]
+        def on_done(_: object) -> None:
+            counts[key] -= 1
+            if not counts[key]:
+                del counts[key]
 
-        task = self._agent.begin(work, f"smartcam.fleet.{order.camera}.{order.name}")
-        task.add_done_callback(done)
+        task = self._agent.start_task(work, f"smartcam.fleet.{order.camera}.{order.name}")
+        task.add_done_callback(on_done)
 
-    def _place(self, order: _Order) -> tuple[str, bool]:
+    def _count_key(self, order: _ServiceQuestion) -> tuple[str, bool]:
         camera = order.camera if order.camera in self._agent.hosts else ""
-        return camera, order.operates
+        return camera, order.is_for_operators
 
     # ------------------------------------------------------------------ other cameras
 
-    async def _for_stranger(self, question: BusQuestion, order: _Order) -> None:
-        """Answer for an unknown camera, if no agent has it and this agent is the first one."""
+    async def _answer_unknown_camera(self, question: BusQuestion, order: _ServiceQuestion) -> None:
+        """Answer a question for a camera that no agent has, if this agent is to answer it."""
         try:
-            speaks = await self._speaks_for_all(order.camera)
+            answers = await self._answers_for_all(order.camera)
         except BaseException:
             question.close()
             raise
-        if not speaks:
+        if not answers:
             question.close()
         elif order.camera in self._agent.hosts or order.service is SETUP:
-            self._begin(question, order)
+            self._start_call(question, order)
         else:
             error = ConfigurationError(
                 f"the fleet {self._keys.fleet} has no camera {order.camera!r}"
                 f"{did_you_mean(order.camera, self._agent.hosts)}; {order.name} was not done"
             )
-            _reply(question, order.failed(error))
+            _reply(question, order.error_answer(error))
 
-    async def _speaks_for_all(self, camera: str) -> bool:
-        """Return True if no other agent has a camera and this agent is the first by its name."""
+    async def _answers_for_all(self, camera: str) -> bool:
+        """Return True if no other agent has the camera, and this agent's name sorts first."""
         keys, bus = self._keys, self._bus
         having, present = await asyncio.gather(
             bus.present(keys.camera("*", camera), PRESENCE_TIMEOUT),
@@ -347,7 +360,7 @@ class Plain:
 
     # ------------------------------------------------------------------ calls
 
-    def _begin(self, question: BusQuestion, order: _Order) -> None:
+    def _start_call(self, question: BusQuestion, order: _ServiceQuestion) -> None:
         """Start a call, unless it is a repetition."""
         try:
             request = order.request()
@@ -364,44 +377,46 @@ class Plain:
             ):
                 raise LocalProtocolError(f"{order.camera}: {order.name} is under way already")
         except SmartCamError as error:
-            _reply(question, order.failed(error))
+            _reply(question, order.error_answer(error))
             return
         if call is None:
-            if not self._is_full(question, order):
-                call = _PlainCall(order.what(request), [question])
+            if not self._refuse_if_full(question, order):
+                call = _PlainCall(order.call_key(request), [question])
                 if request.id is not None:
-                    self._known_answers[order.operates].begin(request, call)
-                self._start(self._do(order, request, call), order)
+                    self._known_answers[order.is_for_operators].add_call(request, call)
+                self._start_task(self._carry_out(order, request, call), order)
         elif call.answer is None:
             call.waiting.append(question)
         else:
             question.reply(question.key, call.answer)
             question.close()
 
-    def _known_call(self, order: _Order, request: PlainRequest) -> _PlainCall | None:
-        known = self._known_answers[order.operates].of(request)
-        if known is not None and known.what != order.what(request):
+    def _known_call(self, order: _ServiceQuestion, request: PlainRequest) -> _PlainCall | None:
+        known = self._known_answers[order.is_for_operators].find_call(request)
+        if known is not None and known.key != order.call_key(request):
             raise LocalProtocolError(
                 f"{order.camera}: id {request.id!r} was another call's; {order.name} was not done"
             )
         return known
 
-    async def _do(self, order: _Order, request: PlainRequest, call: _PlainCall) -> None:
+    async def _carry_out(
+        self, order: _ServiceQuestion, request: PlainRequest, call: _PlainCall
+    ) -> None:
         """Carry out a call, and answer all its questions."""
         name = order.name
         answer: dict[str, Any] = {}
         try:
-            answer = {"error": "", **await self._bounded(order, request)}
+            answer = {"error": "", **await self._carry_out_in_time(order, request)}
         except asyncio.CancelledError:
             error = ConnectionClosedError(
                 f"{order.camera}: the agent ends; whether {name} was done is unknown"
             )
-            answer = order.failed(error)
+            answer = order.error_answer(error)
             raise
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
                 logger.exception("%s ! %s failed", order.camera, name)
-            answer = order.failed(exc)
+            answer = order.error_answer(exc)
         finally:
             call.answer = as_json(answer)
             waiting, call.waiting = call.waiting, []
@@ -409,44 +424,46 @@ class Plain:
                 question.reply(question.key, call.answer)
                 question.close()
             if request.id is not None:
-                self._known_answers[order.operates].end(call.answer)
+                self._known_answers[order.is_for_operators].count_answer(call.answer)
 
-    async def _bounded(self, order: _Order, request: PlainRequest) -> dict[str, Any]:
+    async def _carry_out_in_time(
+        self, order: _ServiceQuestion, request: PlainRequest
+    ) -> dict[str, Any]:
         """Carry out a call within its timeout.
 
         Raises:
-            SmartCamError: the call failed; or it did not end in time, with an unknown outcome.
+            SmartCamError: the call failed, or did not end in time; then its outcome is unknown.
         """
         service = order.service
-        wanted = timeout = request.timeout or service.timeout
+        full_timeout = timeout = request.timeout or service.timeout
         if request.deadline is not None:
             timeout = min(timeout, request.deadline - time.time())
             if timeout <= 0:
                 text = f"{order.camera}: {order.name} came after its deadline; it was not done"
-                raise late(order.name, text)
-        elif order.waited:
-            timeout -= order.waited
+                raise late_call_error(order.name, text)
+        elif order.max_wait:
+            timeout -= order.max_wait
             if timeout <= 0:
-                raise late(
+                raise late_call_error(
                     order.name,
-                    f"{order.camera}: the agent was stopped for {order.waited:.1f} s, for which "
-                    f"{order.name} may have waited: longer than its timeout of {wanted:g} s; it "
-                    "was not done. One with a deadline is done until then",
+                    f"{order.camera}: the agent was stopped for {order.max_wait:.1f} s, for which "
+                    f"{order.name} may have waited: longer than its timeout of {full_timeout:g} s; "
+                    "it was not done. One with a deadline is done until then",
                 )
         loop = asyncio.get_running_loop()
-        begun = loop.time()
+        started_at = loop.time()
         try:
             async with asyncio.timeout(timeout + CANCEL_GRACE) as limit:
-                host = await self._host(order, request)
+                host = await self._get_host(order, request)
                 if getattr(request, "application", 0) or getattr(request, "application_id", 0):
-                    # switching there and back takes further time
+                    # two switches of the application take further time
                     limit.reschedule(
-                        begun + timeout + CANCEL_GRACE + 2 * host.settings.switch_timeout
+                        started_at + timeout + CANCEL_GRACE + 2 * host.settings.switch_timeout
                     )
                 try:
-                    return await self._serve(order, request, host, begun + timeout)
+                    return await self._serve(order, request, host, started_at + timeout)
                 except BaseException:
-                    await self._take_back(order.camera, request)
+                    await self._remove_added_camera(order.camera, request)
                     raise
         except TimeoutError as exc:
             if isinstance(exc, SmartCamError):
@@ -458,70 +475,72 @@ class Plain:
             ) from exc
 
     async def _serve(
-        self, order: _Order, request: PlainRequest, host: Host, deadline: float
+        self, order: _ServiceQuestion, request: PlainRequest, host: Host, deadline: float
     ) -> dict[str, Any]:
         service, loop = order.service, asyncio.get_running_loop()
-        self._numbers += 1
+        self._last_call_number += 1
         program = f"{request.program or 'a program'} without smartcam"
-        gated = service.command and (service is not STOP or host.name in self._added)
-        if gated:
+        needs_gate = service.command and (service is not STOP or host.name in self._added_cameras)
+        if needs_gate:
             await host.enter(program, order.name, deadline - loop.time())
         try:
-            left = max(0.0, deadline - loop.time())
-            owner = Owner(self._program, self._numbers)
-            with host.counted(order.name):
-                work = Work(host, host.topics, request, left, owner, self._calibrations)
-                answer = await service.do(work)
-            if service is STOP and host.name in self._added:
-                self._added.pop(host.name, None)
+            remaining = max(0.0, deadline - loop.time())
+            owner = Owner(self._program, self._last_call_number)
+            with host.counting_trigger(order.name):
+                work = Work(host, host.topics, request, remaining, owner, self._calibrations)
+                answer = await service.carry_out(work)
+            if service is STOP and host.name in self._added_cameras:
+                self._added_cameras.pop(host.name, None)
                 await self._agent.unshare(host.name, "a program has stopped it")
         finally:
-            if gated:
+            if needs_gate:
                 host.gate.leave(program)
         return answer
 
     # ------------------------------------------------------------------ cameras that Setup adds
 
-    async def _host(self, order: _Order, request: PlainRequest) -> Host:
+    async def _get_host(self, order: _ServiceQuestion, request: PlainRequest) -> Host:
         """Return the camera; Setup adds a camera that no agent has."""
         host = self._agent.hosts.get(order.camera)
         if host is not None:
             if isinstance(request, SetupRequest):
-                await host.tried(SETUP_WAIT)
+                await host.wait_first_attempt(SETUP_WAIT)
             return host
         if not isinstance(request, SetupRequest):
             raise ConnectionClosedError(f"{order.camera}: the camera was stopped meanwhile")
         settings = new_camera(request)
         await self._agent.refuse_taken(order.camera, settings)
         if order.camera in self._agent.hosts:
-            return await self._host(order, request)  # another Setup was faster
-        if len(self._added) >= MAX_CAMERAS_ADDED:
+            return await self._get_host(order, request)  # another Setup was faster
+        if len(self._added_cameras) >= MAX_CAMERAS_ADDED:
             raise LocalProtocolError(f"{order.camera}: Setup has added {MAX_CAMERAS_ADDED} cameras")
-        self._added[order.camera] = request
+        self._added_cameras[order.camera] = request
         try:
             host = self._agent.share(order.camera, settings)
-            await host.tried(SETUP_WAIT)
+            await host.wait_first_attempt(SETUP_WAIT)
             host.require()
         except BaseException:
-            await self._take_back(order.camera, request)
+            await self._remove_added_camera(order.camera, request)
             raise
         return host
 
-    async def _take_back(self, camera: str, request: PlainRequest) -> None:
+    async def _remove_added_camera(self, camera: str, request: PlainRequest) -> None:
         """Remove the camera that a failed Setup has added."""
-        if self._added.get(camera) is request:
-            del self._added[camera]
+        if self._added_cameras.get(camera) is request:
+            del self._added_cameras[camera]
             if camera in self._agent.hosts:
                 await self._agent.unshare(camera, "its Setup has failed")
 
 
 def request_fields(payload: bytes) -> tuple[dict[str, Any] | None, SmartCamError | None]:
-    """Return a request's fields, or its error. No bytes are an empty request."""
+    """Return a request's fields, or its error. An empty payload is a request without fields."""
     if len(payload) > MAX_REQUEST_BYTES:
         text = f"a request of {len(payload)} bytes; {MAX_REQUEST_BYTES} are taken"
         return None, ConfigurationError(text)
     try:
-        fields: Any = json.loads(payload, parse_constant=_no_number) if payload.strip() else {}
+        fields: Any = (
+            json.loads(payload, parse_constant=_refuse_constant) if payload.strip() else {}
+        )
     except (ValueError, RecursionError) as exc:
         return None, ConfigurationError(f"the request is no JSON: {exc}")
     if not isinstance(fields, dict):
@@ -530,12 +549,12 @@ def request_fields(payload: bytes) -> tuple[dict[str, Any] | None, SmartCamError
     return cast("dict[str, Any]", fields), None
 
 
-def _no_number(text: str) -> float:
+def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is no number of JSON's")
 
 
-def _only_looks(key: str) -> bool:
-    """Return True if a service changes nothing, so that viewers may use it, too."""
+def _is_read_only(key: str) -> bool:
+    """Return True if the key is of a service that changes nothing, which viewers may use, too."""
     service = SERVICES.get(key.rpartition("/")[2])
     return service is not None and not service.command
 

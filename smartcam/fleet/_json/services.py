@@ -14,13 +14,13 @@ from smartcam._client._inside import TriggerRequest
 from smartcam._thesis import DEFAULT_TIMEOUT, MAX_TIMEOUT
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import FrameFormatError, UnsupportedError
-from smartcam.fleet._agent.calls import ACTIONS, MAX_REPLY_BYTES, ProgramCall, outcomes
-from smartcam.fleet._agent.shared import Carrier
+from smartcam.fleet._agent.calls import ACTIONS, MAX_REPLY_BYTES, ProgramCall, trigger_runs
+from smartcam.fleet._agent.shared import AgentInterpretation
 from smartcam.fleet._bus.keys import COMMANDS
 from smartcam.fleet._bus.wire import decode_own_run
 from smartcam.fleet._frames.stream import FrameOrder
 from smartcam.fleet._frames.wire import FrameForm, to_fields
-from smartcam.fleet._program.reading import result_fields, singles
+from smartcam.fleet._program.reading import result_fields, split_run
 from smartcam.models import Status
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ MAX_PICTURE_BYTES = 1 << 20
 MAX_ID_CHARACTERS = 200
 
 
-def _hex(text: str) -> str:
+def _check_hex(text: str) -> str:
     try:
         bytes.fromhex(text)
     except ValueError as exc:
@@ -52,7 +52,7 @@ def _hex(text: str) -> str:
     return text
 
 
-def _id(value: object) -> str | int:
+def _check_id(value: object) -> str | int:
     if (
         isinstance(value, int)
         and not isinstance(value, bool)
@@ -66,7 +66,7 @@ def _id(value: object) -> str | int:
     )
 
 
-def _time(text: str) -> str:
+def _check_time_text(text: str) -> str:
     try:
         datetime.fromisoformat(text)
     except ValueError as exc:
@@ -74,17 +74,17 @@ def _time(text: str) -> str:
     return text
 
 
-Hex = Annotated[str, Field(max_length=2 * MAX_INPUT_BYTES), AfterValidator(_hex)]
+Hex = Annotated[str, Field(max_length=2 * MAX_INPUT_BYTES), AfterValidator(_check_hex)]
 Number = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 Text = Annotated[str, Field(max_length=200)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
-Id = Annotated[str | int, PlainValidator(_id)]
+Id = Annotated[str | int, PlainValidator(_check_id)]
 Deadline = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Interpret = Annotated[str, Field(max_length=10_000)]
 
 
 class PlainRequest(BaseModel):
-    """The fields that every request may have."""
+    """A request; these fields every request may have."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -116,7 +116,7 @@ class _PlainNumber(PlainRequest):
 
 
 class _PlainClock(PlainRequest):
-    when: Annotated[Text, AfterValidator(_time)]
+    when: Annotated[Text, AfterValidator(_check_time_text)]
 
 
 class _PlainResults(PlainRequest):
@@ -156,7 +156,7 @@ class Work(NamedTuple):
     Attributes:
         host: the camera.
         topics: topics of the camera in JSON.
-        request: request of the service's kind.
+        request: request of the service's class.
         timeout: seconds of the service's timeout.
         owner: owner of the results of the service's trigger.
         calibrations: calibrations of the agent's cameras; None if there is no folder for them.
@@ -174,51 +174,52 @@ class Service(NamedTuple):
     """A service.
 
     Attributes:
-        request: kind of the requests.
-        do: function that does the service and returns the fields of its answer except ``error``.
-        command: whether the service waits while another program has the camera reserved.
-        timeout: seconds, if the request has none.
-        nothing: fields of the answer besides an error.
+        request: class of the requests.
+        carry_out: function that carries out the service, and returns the fields of the answer
+            without ``error``.
+        command: whether the service waits while another program has reserved the camera.
+        timeout: seconds of the timeout for a request without one.
+        empty_fields: fields of an answer with an error, besides those of the error.
     """
 
     request: type[PlainRequest]
-    do: Callable[[Work], Awaitable[dict[str, Any]]]
+    carry_out: Callable[[Work], Awaitable[dict[str, Any]]]
     command: bool = True
     timeout: float = DEFAULT_TIMEOUT
-    nothing: Mapping[str, Any] = MappingProxyType({})
+    empty_fields: Mapping[str, Any] = MappingProxyType({})
 
 
-async def triggered(
+async def trigger_camera(
     work: Work,
     interpretation: Interpretation | None,
     application: int | None,
     *,
     data: bytes | None = None,
-    wanted: int = 1,
+    result_count: int = 1,
     wait: bool = True,
 ) -> list[ResultRun]:
-    """Trigger; return the containers, each as its own run.
+    """Trigger; return the trigger's containers, each as a run of one container.
 
     Raises:
         SmartCamError: like :meth:`smartcam.Camera.trigger`.
     """
     layouts = interpretation.numbered_layouts() if interpretation is not None else None
-    request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
-    runs = await outcomes(work.host, work.owner, request, application, work.timeout)
-    return [single for run in runs for single in singles(decode_own_run(run))]
+    request = TriggerRequest(AgentInterpretation(work.owner, layouts), data, result_count, wait)
+    runs = await trigger_runs(work.host, work.owner, request, application, work.timeout)
+    return [single for run in runs for single in split_run(decode_own_run(run))]
 
 
 async def _trigger(work: Work) -> dict[str, Any]:
     request, topics = work.request, work.topics
     interpretation = topics.interpretation
     if request.interpret_as is not None:
-        interpretation = topics.reading(request.interpret_as)
-    runs = await triggered(
+        interpretation = topics.make_interpretation(request.interpret_as)
+    runs = await trigger_camera(
         work,
         interpretation,
         request.application,
         data=None if request.input is None else bytes.fromhex(request.input),
-        wanted=request.results_per_trigger or 1,
+        result_count=request.results_per_trigger or 1,
         wait=request.when_busy == "wait",
     )
     results = [result_fields(run, interpretation, work.host.name) for run in runs]
@@ -233,17 +234,17 @@ async def _trigger(work: Work) -> dict[str, Any]:
 
 async def _status(work: Work) -> dict[str, Any]:
     topics = work.topics
-    return {**topics.state(), "number": topics.statuses - 1, "at": datetime.now(UTC).isoformat()}
+    return {**topics.state(), "number": topics.next_status - 1, "at": datetime.now(UTC).isoformat()}
 
 
-def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
-    """Return the function of a service that does the same as a call by smartcam's own programs."""
+def _service_of_call(action: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
+    """Return the function of a service that does the same as a call of smartcam's own programs."""
 
     async def service(work: Work) -> dict[str, Any]:
-        arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
+        arguments: dict[str, Any] = work.request.model_dump(exclude=_COMMON_FIELDS)
         blobs = [bytes.fromhex(arguments.pop(name)) for name in ("input",) if name in arguments]
         call = ProgramCall(work.host, "", work.owner, arguments, blobs, work.timeout, {})
-        fields, attached = await ACTIONS[do](call)
+        fields, attached = await ACTIONS[action](call)
         if "status" in fields:
             fields["status_names"] = Status(fields["status"]).names
         return {**fields, "image": base64.b64encode(attached[0]).decode()} if attached else fields
@@ -254,9 +255,9 @@ def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
 async def _results(work: Work) -> dict[str, Any]:
     log, most = work.host.results, work.request.most
     first = max(1, log.following - most) if work.request.first is None else work.request.first
-    part = log.part(first, MAX_REPLY_BYTES)
+    part = log.read_part(first, MAX_REPLY_BYTES)
     runs = map(decode_own_run, part.data)
-    matching = (single for run in runs for single in singles(run) if single.number >= part.first)
+    matching = (single for run in runs for single in split_run(run) if single.number >= part.first)
     results = [work.topics.result(single) for single in itertools.islice(matching, most)]
     return {"first": part.first, "next_result": part.following, "results": results}
 
@@ -265,21 +266,23 @@ async def _frame(work: Work) -> dict[str, Any]:
     request, host = work.request, work.host
     encoding = FrameForm.checked(request.encoding, request.quality, host.name)
     order = FrameOrder("", work.owner.call, encoding, work.timeout)
-    frame, took = await host.frames.get(
+    frame, encoding_time = await host.frames.get_frame(
         order, max_age=request.max_age, after=None, fresh=request.fresh
     )
-    return _picture(host, encoding, frame, took)
+    return _frame_answer(host, encoding, frame, encoding_time)
 
 
 async def _trigger_frame(work: Work) -> dict[str, Any]:
     request, host = work.request, work.host
     encoding = FrameForm.checked(request.encoding, request.quality, host.name)
     order = FrameOrder("", work.owner.call, encoding, work.timeout)
-    frame, took = await host.frames.triggered(order, wait=request.when_busy == "wait")
-    return _picture(host, encoding, frame, took)
+    frame, encoding_time = await host.frames.trigger_frame(order, wait=request.when_busy == "wait")
+    return _frame_answer(host, encoding, frame, encoding_time)
 
 
-def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict[str, Any]:
+def _frame_answer(
+    host: Host, encoding: FrameForm, frame: Frame, encoding_time: float
+) -> dict[str, Any]:
     """Return the fields of an answer that has a frame."""
     if len(frame.data) > MAX_PICTURE_BYTES:
         raise FrameFormatError(
@@ -287,11 +290,14 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
             f"{MAX_PICTURE_BYTES} at most",
             source=host.name,
         )
-    fields = to_fields(frame, 0.0, took, 0)
-    shown = {name: value for name, value in fields.items() if name not in {"captured", "lens"}}
-    if "trigger" in shown:  # times of the event are by the agent's clock
-        shown["trigger"] = {name: shown["trigger"][name] for name in ("number", "evidence")}
-    return {"frame": {**shown, "data": base64.b64encode(frame.data).decode()}}
+    fields = to_fields(frame, 0.0, encoding_time, 0)
+    public_fields = {
+        name: value for name, value in fields.items() if name not in {"captured", "lens"}
+    }
+    if "trigger" in public_fields:  # its time is of the agent's clock
+        trigger = public_fields["trigger"]
+        public_fields["trigger"] = {name: trigger[name] for name in ("number", "evidence")}
+    return {"frame": {**public_fields, "data": base64.b64encode(frame.data).decode()}}
 
 
 async def _unknown(work: Work) -> dict[str, Any]:
@@ -299,9 +305,9 @@ async def _unknown(work: Work) -> dict[str, Any]:
 
 
 UNKNOWN = Service(PlainRequest, _unknown)
-"""Service that answers instead of an unknown one."""
+"""Service that stands for all services that do not exist."""
 
-_OF_ALL = {*PlainRequest.model_fields}
+_COMMON_FIELDS = {*PlainRequest.model_fields}
 
 _REQUESTS: dict[str, type[PlainRequest]] = {
     "switch_application": _PlainSwitch,
@@ -322,7 +328,7 @@ _REQUESTS: dict[str, type[PlainRequest]] = {
     "set_feature": _PlainSetFeature,
     "execute_feature": _PlainFeature,
 }
-"""Requests of the services that do the same as a call of smartcam's own programs."""
+"""Class of the requests, for each service that does the same as a call of smartcam's programs."""
 
 SERVICES: dict[str, Service] = {
     "trigger": Service(_PlainTrigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
@@ -330,6 +336,9 @@ SERVICES: dict[str, Service] = {
     "results": Service(_PlainResults, _results, command=False),
     "frame": Service(_PlainFrame, _frame, command=False),
     "trigger_frame": Service(_PlainTriggerFrame, _trigger_frame),
-    **{do: Service(kind, _same(do), do in COMMANDS) for do, kind in _REQUESTS.items()},
+    **{
+        action: Service(request, _service_of_call(action), action in COMMANDS)
+        for action, request in _REQUESTS.items()
+    },
 }
 """The plain services by name."""

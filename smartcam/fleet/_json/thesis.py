@@ -1,4 +1,4 @@
-"""Serve the thesis' six services in JSON, on the fleet's bus."""
+"""Serve the camera services of the thesis' interface in JSON, on the fleet's bus."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field, create_model
 
-from smartcam._thesis import THESIS as SIX
+from smartcam._thesis import THESIS as THESIS_SERVICES
 from smartcam._thesis import SetupRequest, ThesisCall
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._agent.calls import ACTIONS, ProgramCall
@@ -18,9 +18,9 @@ from smartcam.fleet._json.services import (
     Service,
     Text,
     Work,
-    triggered,
+    trigger_camera,
 )
-from smartcam.fleet._program.reading import interpreted
+from smartcam.fleet._program.reading import interpret_run
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
@@ -32,12 +32,12 @@ _TOPIC = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+){0,7}")
 
 
 def _none_if_empty(value: object) -> object:
-    nothing = value == "" or (type(value) in {int, float} and value == 0)
-    return None if nothing else value
+    is_empty = value == "" or (type(value) in {int, float} and value == 0)
+    return None if is_empty else value
 
 
 class BusFields(PlainRequest):
-    """The fields that a request on the bus may have besides those over ROS."""
+    """The fields that a request may have only on the bus, not over ROS."""
 
     camera_name: Annotated[str, Field(min_length=1, max_length=200)]
     id: Annotated[Id | None, BeforeValidator(_none_if_empty)] = None
@@ -63,7 +63,7 @@ def new_camera(request: SetupRequest) -> CameraSettings:
 
 
 class JsonThesisFace:
-    """The part of an agent's camera that the thesis' services use.
+    """An agent's camera as the thesis' services use it.
 
     Args:
         work: the running service.
@@ -95,11 +95,11 @@ class JsonThesisFace:
 
     def check_reading(self, spec: str) -> None:
         """Raise ConfigurationError if results cannot be interpreted by ``spec``."""
-        self._topics.reading(spec)
+        self._topics.make_interpretation(spec)
 
     def read_as(self, spec: str | None) -> None:
         """Interpret results by ``spec`` from now on; None: by the settings."""
-        self._topics.interpret(self._host.settings.interpret_as if spec is None else spec)
+        self._topics.set_interpretation(self._host.settings.interpret_as if spec is None else spec)
 
     def is_calibrated(self, application: int) -> bool:
         """Return False: JSON has poses in the camera's frame."""
@@ -107,15 +107,15 @@ class JsonThesisFace:
 
     def check_status_topic(self, topic: str) -> None:
         """Raise ConfigurationError if a topic is not valid."""
-        _topic(topic)
+        _check_topic(topic)
 
     def publish_status(self, topic: str) -> dict[str, Any]:
         """Publish the status on this topic; return its key."""
-        return {"topic": self._topics.publish_status(_topic(topic))}
+        return {"topic": self._topics.publish_status(_check_topic(topic))}
 
     async def publish_results(self, topic: str, min_delay: float, queue: int) -> dict[str, Any]:
         """Publish results on this topic; return its key."""
-        return {"topic": self._topics.publish_results(_topic(topic), min_delay, queue)}
+        return {"topic": self._topics.publish_results(_check_topic(topic), min_delay, queue)}
 
     async def end_publishing(self) -> None:
         """End publishing on the topics that requests have named."""
@@ -127,7 +127,7 @@ class JsonThesisFace:
 
     async def ensure(self, application: int, timeout: float) -> None:
         """Load and run an application."""
-        await self._host.require().ensure(application, timeout)
+        await self._host.require().ensure_application(application, timeout)
 
     async def switch(self, application: int, timeout: float) -> None:
         """Load an application."""
@@ -138,13 +138,13 @@ class JsonThesisFace:
 
     async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
         """Trigger; return the result's application, and its value by ``spec``."""
-        reading = self._topics.reading(spec)
-        (run,) = await triggered(self._work, reading, application)
-        return run.application, interpreted(run, reading, self.name)[0]
+        reading = self._topics.make_interpretation(spec)
+        (run,) = await trigger_camera(self._work, reading, application)
+        return run.application, interpret_run(run, reading, self.name)[0]
 
 
-def _topic(text: str) -> str:
-    """Return a topic without slashes around it.
+def _check_topic(text: str) -> str:
+    """Return a topic without slashes at its ends.
 
     Raises:
         ConfigurationError: the topic is not valid.
@@ -158,21 +158,33 @@ def _topic(text: str) -> str:
     return name
 
 
-def _on_bus(name: str) -> Service:
-    """Return one of the six as a service of the bus."""
-    six: ThesisService = SIX[name]
-    request: Any = create_model(six.request.__name__, __base__=(six.request, BusFields))
+def _bus_service(name: str) -> Service:
+    """Return one of the six services as a service of the bus."""
+    thesis_service: ThesisService = THESIS_SERVICES[name]
+    request: Any = create_model(
+        thesis_service.request.__name__, __base__=(thesis_service.request, BusFields)
+    )
 
-    async def do(work: Work) -> dict[str, Any]:
-        return await six.answer(ThesisCall(JsonThesisFace(work), work.request, work.timeout))
+    async def carry_out(work: Work) -> dict[str, Any]:
+        return await thesis_service.answer(
+            ThesisCall(JsonThesisFace(work), work.request, work.timeout)
+        )
 
-    nothing: dict[str, Any] = {} if six.nothing is None else {six.nothing: []}
-    gated = name != "EnablePublishing"
-    return Service(request, do, command=gated, timeout=six.timeout, nothing=nothing)
+    empty_fields: dict[str, Any] = (
+        {} if thesis_service.nothing is None else {thesis_service.nothing: []}
+    )
+    is_command = name != "EnablePublishing"
+    return Service(
+        request,
+        carry_out,
+        command=is_command,
+        timeout=thesis_service.timeout,
+        empty_fields=empty_fields,
+    )
 
 
-_ON_BUS = {name: _on_bus(name) for name in SIX}
-SETUP, STOP = _ON_BUS["SmartcameraSetup"], _ON_BUS["SmartcameraStop"]
+_BUS_SERVICES = {name: _bus_service(name) for name in THESIS_SERVICES}
+SETUP, STOP = _BUS_SERVICES["SmartcameraSetup"], _BUS_SERVICES["SmartcameraStop"]
 
-THESIS: dict[str, Service] = {**_ON_BUS, "Setup": SETUP, "Stop": STOP}
-"""The services of the thesis' interface by name."""
+THESIS: dict[str, Service] = {**_BUS_SERVICES, "Setup": SETUP, "Stop": STOP}
+"""The six camera services by name; two of them also have a short name."""

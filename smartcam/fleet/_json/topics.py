@@ -1,4 +1,4 @@
-"""Publish topics in JSON for programs without smartcam, while they have subscribers."""
+"""Publish topics in JSON for programs without smartcam; each only while it has a subscriber."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from smartcam._client._inside import Interpretation
 from smartcam._json import object_text
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._program.program_name import in_words
-from smartcam.fleet._program.reading import result_fields, singles
+from smartcam.fleet._program.reading import result_fields, split_run
 from smartcam.models import Connected, Disconnected, Reconnected, Status, StatusChanged, jsonable
 
 if TYPE_CHECKING:
@@ -26,22 +26,23 @@ if TYPE_CHECKING:
     from smartcam.models import CameraEvent
 
 MAX_QUEUED_BYTES = 1 << 24
-"""Largest number of bytes of containers that wait for a topic with a delay; beyond it the oldest
-are dropped."""
+"""Largest number of bytes of containers that wait for a topic with a delay; the oldest containers
+beyond it are dropped."""
 
 Kind = Literal["results", "status", "events"]
 
 
 def as_json(fields: Mapping[str, object]) -> bytes:
-    """Return fields as a payload."""
+    """Return fields as JSON in UTF-8."""
     return object_text(fields).encode()
 
 
 class Topics:
     """The topics of one agent's cameras.
 
-    One check shows whether any camera's topics have a subscriber; only then a camera's own
-    publisher is created. So a thousand cameras cost nothing without subscribers.
+    For each kind of messages, one publisher for all cameras shows whether there is a subscriber.
+    Only then a camera's own publisher is created. So a thousand cameras cost nothing without
+    subscribers.
 
     Args:
         agent: the agent's name.
@@ -54,47 +55,49 @@ class Topics:
         self.identity: dict[str, str] = {"agent": agent, "epoch": str(epoch)}
         self.keys: Keys = keys
         self.bus: Bus = bus
-        self._any: dict[Kind, Publisher] = {}
-        self._made: dict[tuple[Kind, str], Publisher] = {}
+        self._kind_publishers: dict[Kind, Publisher] = {}
+        self._camera_publishers: dict[tuple[Kind, str], Publisher] = {}
 
     def open(self) -> None:
         """Start to check for subscribers."""
         kinds: tuple[Kind, ...] = ("results", "status", "events")
         for kind in kinds:
-            self._any[kind] = self.bus.publisher(self.keys.topic(kind, "**"))
+            self._kind_publishers[kind] = self.bus.publisher(self.keys.topic(kind, "**"))
 
     def close(self) -> None:
         """Close all publishers."""
-        handles: list[Handle] = [*self._any.values(), *self._made.values()]
-        self._any.clear()
-        self._made.clear()
+        handles: list[Handle] = [*self._kind_publishers.values(), *self._camera_publishers.values()]
+        self._kind_publishers.clear()
+        self._camera_publishers.clear()
         for handle in handles:
             handle.close()
 
-    def subscribed(self, kind: Kind, camera: str) -> Publisher | None:
+    def publisher_of(self, kind: Kind, camera: str) -> Publisher | None:
         """Return the publisher of one kind of a camera's messages; None without a subscriber."""
-        everyone = self._any.get(kind)
-        if everyone is None or not everyone.has_subscribers:
+        kind_publisher = self._kind_publishers.get(kind)
+        if kind_publisher is None or not kind_publisher.has_subscribers:
             return None
-        made = self._made.get((kind, camera))
-        if made is None:
-            made = self._made[kind, camera] = self.bus.publisher(self.keys.topic(kind, camera))
-        return made if made.has_subscribers else None
+        publisher = self._camera_publishers.get((kind, camera))
+        if publisher is None:
+            publisher = self._camera_publishers[kind, camera] = self.bus.publisher(
+                self.keys.topic(kind, camera)
+            )
+        return publisher if publisher.has_subscribers else None
 
-    def forget(self, camera: str) -> None:
+    def close_camera(self, camera: str) -> None:
         """Close the publishers of a camera that is no longer shared."""
-        for key in [key for key in self._made if key[1] == camera]:
-            self._made.pop(key).close()
+        for key in [key for key in self._camera_publishers if key[1] == camera]:
+            self._camera_publishers.pop(key).close()
 
 
 @dataclass(eq=False)
 class Publication:
-    """Results of one camera under the topic of a request, with a delay.
+    """Publishes the results of one camera under the topic of a request, with a delay.
 
     Args:
         publisher: publisher of the results.
         min_delay: least seconds between two results.
-        queue_size: largest number of waiting results; beyond it the oldest is dropped.
+        queue_size: largest number of waiting results; the oldest results beyond it are dropped.
     """
 
     publisher: Publisher
@@ -105,28 +108,28 @@ class Publication:
     _timer: asyncio.TimerHandle | None = None
 
     def offer(self, runs: Iterable[ResultRun], topics: CameraTopics) -> None:
-        """Queue results, each as its own run."""
+        """Queue results, and send them as the delay allows; each run has one container."""
         if not self.publisher.has_subscribers:
             return
         for run in runs:
             self._queue.append(run)
             self._bytes += run.size
-            self._go_on(topics)
+            self._send_queued(topics)
             while len(self._queue) > self.queue_size or self._bytes > MAX_QUEUED_BYTES:
                 self._bytes -= self._queue.popleft().size
 
-    def _go_on(self, topics: CameraTopics) -> None:
+    def _send_queued(self, topics: CameraTopics) -> None:
         while self._queue and self._timer is None:
             run = self._queue.popleft()
             self._bytes -= run.size
             self.publisher.put(as_json(topics.result(run)))
             if self.min_delay:
                 loop = asyncio.get_running_loop()
-                self._timer = loop.call_later(self.min_delay, self._next, topics)
+                self._timer = loop.call_later(self.min_delay, self._on_delay_over, topics)
 
-    def _next(self, topics: CameraTopics) -> None:
+    def _on_delay_over(self, topics: CameraTopics) -> None:
         self._timer = None
-        self._go_on(topics)
+        self._send_queued(topics)
 
     def close(self) -> None:
         """Stop sending, and drop the results that wait."""
@@ -144,11 +147,12 @@ class CameraTopics:
         topics: topics of the camera's agent.
 
     Attributes:
-        interpret_as: contents of the camera's containers, for values in JSON.
+        interpret_as: interpreter or layout of the camera's containers, for values in JSON.
         interpretation: interpretation of the containers; None if their contents are not known.
         trouble: reason why there is no session; empty if there is one.
-        stopped: whether the thesis' SmartcameraStop has closed the camera for its services.
-        statuses, events: numbers of the next status and of the next event.
+        stopped: whether SmartcameraStop, a service of the thesis' interface, has closed the camera
+            for the services of that interface.
+        next_status, next_event: numbers of the next status and of the next event.
         status_out: publisher of the status under the topic of a request.
         results_out: publication of the results under the topic of a request.
     """
@@ -159,22 +163,24 @@ class CameraTopics:
         self.stopped: bool = False
         self.status_out: Publisher | None = None
         self.results_out: Publication | None = None
-        self.statuses: int = 1
-        self.events: int = 1
-        self._before: Status | None = None
-        self.interpret(host.settings.interpret_as)
+        self.next_status: int = 1
+        self.next_event: int = 1
+        self._last_status: Status | None = None
+        self.set_interpretation(host.settings.interpret_as)
 
-    def interpret(self, spec: Any) -> None:
-        """Interpret the camera's containers in another way from now on.
+    def set_interpretation(self, spec: Any) -> None:
+        """Interpret the camera's containers by ``spec`` from now on; None: not at all.
 
         Raises:
             ConfigurationError: ``spec`` is not valid.
         """
-        self.interpretation: Interpretation | None = None if spec is None else self.reading(spec)
+        self.interpretation: Interpretation | None = (
+            None if spec is None else self.make_interpretation(spec)
+        )
         self.interpret_as: Any = spec
 
-    def reading(self, spec: Any) -> Interpretation:
-        """Return the interpretation of its containers by ``spec``.
+    def make_interpretation(self, spec: Any) -> Interpretation:
+        """Return an interpretation of the camera's containers by ``spec``.
 
         Raises:
             ConfigurationError: ``spec`` is not valid.
@@ -185,7 +191,7 @@ class CameraTopics:
     def publish_status(self, topic: str) -> str:
         """Publish the status under a topic of the thesis' interface; return its key.
 
-        It replaces the previous one; an empty name ends it.
+        This replaces the previous topic; an empty name only ends it.
         """
         if self.status_out is not None:
             self.status_out.close()
@@ -198,7 +204,7 @@ class CameraTopics:
     def publish_results(self, topic: str, min_delay: float, queue_size: int) -> str:
         """Publish results under a topic of the thesis' interface; return its key.
 
-        It replaces the previous one; an empty name ends it.
+        This replaces the previous topic; an empty name only ends it.
         """
         if self.results_out is not None:
             self.results_out.close()
@@ -217,27 +223,27 @@ class CameraTopics:
     def close(self) -> None:
         """End all publishing of a camera that is no longer shared."""
         self.end_publishing()
-        self._topics.forget(self._host.name)
+        self._topics.close_camera(self._host.name)
 
-    # ------------------------------------------------------------------ as JSON
+    # ------------------------------------------------------------------ fields for JSON
 
     def result(self, run: ResultRun) -> dict[str, Any]:
-        """Return a result; ``run`` has one container."""
+        """Return the fields of a result; ``run`` has one container."""
         fields = result_fields(run, self.interpretation, self._host.name)
         return {**self._topics.identity, **fields}
 
     def state(self) -> dict[str, Any]:
         """Return the fields of the camera's current state."""
         host = self._host
-        state = host.state()
-        word: int | None = state["status"]
+        state = host.state_fields()
+        bits: int | None = state["status"]
         return {
             "camera": host.name,
             **self._topics.identity,
             "connected": state["connected"],
             "failure": str(host.failure or self.trouble),
-            "status": word,
-            "status_names": [] if word is None else Status(word).names,
+            "status": bits,
+            "status_names": [] if bits is None else Status(bits).names,
             "application": state["application"],
             "reserved_by": None if host.gate.holder is None else in_words(host.gate.holder),
         }
@@ -247,11 +253,11 @@ class CameraTopics:
         host = self._host
         dialect = capabilities = None
         try:
-            can = host.camera.capabilities
+            features = host.camera.capabilities
         except SmartCamError:
             pass  # there was no session yet
         else:
-            dialect, capabilities = can.dialect, can.names
+            dialect, capabilities = features.dialect, features.names
         return {
             **self.state(),
             "url": host.camera.url,
@@ -270,21 +276,21 @@ class CameraTopics:
 
     def on_run(self, run: ResultRun) -> None:
         """Publish received containers."""
-        out = self._topics.subscribed("results", self._host.name)
+        out = self._topics.publisher_of("results", self._host.name)
         if out is not None:
-            for single in singles(run):
+            for single in split_run(run):
                 out.put(as_json(self.result(single)))
         if self.results_out is not None:
-            self.results_out.offer(singles(run), self)
+            self.results_out.offer(split_run(run), self)
 
     def on_state(self) -> None:
         """Number the camera's state, and publish it if there is a subscriber."""
-        number, self.statuses = self.statuses, self.statuses + 1
-        out = self._topics.subscribed("status", self._host.name)
+        number, self.next_status = self.next_status, self.next_status + 1
+        out = self._topics.publisher_of("status", self._host.name)
         if out is None and self.status_out is None:
             return
-        outs = [out, self.status_out]
-        subscribed = [each for each in outs if each is not None and each.has_subscribers]
+        publishers = [out, self.status_out]
+        subscribed = [out for out in publishers if out is not None and out.has_subscribers]
         if subscribed:
             at = datetime.now(UTC).isoformat()
             data = as_json({**self.state(), "number": number, "at": at})
@@ -293,17 +299,17 @@ class CameraTopics:
 
     def on_status(self, status: Status) -> None:
         """Handle a status of the camera; publish its change as an event."""
-        before, self._before = self._before, status
-        if status != before:
-            number, self.events = self.events, self.events + 1
-            if self._topics.subscribed("events", self._host.name) is not None:
+        previous, self._last_status = self._last_status, status
+        if status != previous:
+            number, self.next_event = self.next_event, self.next_event + 1
+            if self._topics.publisher_of("events", self._host.name) is not None:
                 at, name = datetime.now(UTC), self._host.name
-                changed = StatusChanged(camera=name, at=at, status=status, previous=before)
+                changed = StatusChanged(camera=name, at=at, status=status, previous=previous)
                 self._publish_event(changed, number)
 
     def on_event(self, event: CameraEvent) -> None:
         """Publish an event of the camera."""
-        number, self.events = self.events, self.events + 1
+        number, self.next_event = self.next_event, self.next_event + 1
         if isinstance(event, Disconnected):
             self.trouble = event.reason
         elif isinstance(event, (Connected, Reconnected)):
@@ -312,16 +318,16 @@ class CameraTopics:
 
     def on_reservation(self, change: Change, program: str) -> None:
         """Publish that a program has reserved the camera, or no longer has."""
-        number, self.events = self.events, self.events + 1
+        number, self.next_event = self.next_event, self.next_event + 1
         fields = {"camera": self._host.name, "at": jsonable(datetime.now(UTC))}
         fields["by"] = in_words(program)
         self._put_event(change, fields, number)
 
     def _publish_event(self, event: CameraEvent, number: int) -> None:
-        if self._topics.subscribed("events", self._host.name) is not None:
+        if self._topics.publisher_of("events", self._host.name) is not None:
             self._put_event(type(event).__name__, jsonable(event), number)
 
     def _put_event(self, kind: str, fields: dict[str, Any], number: int) -> None:
-        out = self._topics.subscribed("events", self._host.name)
+        out = self._topics.publisher_of("events", self._host.name)
         if out is not None:
             out.put(as_json({**self._topics.identity, "number": number, "event": kind, **fields}))

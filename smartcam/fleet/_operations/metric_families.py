@@ -1,8 +1,8 @@
 """Convert an agent's numbers to Prometheus' families and their text.
 
 The text of a thousand cameras takes a tenth of a second, and a thread for it would block the event
-loop for 5 ms at a time. So it is written in the event loop, half a millisecond at a time: one
-family of a few cameras after the other.
+loop for 5 ms at a time. So it is written in the event loop, in steps of half a millisecond. Each
+step writes one family of a few cameras.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._extras import load
 from smartcam.fleet._operations.metrics import FATES
-from smartcam.fleet._operations.trigger_counts import RESULT, SUMS, cumulative
+from smartcam.fleet._operations.trigger_counts import RESULT, SUMS, cumulative_bins
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._operations.metrics import AgentNumbers, CameraNumbers
 
 MAX_LINES_PER_TURN = 80
-"""Largest number of lines that are written at a time."""
+"""Largest number of lines that are written in one step."""
 
 _SUMS = {
     "bytes_received": ("smartcam_received_bytes", "Bytes from cameras"),
@@ -52,29 +52,29 @@ _GAUGES = (
 )
 
 
-async def exposition(numbers: AgentNumbers | None, *, each: bool) -> tuple[bytes, str]:
+async def exposition(numbers: AgentNumbers | None, *, per_camera: bool) -> tuple[bytes, str]:
     """Return the text of an agent's numbers, and its content type.
 
     Args:
-        numbers: numbers that were read; None: the agent does not run.
-        each: whether there is a histogram for each camera.
+        numbers: the agent's numbers; None: the agent does not run.
+        per_camera: whether there is a histogram for each camera.
 
     Raises:
         MissingExtraError: prometheus-client is not installed.
     """
     client = require_client()
-    parts: list[bytes] = [await asyncio.to_thread(_of_process, client)]
+    parts: list[bytes] = [await asyncio.to_thread(_process_text, client)]
     if numbers is not None:
-        for family in _of_agent(client.core, numbers):
+        for family in _agent_families(client.core, numbers):
             parts.append(_text(client, family))
             await asyncio.sleep(0)
-        for kind in _KINDS if each else (*_KINDS[:-1], _SUMMARY):
-            chosen = [camera for camera in numbers.cameras if kind.chosen(camera)]
+        for kind in _KINDS if per_camera else (*_KINDS[:-1], _SUMMARY):
+            cameras = [camera for camera in numbers.cameras if kind.applies(camera)]
             size = max(1, MAX_LINES_PER_TURN // kind.lines)
-            for begin in range(0, len(chosen), size):
-                family = kind.make(client.core, numbers.agent, chosen[begin : begin + size])
+            for begin in range(0, len(cameras), size):
+                family = kind.make_family(client.core, numbers.agent, cameras[begin : begin + size])
                 text = _text(client, family)
-                # the help text is before the first ones
+                # only the first part of a family begins with the help text
                 parts.append(text.split(b"\n", 2)[2] if begin else text)
                 await asyncio.sleep(0)
     return b"".join(parts), client.CONTENT_TYPE_LATEST
@@ -90,8 +90,8 @@ def require_client() -> Any:
     return load("prometheus_client")
 
 
-class _One(NamedTuple):
-    """A family as a collector, which prometheus-client converts to text."""
+class _FamilyCollector(NamedTuple):
+    """A collector of one family, which prometheus-client converts to text."""
 
     family: Any
 
@@ -100,34 +100,34 @@ class _One(NamedTuple):
 
 
 def _text(client: Any, family: Any) -> bytes:
-    made: bytes = client.generate_latest(_One(family))
-    return made
+    text: bytes = client.generate_latest(_FamilyCollector(family))
+    return text
 
 
-def _of_process(client: Any) -> bytes:
+def _process_text(client: Any) -> bytes:
     """Return the text of the process' families; blocks, since it asks the system for them."""
     registry = client.CollectorRegistry(auto_describe=False)
     client.ProcessCollector(registry=registry)
     client.GCCollector(registry=registry)
-    made: bytes = client.generate_latest(registry)
-    return made
+    text: bytes = client.generate_latest(registry)
+    return text
 
 
-# ---------------------------------------------------------------------- of the agent
+# ---------------------------------------------------------------------- the agent's families
 
 
-def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
+def _agent_families(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
     values = [numbers.agent]
     family = core.InfoMetricFamily("smartcam_agent", "The agent of a fleet", labels=["agent"])
     family.add_metric(values, {"fleet": numbers.fleet, "version": _version()})
     yield family
     gauges = [(name, text, numbers.gauges[key]) for name, key, text in _GAUGES]
     gauges += [
-        ("smartcam_agent_start_time_seconds", "When it began", numbers.began),
+        ("smartcam_agent_start_time_seconds", "When it began", numbers.started_at),
         (
             "smartcam_last_reload_successful",
             "Whether the last reading of the fleet file was taken",
-            float(numbers.reloaded),
+            float(numbers.last_reload_succeeded),
         ),
     ]
     for name, text, value in gauges:
@@ -145,7 +145,7 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
     for outcome, count in numbers.reloads.items():
         family.add_metric([*values, outcome], count)
     yield family
-    yield from _of_outlets(core, numbers)
+    yield from _outlet_families(core, numbers)
     for key in SUMS:
         name, text = _SUMS[key]
         family = core.CounterMetricFamily(name, text, labels=["agent"])
@@ -164,12 +164,12 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         ),
     ):
         family = core.HistogramMetricFamily(name, text, labels=["agent"])
-        family.add_metric(values, cumulative(histogram), histogram.total)
+        family.add_metric(values, cumulative_bins(histogram), histogram.total)
         yield family
 
 
-def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
-    """Yield the accounts of outlets: results that came were delivered, wait, or were dropped."""
+def _outlet_families(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
+    """Yield the families of outlets: each result was delivered, waits, or was dropped."""
     if not numbers.outlets:
         return
     labels = ["agent", "outlet"]
@@ -199,20 +199,20 @@ def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
     yield from (received, delivered, spooled, well, dropped)
 
 
-# ---------------------------------------------------------------------- of its cameras
+# ---------------------------------------------------------------------- the cameras' families
 
 
 class _MetricKind(NamedTuple):
-    """A family of numbers that each camera has.
+    """A family with numbers of each camera.
 
     Attributes:
         type: type of the family, in the names of prometheus-client's classes.
         name: name of the family.
         text: help text of the family, for people.
         labels: names of the labels besides ``agent`` and ``camera``.
-        values: function for a camera's values: the labels, and the arguments of a number.
+        values: function that returns a camera's labels, and the arguments of each number.
         lines: approximate number of lines for one camera.
-        chosen: whether a camera has it.
+        applies: function that returns whether a camera has numbers of the family.
     """
 
     type: str
@@ -221,12 +221,12 @@ class _MetricKind(NamedTuple):
     labels: tuple[str, ...]
     values: Callable[[CameraNumbers], list[tuple[tuple[str, ...], tuple[Any, ...]]]]
     lines: int
-    chosen: Callable[[CameraNumbers], bool] = lambda _: True
+    applies: Callable[[CameraNumbers], bool] = lambda _: True
 
-    def make(self, core: Any, agent: str, cameras: Sequence[CameraNumbers]) -> Any:
-        """Return the family of some cameras."""
-        kind = getattr(core, f"{self.type}MetricFamily")
-        family = kind(self.name, self.text, labels=["agent", "camera", *self.labels])
+    def make_family(self, core: Any, agent: str, cameras: Sequence[CameraNumbers]) -> Any:
+        """Return the family with the numbers of some cameras."""
+        family_class = getattr(core, f"{self.type}MetricFamily")
+        family = family_class(self.name, self.text, labels=["agent", "camera", *self.labels])
         for camera in cameras:
             for labels, number in self.values(camera):
                 family.add_metric([agent, camera.name, *labels], *number)
@@ -261,7 +261,7 @@ _KINDS = (
         "smartcam_taken",
         "Whether another client has the camera",
         (),
-        lambda numbers: [((), (float(numbers.taken),))],
+        lambda numbers: [((), (float(numbers.is_taken),))],
         1,
     ),
     _MetricKind(
@@ -293,7 +293,7 @@ _KINDS = (
         "smartcam_frame_viewers",
         "Streams of frames",
         (),
-        lambda numbers: [((), (numbers.viewers,))],
+        lambda numbers: [((), (numbers.stream_count,))],
         1,
         _has_frames,
     ),
@@ -320,12 +320,13 @@ _KINDS = (
         *_LATENCY,
         (),
         lambda numbers: [
-            ((), (cumulative(numbers.account.processing), numbers.account.processing.total))
+            ((), (cumulative_bins(numbers.account.processing), numbers.account.processing.total))
         ],
         20,
     ),
 )
-"""Families of each camera's numbers; without ``each`` a summary replaces the last one."""
+"""Families with numbers of each camera; without ``per_camera`` a summary replaces the last
+family."""
 
 
 def _version() -> str:

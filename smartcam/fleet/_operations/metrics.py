@@ -1,6 +1,6 @@
-"""Collect an agent's numbers from existing counts.
+"""Collect an agent's numbers from counts that it has.
 
-The agent belongs to its event loop, so it is read there, a few cameras at a time.
+The agent belongs to its event loop, so its counts are read there, a few cameras at a time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._inside import OutletState
 
 CAMERAS_PER_SLICE = 24
-"""Number of cameras that are read at a time, which takes half a millisecond."""
+"""Number of cameras that are read in one turn of the event loop, half a millisecond."""
 
 FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
 
@@ -30,10 +30,10 @@ class CameraNumbers(NamedTuple):
 
     name: str
     connected: bool
-    taken: bool
+    is_taken: bool
     account: Statistics
     triggers: dict[str, int]
-    viewers: int
+    stream_count: int
     frames: SourceStatistics | None
 
 
@@ -42,46 +42,46 @@ class AgentNumbers(NamedTuple):
 
     agent: str
     fleet: str
-    began: float
+    started_at: float
     gauges: dict[str, float]
     reloads: dict[str, int]
-    reloaded: bool
+    last_reload_succeeded: bool
     totals: Totals
     cameras: list[CameraNumbers]
     outlets: Mapping[str, OutletState]
 
 
 async def read_numbers(server: FleetServer) -> AgentNumbers | None:
-    """Read an agent in its event loop, a few cameras at a time; None if it does not run."""
+    """Return an agent's numbers, read in its event loop; None if the agent does not run."""
     agent = server.agent
     if agent is None:
         return None
     hosts = [*agent.hosts.values()]
-    read: list[tuple[Host, CameraNumbers]] = []
-    kept_results = kept_bytes = waiting = reserved = 0
+    numbers_read: list[tuple[Host, CameraNumbers]] = []
+    kept_results = kept_bytes = waiting_count = reserved_count = 0
     for begin in range(0, len(hosts), CAMERAS_PER_SLICE):
         for host in hosts[begin : begin + CAMERAS_PER_SLICE]:
             if agent.hosts.get(host.name) is host:  # the camera may have been removed meanwhile
-                read.append((host, _camera(host)))
-                kept_results += host.results.kept
+                numbers_read.append((host, _camera_numbers(host)))
+                kept_results += host.results.kept_count
                 kept_bytes += host.results.kept_bytes
-                waiting += host.gate.waiting
-                reserved += host.gate.holder is not None
+                waiting_count += host.gate.waiting_count
+                reserved_count += host.gate.holder is not None
         await asyncio.sleep(0)
     gauges: dict[str, float] = {
-        "programs": agent.programs,
-        "calls": agent.calls,
+        "programs": agent.program_count,
+        "calls": agent.call_count,
         "kept_results": kept_results,
         "kept_bytes": kept_bytes,
-        "waiting_commands": waiting,
-        "reserved": reserved,
+        "waiting_commands": waiting_count,
+        "reserved": reserved_count,
         "bus_bytes": server.bus_bytes,
     }
     reloads = server.reloads
-    # at the same time, so that each camera counts once, here or among removed ones
-    cameras = [numbers for host, numbers in read if agent.hosts.get(host.name) is host]
-    totals = Totals(agent.past)
-    totals.add(host.camera.statistics() for host in agent.leaving)
+    # without await in between, so that each camera counts once: here or among removed cameras
+    cameras = [numbers for host, numbers in numbers_read if agent.hosts.get(host.name) is host]
+    totals = Totals(agent.past_totals)
+    totals.add(host.camera.statistics() for host in agent.closing_hosts)
     for begin in range(0, len(cameras), 4 * CAMERAS_PER_SLICE):
         totals.add(camera.account for camera in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
         await asyncio.sleep(0)
@@ -98,14 +98,14 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     )
 
 
-def _camera(host: Host) -> CameraNumbers:
+def _camera_numbers(host: Host) -> CameraNumbers:
     frames = host.frames
     return CameraNumbers(
         host.name,
         host.connected,
-        host.camera.taken,
+        host.camera.is_taken,
         host.camera.statistics(),
         dict(host.triggers),
-        frames.viewers,
+        frames.stream_count,
         frames.statistics,
     )

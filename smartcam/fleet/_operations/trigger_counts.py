@@ -50,7 +50,7 @@ OUTCOMES: Final = (RESULT, *dict.fromkeys(word for _, word in _FAILURE_WORDS), "
 
 
 def outcome_of(error: BaseException) -> str:
-    """Return the word for a trigger's failure."""
+    """Return the word for the outcome of a trigger that failed with this error."""
     return next((word for kind, word in _FAILURE_WORDS if isinstance(error, kind)), "other")
 
 
@@ -63,7 +63,7 @@ SUMS: Final = (
 
 
 class Totals:
-    """Sums over cameras, also over removed ones, so that they never decrease.
+    """Sums over all cameras, also over cameras that were removed, so that they never decrease.
 
     Attributes:
         counts: sums of the counters in :data:`SUMS`.
@@ -77,19 +77,23 @@ class Totals:
 
     def add(self, accounts: Iterable[Statistics]) -> None:
         """Add the counts of cameras."""
-        given = [*accounts]
+        statistics = [*accounts]
         for name in SUMS:
-            self.counts[name] += sum(getattr(account, name) for account in given)
-        self.processing = _sum([self.processing, *(account.processing for account in given)])
-        self.round_trip = _sum([self.round_trip, *(account.round_trip for account in given)])
+            self.counts[name] += sum(getattr(account, name) for account in statistics)
+        self.processing = _sum_histograms(
+            [self.processing, *(account.processing for account in statistics)]
+        )
+        self.round_trip = _sum_histograms(
+            [self.round_trip, *(account.round_trip for account in statistics)]
+        )
 
 
-def _sum(histograms: list[Histogram]) -> Histogram:
+def _sum_histograms(histograms: list[Histogram]) -> Histogram:
     counts = tuple(map(sum, zip(*(histogram.counts for histogram in histograms), strict=True)))
     return Histogram(HISTOGRAM_BOUNDS, counts, sum(histogram.total for histogram in histograms))
 
 
-def cumulative(histogram: Histogram) -> list[tuple[str, float]]:
+def cumulative_bins(histogram: Histogram) -> list[tuple[str, float]]:
     """Return the bins in Prometheus' form: each counts all values up to its bound."""
     bounds = [*map(str, histogram.bounds), "+Inf"]
     return list(zip(bounds, map(float, itertools.accumulate(histogram.counts)), strict=True))

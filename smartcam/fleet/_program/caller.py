@@ -20,14 +20,14 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet._bus.errors import from_fields
-from smartcam.fleet._bus.keys import COMMANDS, FENCED
+from smartcam.fleet._bus.keys import COMMANDS, RESERVED_COMMANDS
 from smartcam.fleet._bus.wire import (
     BusMessage,
     TriggerOrder,
     TriggerReply,
     encode,
     encode_order,
-    grace,
+    reply_grace,
 )
 from smartcam.fleet._security.certificates import may_command
 
@@ -43,17 +43,19 @@ MAX_DRIFT_RATIO = 1e-4
 """Largest drift between two clocks, seconds per second."""
 
 HELLO_TIMEOUT = 2.0
-"""Seconds for the answer to a hello, which is then sent again while the agent is present."""
+"""Seconds for the answer to a hello; after that, the hello is sent again if the agent is
+present."""
 
 
-SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
-"""Names of calls in texts for users, if they differ from the call's own."""
+NAMES_FOR_USERS = {"ensure": "switch_application", "enter": "switch_application"}
+"""Names in texts for users of calls that have another name on the bus."""
 OTHER_AGENT_INTERVAL = 0.25
-"""Seconds between two searches for another agent with a session, if the current agent has none."""
+"""Seconds between two searches for another agent that has a session, if the current one has
+none."""
 
 SESSION_QUESTION_INTERVAL = 5.0
-"""Seconds between two questions to an agent without a session whether it has one now: its message
-may be lost, and a camera without triggers causes no further ones."""
+"""Seconds between two questions to an agent whether it has a session now. Its message about a new
+session may be lost, and a camera without triggers causes no further messages."""
 
 MAX_AGENTS_REMEMBERED = 16
 """Largest number of agents of a camera that are remembered."""
@@ -62,17 +64,17 @@ RESEND_DELAY = 1.0
 """Seconds until an unconfirmed message, which may be lost, is sent again."""
 
 
-class Met:
-    """An agent that has answered.
+class MetAgent:
+    """An agent that has answered a hello.
 
     Attributes:
-        agent: name of the agent.
+        name: name of the agent.
         epoch: number of the agent's start.
-        hello: fields on the camera in the agent's answer.
+        hello: fields about the camera in the agent's answer.
     """
 
-    def __init__(self, agent: str, epoch: int, hello: dict[str, Any]) -> None:
-        self.agent: str = agent
+    def __init__(self, name: str, epoch: int, hello: dict[str, Any]) -> None:
+        self.name: str = name
         self.epoch: int = epoch
         self.hello: dict[str, Any] = hello
 
@@ -94,15 +96,15 @@ class Lease:
         self.reported: bool = False
 
 
-class _HelloHeard(NamedTuple):
-    """An agent's answer to a hello, with the loop times before and after its clock's time."""
+class _HelloReply(NamedTuple):
+    """An agent's answer to a hello: its clock's time, and the loop times of question and answer."""
 
     agent: str
     epoch: int
     hello: dict[str, Any]
     clock: float
-    begun: float
-    at: float
+    asked_at: float
+    answered_at: float
 
 
 class Caller:
@@ -118,12 +120,12 @@ class Caller:
         on_lease_lost: callback for the loss of this program's reservations, once for each loss.
 
     Attributes:
-        met: the agent; None while there is none.
-        trouble: reason why there is no agent.
-        end: reason why there will be no further agent.
-        linked: whether the agent had a session with the camera when it last reported.
-        leases: the reservations whose blocks run, oldest first, by the calls that made them.
-        streamed: whether this program takes all results of the camera.
+        agent: the agent that answered; None while there is none.
+        no_agent_error: reason why there is no agent now.
+        final_error: reason why there will be no further agent.
+        has_session: whether the agent had a session with the camera when it last reported.
+        leases: the reservations whose blocks run, oldest first, by the numbers of their calls.
+        streams_results: whether this program takes all results of the camera.
     """
 
     def __init__(
@@ -132,7 +134,7 @@ class Caller:
         camera: str,
         program: Program,
         counters: Counters,
-        on_met: Callable[[Met], None],
+        on_met: Callable[[MetAgent], None],
         on_lost: Callable[[LinkError], None],
         on_lease_lost: Callable[[], None] = lambda: None,
     ) -> None:
@@ -141,74 +143,78 @@ class Caller:
         self.camera: str = camera
         self.program: Program = program
         self.counters: Counters = counters
-        self.met: Met | None = None
-        self.trouble: LinkError | None = None
-        self.end: LinkError | None = None
-        self.linked: bool = False
+        self.agent: MetAgent | None = None
+        self.no_agent_error: LinkError | None = None
+        self.final_error: LinkError | None = None
+        self.has_session: bool = False
         self.leases: dict[int, Lease] = {}
-        self.streamed: bool = False
-        self._commands_to = "", ""  # the agent of the last call, and the key of commands to it
-        self._epochs: dict[str, int] = {}  # epochs of agents that have answered
+        self.streams_results: bool = False
+        self._command_key = "", ""  # the agent of the last command, and the key of commands to it
+        self._epochs: dict[str, int] = {}  # epoch of each agent that has answered
         self._on_met, self._on_lost = on_met, on_lost
-        self._agents: dict[str, None] = {}
-        self._stirred = asyncio.Event()
-        self._watch: Handle | None = None
+        self._agents: dict[str, None] = {}  # present agents that share the camera
+        self._changed = asyncio.Event()
+        self._presence_watch: Handle | None = None
         self._task: asyncio.Task[None] | None = None
-        self._ahead = 0.0  # least seconds by which the agent's clock is ahead of the loop's
-        self._measured = 0.0
-        self._most = math.inf  # most seconds by which the agent's clock is ahead
-        self._bounded = 0.0
-        self._removed = ""  # reason why the current agent no longer shares the camera
-        self._insisting: set[asyncio.Task[None]] = set()
+        self._min_clock_lead = (
+            0.0  # least number of seconds by which the agent's clock is ahead of the loop's
+        )
+        self._min_lead_at = 0.0
+        self._max_clock_lead = math.inf  # largest number of these seconds
+        self._max_lead_at = 0.0
+        self._removal_reason = ""  # reason why the current agent no longer shares the camera
+        self._resending_tasks: set[asyncio.Task[None]] = set()
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ open and close
 
     def open(self) -> None:
         """Start looking for the agent."""
         keys, bus = self.program.keys, self.program.bus
-        self._watch = bus.watch(keys.camera("*", self.camera), self._on_presence)
+        self._presence_watch = bus.watch(keys.camera("*", self.camera), self._on_presence)
         self._task = asyncio.get_running_loop().create_task(
-            self._attend(), name=f"smartcam.fleet.{self.camera}"
+            self._keep_agent(), name=f"smartcam.fleet.{self.camera}"
         )
 
     async def close(self, error: LinkError | None = None) -> None:
         """Stop looking for the agent. Idempotent."""
-        self.finish(error or ConnectionClosedError(f"{self.name}: the connection is closed"))
-        if self._watch is not None:
-            self._watch.close()
+        self.end_for_good(error or ConnectionClosedError(f"{self.name}: the connection is closed"))
+        if self._presence_watch is not None:
+            self._presence_watch.close()
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
             await asyncio.wait({task})
-        if self._insisting:
-            # repeated messages wait for answers that have failed
-            await asyncio.wait(self._insisting)
+        if self._resending_tasks:
+            # the futures of their answers have failed, so these tasks end now
+            await asyncio.wait(self._resending_tasks)
 
-    def finish(self, error: LinkError) -> None:
-        """End for good: there will be no further agent."""
-        if self.end is None:
-            self.end = error
-        self.met = None
-        self.program.fail(self, lambda: error)
+    def end_for_good(self, error: LinkError) -> None:
+        """End all calls, and refuse further ones with this error."""
+        if self.final_error is None:
+            self.final_error = error
+        self.agent = None
+        self.program.fail_calls(self, lambda: error)
 
     # ------------------------------------------------------------------ the agent
 
-    def require(self) -> Met:
+    def require(self) -> MetAgent:
         """Return the agent.
 
         Raises:
             ConnectionLostError: there is no agent now.
             ConnectionClosedError: the caller is not open, or closed.
         """
-        if self.met is not None:
-            return self.met
-        if self.end is not None:
-            raise self.end.with_traceback(None)
-        if self.trouble is not None:
+        if self.agent is not None:
+            return self.agent
+        if self.final_error is not None:
+            raise self.final_error.with_traceback(None)
+        if self.no_agent_error is not None:
             identity = self.program.bus.identity
             if identity is not None and identity.expired:
-                raise ConnectionLostError(f"{self.trouble}; {identity.expired}") from self.trouble
-            raise self.trouble.with_traceback(None)
+                raise ConnectionLostError(
+                    f"{self.no_agent_error}; {identity.expired}"
+                ) from self.no_agent_error
+            raise self.no_agent_error.with_traceback(None)
         if self._task is not None:
             raise ConnectionLostError(f"{self.name}: no agent has answered yet")
         raise ConnectionClosedError(f"{self.name}: not connected: open it first")
@@ -217,68 +223,70 @@ class Caller:
         agent = self.program.keys.tail(key, "presence/camera")[0]
         if present:
             self._agents[agent] = None
-            self._stirred.set()
+            self._changed.set()
         else:
             self.agent_left(agent)
 
     def agent_left(self, agent: str) -> None:
         """End the calls of an agent that no longer shares the camera. Idempotent."""
         self._agents.pop(agent, None)
-        if self.met is not None and self.met.agent == agent:
-            why = self._removed
-            gone = f"the agent {agent} is gone, or the way to it"
-            self.lose(f"the agent {agent} shares the camera no more: {why}" if why else gone)
-        self._stirred.set()
+        if self.agent is not None and self.agent.name == agent:
+            why = self._removal_reason
+            lost = f"the agent {agent} is gone, or the way to it"
+            self.lose_agent(f"the agent {agent} shares the camera no more: {why}" if why else lost)
+        self._changed.set()
 
-    def removed(self, why: str) -> None:
-        """Note why the agent no longer shares the camera; the agent's presence ends next."""
-        self._removed = why
+    def note_removal(self, why: str) -> None:
+        """Note why the agent will no longer share the camera; :meth:`agent_left` follows."""
+        self._removal_reason = why
 
-    def lose(self, why: str) -> None:
-        """End every running call with an unknown outcome, since the agent was lost."""
-        if self.met is None:
+    def lose_agent(self, why: str) -> None:
+        """Forget the lost agent, and end every running call with an unknown outcome."""
+        if self.agent is None:
             return
-        self.met, self.linked = None, False
-        error = self.trouble = ConnectionLostError(f"{self.name}: {why}")
-        self.program.fail(self, lambda: _unknown_outcome_error(error))
-        self._stirred.set()
+        self.agent, self.has_session = None, False
+        error = self.no_agent_error = ConnectionLostError(f"{self.name}: {why}")
+        self.program.fail_calls(self, lambda: _unknown_outcome_error(error))
+        self._changed.set()
         self._on_lost(error)
 
-    async def _attend(self) -> None:
-        """Connect to an agent whenever there is one; of several, to the agent with a session."""
+    async def _keep_agent(self) -> None:
+        """Connect to an agent whenever there is one; prefer an agent that has a session."""
         loop, quiet_since = asyncio.get_running_loop(), 0.0
         while True:
-            look = None
-            if self.met is not None and not self.linked:
-                look = OTHER_AGENT_INTERVAL if len(self._agents) > 1 else SESSION_QUESTION_INTERVAL
+            wait_timeout = None
+            if self.agent is not None and not self.has_session:
+                wait_timeout = (
+                    OTHER_AGENT_INTERVAL if len(self._agents) > 1 else SESSION_QUESTION_INTERVAL
+                )
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(look):
-                    await self._stirred.wait()
+                async with asyncio.timeout(wait_timeout):
+                    await self._changed.wait()
                     quiet_since = loop.time()
-            self._stirred.clear()
-            met = self.met
-            if met is not None and self.linked:
+            self._changed.clear()
+            met = self.agent
+            if met is not None and self.has_session:
                 continue
             if met is not None and loop.time() - quiet_since >= SESSION_QUESTION_INTERVAL:
                 quiet_since = loop.time()
-                await self._ask_anew(met)
+                await self._greet_again(met)
                 continue
-            others = sorted(self._agents.keys() - ({met.agent} if met is not None else set()))
+            others = sorted(self._agents.keys() - ({met.name} if met is not None else set()))
             if not others:
                 continue
             try:
-                await self._choose(others, met)
+                await self._choose_agent(others, met)
             except SmartCamError as error:
                 if met is None:
-                    self.trouble = ConnectionLostError(f"{self.name}: {error}")
+                    self.no_agent_error = ConnectionLostError(f"{self.name}: {error}")
                     if self._agents:
                         await asyncio.sleep(HELLO_TIMEOUT / 10)
-                        self._stirred.set()
+                        self._changed.set()
 
-    async def _choose(self, agents: list[str], met: Met | None) -> None:
-        """Choose an agent, if possible with a session; it may replace the current one."""
-        only_linked = met is not None
-        replies: list[_HelloHeard] = []
+    async def _choose_agent(self, agents: list[str], met: MetAgent | None) -> None:
+        """Choose an agent, if possible one with a session; it may replace the current agent."""
+        needs_session = met is not None
+        replies: list[_HelloReply] = []
         failed: SmartCamError | None = None
         for agent in agents:
             try:
@@ -288,107 +296,109 @@ class Caller:
                 continue
             if replies[-1].hello.get("connected") and not replies[-1].hello.get("trying"):
                 break  # a camera has one session
-        if self.met is not met:
+        if self.agent is not met:
             return  # an agent appeared or disappeared
         if not replies:
             if failed is not None:
                 raise failed
             return
         best = replies[-1] if replies[-1].hello.get("connected") else replies[0]
-        if only_linked and not best.hello.get("connected"):
+        if needs_session and not best.hello.get("connected"):
             return
         if met is not None:
-            self.lose(f"the agent {met.agent} has no session with the camera, {best.agent} has one")
-        self._meet(best)
+            self.lose_agent(
+                f"the agent {met.name} has no session with the camera, {best.agent} has one"
+            )
+        self._accept_agent(best)
 
-    async def _ask_anew(self, met: Met) -> None:
-        """Ask the agent again, and take its state if it has a session now."""
+    async def _greet_again(self, met: MetAgent) -> None:
+        """Greet the agent again, and take over its state if it has a session now."""
         with contextlib.suppress(SmartCamError):
-            reply = await self._greet_agent(met.agent)
-            if self.met is met and not self.linked and reply.hello.get("connected"):
-                self._meet(reply)
+            reply = await self._greet_agent(met.name)
+            if self.agent is met and not self.has_session and reply.hello.get("connected"):
+                self._accept_agent(reply)
 
-    async def _greet_agent(self, agent: str) -> _HelloHeard:
+    async def _greet_agent(self, agent: str) -> _HelloReply:
         loop = asyncio.get_running_loop()
-        begun = loop.time()
-        reply = await self._exchange("hello", begun + HELLO_TIMEOUT, agent)
+        asked_at = loop.time()
+        reply = await self._exchange("hello", asked_at + HELLO_TIMEOUT, agent)
         fields = reply.fields
         try:
             epoch, clock = int(fields["epoch"]), float(fields["clock"])
             hello = dict(fields["answer"])
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"the agent {agent} sent an invalid hello: {exc}") from exc
-        return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
+        return _HelloReply(agent, epoch, hello, clock, asked_at, loop.time())
 
-    def _meet(self, reply: _HelloHeard) -> None:
-        self._ahead, self._measured = reply.clock - reply.at, reply.at
-        self._most = math.inf
-        self.bound(reply.clock, reply.begun)
+    def _accept_agent(self, reply: _HelloReply) -> None:
+        self._min_clock_lead, self._min_lead_at = reply.clock - reply.answered_at, reply.answered_at
+        self._max_clock_lead = math.inf
+        self.bound_clock(reply.clock, reply.asked_at)
         if reply.agent in self._agents:
             self._epochs[reply.agent] = reply.epoch
             if len(self._epochs) > MAX_AGENTS_REMEMBERED:
                 del self._epochs[next(iter(self._epochs))]
-            self.met = Met(reply.agent, reply.epoch, reply.hello)
-            self._removed = ""
-            self.trouble = None
-            self._on_met(self.met)
+            self.agent = MetAgent(reply.agent, reply.epoch, reply.hello)
+            self._removal_reason = ""
+            self.no_agent_error = None
+            self._on_met(self.agent)
 
-    def restarted(self, epoch: int) -> bool:
-        """Return True if an epoch belongs to a newer start of the current agent."""
-        met = self.met
+    def has_restarted(self, epoch: int) -> bool:
+        """Return True if a received epoch shows that the current agent has been started again."""
+        met = self.agent
         if met is None or epoch <= met.epoch or len(self._agents) > 1:
             return False
-        return all(known != epoch for agent, known in self._epochs.items() if agent != met.agent)
+        return all(known != epoch for agent, known in self._epochs.items() if agent != met.name)
 
-    def unlink(self) -> None:
+    def note_session_end(self) -> None:
         """Note that the agent has no session, and look for an agent that has one."""
-        self.linked = False
-        self._stirred.set()
+        self.has_session = False
+        self._changed.set()
 
     # ------------------------------------------------------------------ the clock
 
-    def sample(self, clock: float) -> None:
-        """Use the agent's time in a message that has just arrived for its clock."""
+    def sample_clock(self, clock: float) -> None:
+        """Estimate the agent's clock from its time in a message that has just arrived."""
         now = asyncio.get_running_loop().time()
-        least = self._ahead - MAX_DRIFT_RATIO * (now - self._measured)
-        self._ahead, self._measured = max(least, clock - now), now
+        min_lead = self._min_clock_lead - MAX_DRIFT_RATIO * (now - self._min_lead_at)
+        self._min_clock_lead, self._min_lead_at = max(min_lead, clock - now), now
 
-    def bound(self, clock: float, sent: float) -> None:
-        """Bound the agent's clock, which showed ``clock`` after a message from this program."""
+    def bound_clock(self, clock: float, sent_at: float) -> None:
+        """Bound the agent's clock: it showed ``clock`` after a message was sent at ``sent_at``."""
         now = asyncio.get_running_loop().time()
-        most = self._most + MAX_DRIFT_RATIO * (now - self._bounded)
-        self._most, self._bounded = min(most, clock - sent), now
+        max_lead = self._max_clock_lead + MAX_DRIFT_RATIO * (now - self._max_lead_at)
+        self._max_clock_lead, self._max_lead_at = min(max_lead, clock - sent_at), now
 
-    def here(self, clock: float) -> tuple[float, float]:
-        """Return the loop's times between which the agent's clock showed ``clock``."""
+    def local_times(self, clock: float) -> tuple[float, float]:
+        """Return the earliest and latest loop time at which the agent's clock showed ``clock``."""
         if self.program.bus.local:
             return clock, clock
         now = asyncio.get_running_loop().time()
-        least = self._ahead - MAX_DRIFT_RATIO * max(0.0, now - self._measured)
-        most = max(least, self._most + MAX_DRIFT_RATIO * max(0.0, now - self._bounded))
-        return clock - most, clock - least
+        min_lead = self._min_clock_lead - MAX_DRIFT_RATIO * max(0.0, now - self._min_lead_at)
+        max_lead = self._max_clock_lead + MAX_DRIFT_RATIO * max(0.0, now - self._max_lead_at)
+        return clock - max(min_lead, max_lead), clock - min_lead
 
-    def clock_at_most(self, at: float) -> float:
-        """Return the agent's time at a time of the loop's clock, or one a little later."""
+    def latest_agent_time(self, at: float) -> float:
+        """Return the latest time that the agent's clock can show at a loop time."""
         self.require()
-        earliest, _ = self.here(0.0)
+        earliest, _ = self.local_times(0.0)
         return at - earliest
 
-    def clock(self, at: float) -> float:
-        """Return the agent's time at a time of the loop's clock, or one a little earlier."""
-        return at + self._ahead - MAX_DRIFT_RATIO * max(0.0, at - self._measured)
+    def earliest_agent_time(self, at: float) -> float:
+        """Return the earliest time that the agent's clock can show at a loop time."""
+        return at + self._min_clock_lead - MAX_DRIFT_RATIO * max(0.0, at - self._min_lead_at)
 
     # ------------------------------------------------------------------ reservations
 
-    def lease(self, number: int) -> Lease:
-        """Return a reservation of this program whose block runs.
+    def require_lease(self, number: int) -> Lease:
+        """Return a reservation of this program whose block runs; refuse a lost one.
 
         Raises:
             ReservationLostError: the reservation is known to be lost.
         """
-        lease, met = self.leases[number], self.met
+        lease, met = self.leases[number], self.agent
         if not lease.lost and met is not None and met.epoch != lease.epoch:
-            why = f"the agent {met.agent} has the camera now, which was started since"
+            why = f"the agent {met.name} has the camera now, which was started since"
             self.lose_lease(number, why)
         if lease.lost:
             raise ReservationLostError(
@@ -410,22 +420,22 @@ class Caller:
         if unreported:
             self._on_lease_lost()
 
-    def look_at_leases(self) -> None:
+    def check_leases(self) -> None:
         """Check whether reservations are lost, now that an agent has answered."""
         for number in self.leases:
             with contextlib.suppress(ReservationLostError):
-                self.lease(number)
+                self.require_lease(number)
 
-    def _fence(self, do: str) -> int | None:
-        """Return the oldest reservation whose block makes the call; None without one.
+    def _reservation_of(self, do: str) -> int | None:
+        """Return the number of the oldest reservation that a call uses; None if it uses none.
 
         Raises:
             ReservationLostError: one of the reservations is lost; nothing was sent.
         """
-        if not self.leases or do not in FENCED:
+        if not self.leases or do not in RESERVED_COMMANDS:
             return None
         for number in self.leases:
-            self.lease(number)
+            self.require_lease(number)
         return next(iter(self.leases))
 
     # ------------------------------------------------------------------ calls
@@ -455,10 +465,8 @@ class Caller:
         Cancellation: the agent receives a cancelling message.
         """
         met = self.require()
-        reply = await self._exchange(
-            do, deadline, met.agent, met, arguments, blobs, number, timeout
-        )
-        self.sample(float(reply.fields.get("clock", -1e300)))
+        reply = await self._exchange(do, deadline, met.name, met, arguments, blobs, number, timeout)
+        self.sample_clock(float(reply.fields.get("clock", -1e300)))
         return reply
 
     async def _exchange(
@@ -466,13 +474,13 @@ class Caller:
         do: str,
         deadline: float,
         agent: str,
-        met: Met | None = None,
+        met: MetAgent | None = None,
         arguments: dict[str, Any] | None = None,
         blobs: Sequence[bytes] = (),
         number: int | None = None,
         timeout: float | None = None,
     ) -> BusMessage:
-        begun = asyncio.get_running_loop().time()
+        asked_at = asyncio.get_running_loop().time()
         number = number or self.program.next_call()
         fields: dict[str, Any] = {
             "program": self.program.token,
@@ -481,12 +489,18 @@ class Caller:
             "arguments": arguments or {},
         }
         if met is not None:
-            timeout = deadline - begun if timeout is None else timeout
-            fields |= {"epoch": met.epoch, "deadline": self.clock(deadline), "timeout": timeout}
-            if (reservation := self._fence(do)) is not None:
+            timeout = deadline - asked_at if timeout is None else timeout
+            fields |= {
+                "epoch": met.epoch,
+                "deadline": self.earliest_agent_time(deadline),
+                "timeout": timeout,
+            }
+            if (reservation := self._reservation_of(do)) is not None:
                 fields["reservation"] = reservation
-            deadline += grace(timeout)
-        reply = await self._ask(do, number, encode(fields, blobs), begun, deadline, agent, met)
+            deadline += reply_grace(timeout)
+        reply = await self._await_reply(
+            do, number, encode(fields, blobs), asked_at, deadline, agent, met
+        )
         if not isinstance(reply, BusMessage):
             raise RemoteProtocolError(f"{self.name}: the agent {agent} answers {do} as a trigger")
         return reply
@@ -522,7 +536,7 @@ class Caller:
             (
                 number,
                 met.epoch,
-                self.clock(deadline),
+                self.earliest_agent_time(deadline),
                 timeout,
                 application,
                 expected,
@@ -531,48 +545,50 @@ class Caller:
                 interpretation.by_application,
                 request.input_data,
                 interpretation.numbered_layouts(),
-                self._fence("trigger"),
+                self._reservation_of("trigger"),
             ),
         )
         payload = encode_order(self.program.token, order)
-        begun, until = deadline - timeout, deadline + grace(timeout)
-        reply = await self._ask("trigger", number, payload, begun, until, met.agent, met)
+        asked_at, reply_deadline = deadline - timeout, deadline + reply_grace(timeout)
+        reply = await self._await_reply(
+            "trigger", number, payload, asked_at, reply_deadline, met.name, met
+        )
         if not isinstance(reply, TriggerReply):
             raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
-        self.sample(reply.clock)
+        self.sample_clock(reply.clock)
         return reply
 
-    async def _ask(
+    async def _await_reply(
         self,
         do: str,
         number: int,
         payload: bytes,
-        begun: float,
+        asked_at: float,
         deadline: float,
         agent: str,
-        met: Met | None,
+        met: MetAgent | None,
     ) -> Reply:
-        """Send a call, and return the reply; ``deadline`` is this side's."""
+        """Send a call, and wait for the reply until ``deadline``, which the agent does not know."""
         self._check_allowed(do)
-        program, key = self.program, self._key(agent, do)
-        waiting = program.expect(number, self, deadline)
+        program, key = self.program, self._key_of_call(agent, do)
+        reply_future = program.expect_reply(number, self, deadline)
         try:
             self.counters.bytes_sent += program.put(key, payload)
             self.counters.frames_sent += 1
-            reply: Reply = await waiting
+            reply: Reply = await reply_future
         except TimeoutError as exc:
             self._cancel(key, number)
-            raise self._silence_error(do, deadline - begun) from exc
+            raise self._no_answer_error(do, deadline - asked_at) from exc
         except asyncio.CancelledError:
             self._cancel(key, number)
             raise
         finally:
-            program.forget(number)
+            program.forget_call(number)
         self.counters.frames_received += 1
         if isinstance(reply, TriggerReply):
             return reply
-        if reply.fields.get("stranger") and self.met is met and met is not None:
-            self.lose(f"the agent {met.agent} was restarted, or took this program for gone")
+        if reply.fields.get("stranger") and self.agent is met and met is not None:
+            self.lose_agent(f"the agent {met.name} was restarted, or took this program for gone")
         if "error" in reply.fields:
             error = from_fields(reply.fields["error"])
             if isinstance(error, ReservationLostError) and self.leases:
@@ -581,31 +597,31 @@ class Caller:
         return reply
 
     def notify(self, do: str, arguments: dict[str, Any]) -> None:
-        """Make a call without waiting for it, if there is an agent."""
-        if self.met is not None and self._allowed(do):
-            fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
-            self._insist(self._key(self.met.agent, do), fields)
+        """Make a call without waiting for its reply; do nothing if there is no agent."""
+        if self.agent is not None and self._is_allowed(do):
+            fields = {"do": do, "arguments": arguments, "epoch": self.agent.epoch}
+            self._send_until_confirmed(self._key_of_call(self.agent.name, do), fields)
 
-    def come(self, number: int, offset: int | None) -> None:
+    def confirm_bytes(self, number: int, offset: int | None) -> None:
         """Report the number of received bytes of a call's frame; None: send no further bytes."""
-        if self.met is not None:
+        if self.agent is not None:
             fields = {"call": number, "come": offset}
-            self.program.send(self._key(self.met.agent, "frame"), fields)
+            self.program.send(self._key_of_call(self.agent.name, "frame"), fields)
 
     def _cancel(self, key: str, number: int) -> None:
-        self._insist(key, {"cancel": number})
+        self._send_until_confirmed(key, {"cancel": number})
 
-    def _insist(self, key: str, fields: dict[str, Any]) -> None:
+    def _send_until_confirmed(self, key: str, fields: dict[str, Any]) -> None:
         """Send a message now, and repeatedly until the agent confirms it.
 
-        A lost agent has already ended the program's work.
+        Stop when the agent is lost: it has then ended the program's work by itself.
         """
-        program, met = self.program, self.met
+        program, met = self.program, self.agent
 
         def send() -> tuple[int, Outcome]:
             number = program.next_call()
             program.send(key, {"call": number, **fields})
-            return number, program.expect(number, self)
+            return number, program.expect_reply(number, self)
 
         async def repeat(number: int, answer: Outcome) -> None:
             while True:
@@ -613,23 +629,23 @@ class Caller:
                     async with asyncio.timeout(RESEND_DELAY):
                         await answer
                 except TimeoutError:
-                    if self.met is not met or met is None:
+                    if self.agent is not met or met is None:
                         return
                 except SmartCamError:
                     return
                 else:
                     return
                 finally:
-                    program.forget(number)
+                    program.forget_call(number)
                 number, answer = send()
 
         task = asyncio.get_running_loop().create_task(
             repeat(*send()), name=f"smartcam.fleet.{self.camera}.insist"
         )
-        self._insisting.add(task)
-        task.add_done_callback(self._insisting.discard)
+        self._resending_tasks.add(task)
+        task.add_done_callback(self._resending_tasks.discard)
 
-    def _allowed(self, do: str) -> bool:
+    def _is_allowed(self, do: str) -> bool:
         identity = self.program.bus.identity
         return do not in COMMANDS or identity is None or may_command(identity.role)
 
@@ -640,8 +656,8 @@ class Caller:
             NotAllowedError: the role of this program's certificate forbids it.
         """
         identity = self.program.bus.identity
-        if identity is not None and not self._allowed(do):
-            what = SWITCHES.get(do, do)
+        if identity is not None and not self._is_allowed(do):
+            what = NAMES_FOR_USERS.get(do, do)
             raise NotAllowedError(
                 f"{self.name}: {what} is a command, and this program's certificate is that of "
                 f"{identity}, who may look; nothing was sent",
@@ -649,32 +665,32 @@ class Caller:
                 certificate=identity.name,
             )
 
-    def _perhaps(self, do: str) -> str:
-        """Return a text on another possible reason for silence; empty if there is none."""
+    def _possible_cause(self, do: str) -> str:
+        """Return a text about another possible reason for a missing answer; empty without one."""
         identity = self.program.bus.identity
         if identity is None:
             return ""
         return f"; nobody is there, or {do} is not allowed for {identity}"
 
-    def _key(self, agent: str, do: str) -> str:
+    def _key_of_call(self, agent: str, do: str) -> str:
         program, camera = self.program, self.camera
         if do in COMMANDS:
-            if self._commands_to[0] != agent:
-                self._commands_to = agent, program.keys.command(agent, camera)
-            return self._commands_to[1]
+            if self._command_key[0] != agent:
+                self._command_key = agent, program.keys.command(agent, camera)
+            return self._command_key[1]
         return program.keys.ask(program.role, agent, camera)
 
-    def _silence_error(self, do: str, waited: float) -> SmartCamError:
-        agent = "the agent" if self.met is None else f"the agent {self.met.agent}"
+    def _no_answer_error(self, do: str, waited: float) -> SmartCamError:
+        agent = "the agent" if self.agent is None else f"the agent {self.agent.name}"
         if do == "trigger":
             return TriggerTimeoutError(
                 f"{self.name}: {agent} did not answer within {waited:.3g} s; whether the camera "
-                f"was triggered is unknown{self._perhaps(do)}",
+                f"was triggered is unknown{self._possible_cause(do)}",
                 waited=waited,
             )
         return ResponseTimeoutError(
             f"{self.name}: {agent} did not answer {do} within {waited:.3g} s; whether it was "
-            f"done is unknown{self._perhaps(do)}",
+            f"done is unknown{self._possible_cause(do)}",
             waited=waited,
         )
 

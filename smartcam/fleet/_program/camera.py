@@ -36,11 +36,11 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet._bus.errors import from_fields
-from smartcam.fleet._bus.wire import grace
+from smartcam.fleet._bus.wire import reply_grace
 from smartcam.fleet._frames.wire import FrameForm
-from smartcam.fleet._program.caller import Caller, Lease, Met
+from smartcam.fleet._program.caller import Caller, Lease, MetAgent
 from smartcam.fleet._program.program_name import in_words
-from smartcam.fleet._program.receiver import FleetListeners, Own, Receiver
+from smartcam.fleet._program.receiver import FleetListeners, OwnTrigger, Receiver
 from smartcam.models import (
     ApplicationChanged,
     CameraEvent,
@@ -72,16 +72,15 @@ if TYPE_CHECKING:
     from smartcam.settings import Address, CameraSettings
 
 QUESTION_TIMEOUT = 2.0
-"""Seconds for the answer to a question; then it is asked again until its deadline."""
+"""Seconds for the answer to a question; after that, it is asked again until its deadline."""
 
 REACH_TIMEOUT = 0.5
-"""Seconds to wait for the events that the agent sent before a reply, which count as lost if they
-come later."""
+"""Seconds to wait for the events that the agent sent before a reply; later ones count as lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReservationLost(CameraEvent):
-    """A program has lost its reservation of the camera before the end of its block.
+    """A program has lost its reservation of the camera before its block has ended.
 
     Attributes:
         by: the program in words, as in errors: ``robot1 on host7, pid 31``.
@@ -97,14 +96,14 @@ class FleetCamera(Camera[ValueT]):
     :class:`~smartcam.fleet.Fleet`. The agent carries out commands, each once; results are read
     in this process.
 
-    The link is that to the agent, too: its loss is a :exc:`~smartcam.ConnectionLostError` that
-    names it. It is then unknown whether a running call was carried out.
+    If the agent or the link to it is lost, this raises a :exc:`~smartcam.ConnectionLostError` that
+    names the agent. It is then unknown whether a running call was carried out.
 
     Args:
         settings: validated options; options of the session with the camera are the agent's.
         camera: name of the camera in the fleet.
         program: program with an end of the bus.
-        shared: whether other cameras use that end, too; then it is not closed with this camera.
+        shared: whether other cameras use this program, too; then this camera does not close it.
         observers: observers of the camera.
     """
 
@@ -118,8 +117,8 @@ class FleetCamera(Camera[ValueT]):
         observers: Iterable[Observer] = (),
     ) -> None:
         self._agents_layout: Any = None  # layout for results if this program gives none
-        self._unreadable: ConfigurationError | None = None  # reason why that layout cannot be used
-        self._met = False
+        self._layout_error: ConfigurationError | None = None  # why that layout cannot be used
+        self._has_met_agent = False
         super().__init__(settings, observers=observers)
         self._program, self._shared = program, shared
         self._wire = Counters()
@@ -132,8 +131,8 @@ class FleetCamera(Camera[ValueT]):
             self._on_lost,
             self._on_lease_lost,
         )
-        self._expected = settings.application
-        self._switch_in_doubt = False  # a switch was interrupted: either application may be active
+        self._expected_application = settings.application
+        self._is_switch_uncertain = False  # an interrupted switch: either application may be active
         self._receiver = Receiver(
             settings.name,
             camera,
@@ -142,19 +141,19 @@ class FleetCamera(Camera[ValueT]):
             self._counters,
             lambda: self._default,
             self._on_state,
-            lambda: None if self._switch_in_doubt else self._expected,
+            lambda: None if self._is_switch_uncertain else self._expected_application,
         )
         self._opened = False
-        self.opening: asyncio.Task[None] | None = None  # the fleet that made it waits for its agent
+        self.opening_task: asyncio.Task[None] | None = None  # waits for the agent's first answer
         self._sessions = 0
-        self._linked = False  # the agent has a session with the camera
-        self._trying = True  # whether the agent's first attempt to connect has not ended
+        self._has_session = False  # the agent has a session with the camera
+        self._is_first_attempt = True  # whether the agent's first attempt to connect has not ended
         self._status: Status | None = None
-        self._active: int | None = None
-        self._about: dict[str, Any] = {}  # facts about the camera from its agent
-        self._trouble: LinkError | None = None
+        self._active_application: int | None = None
+        self._agent_facts: dict[str, Any] = {}  # facts about the camera from its agent
+        self._no_session_error: LinkError | None = None
         self._closed: LinkError | None = None
-        self._watching: set[asyncio.Queue[Status | LinkError]] = set()
+        self._change_queues: set[asyncio.Queue[Status | LinkError]] = set()
 
     _listeners: FleetListeners
 
@@ -164,12 +163,12 @@ class FleetCamera(Camera[ValueT]):
     def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
         if spec is None:
             spec = self._agents_layout
-        if self._met:
+        if self._has_met_agent:
             return super()._interpretation(spec, of_camera=of_camera)
-        return self._provisional(spec, of_camera)
+        return self._provisional_interpretation(spec, of_camera)
 
-    def _provisional(self, spec: object, own: bool) -> Interpretation:
-        """Return the interpretation of results until the agent's answer.
+    def _provisional_interpretation(self, spec: object, own: bool) -> Interpretation:
+        """Return the interpretation of results that applies until the agent has answered.
 
         Raises:
             ConfigurationError: ``spec`` cannot work with any agent.
@@ -192,7 +191,7 @@ class FleetCamera(Camera[ValueT]):
                 refused = refused or exc
         raise refused or ConfigurationError(f"{self.name}: {spec!r:.80} cannot be read")
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ open and close
 
     def _release_unreferenced(self) -> bool:
         # the bus refers to the camera until it is closed; its own bus is dropped with it
@@ -208,20 +207,22 @@ class FleetCamera(Camera[ValueT]):
             self._check_session()
             if self.settings.application is not None:
                 application = self.settings.application
-                await self._do("ensure", self.settings.switch_timeout, application=application)
+                await self._call_agent(
+                    "ensure", self.settings.switch_timeout, application=application
+                )
         except BaseException as exc:
             if isinstance(exc, LinkError):
-                self._finish(exc)
+                self._end_for_good(exc)
             await self.close()
             raise
         return self
 
     async def follow(self, timeout: float, *, session: bool = True) -> None:
-        """Start to follow the camera, even if it is not there yet.
+        """Subscribe to the camera's messages, even if no agent shares it yet.
 
         Args:
             timeout: seconds for connecting to the bus, and for an agent's first answer.
-            session: whether to wait also for the agent's first attempt of a session.
+            session: whether to wait also until the agent's first attempt of a session has ended.
         """
         self._opened = True
         deadline = self._deadline(timeout)
@@ -232,39 +233,39 @@ class FleetCamera(Camera[ValueT]):
                 raise self._not_reached_error(str(exc)) from exc
         self._receiver.open()
         self._caller.open()
-        await self._settle(deadline, session=session)
+        await self._wait_first_session(deadline, session=session)
         if self._has_observers:
             self._on_listener_added(self._listeners.results)
 
-    async def _settle(self, deadline: float, *, session: bool) -> None:
-        """Wait until the agent has a session with the camera, or has tried in vain; bounded."""
+    async def _wait_first_session(self, deadline: float, *, session: bool) -> None:
+        """Wait for the agent's answer and its first attempt of a session; bounded."""
 
-        def settled() -> bool:
-            met = self._caller.met is not None
-            return self.ended or (met and not (session and self._trying))
+        def is_decided() -> bool:
+            met = self._caller.agent is not None
+            return self.ended or (met and not (session and self._is_first_attempt))
 
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(deadline):
-                await self._stirred_until(settled)
+                await self._wait_until(is_decided)
 
-    async def _stirred_until(self, condition: Callable[[], bool]) -> None:
+    async def _wait_until(self, condition: Callable[[], bool]) -> None:
         """Wait until a condition on the agent's messages is true."""
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
-        self._watching.add(queue)
+        self._change_queues.add(queue)
         try:
             while not condition():
                 await queue.get()
         finally:
-            self._watching.discard(queue)
+            self._change_queues.discard(queue)
 
     def _check_session(self) -> None:
         """Raise the reason why there is no session, or no usable one."""
         if self._closed is not None:
             raise self._closed.with_traceback(None)
-        if self._unreadable is not None:
-            raise self._unreadable
+        if self._layout_error is not None:
+            raise self._layout_error
         if not self.connected:
-            trouble = self._caller.trouble or self._trouble
+            trouble = self._caller.no_agent_error or self._no_session_error
             waited = self.settings.connect_timeout
             fleet = self._program.keys.fleet
             why = f"no agent of fleet {fleet} has this camera, or none answered within {waited:g} s"
@@ -278,7 +279,7 @@ class FleetCamera(Camera[ValueT]):
         return ConnectFailedError(text, host=address.host, port=address.port, attempts=(why,))
 
     async def close(self) -> None:
-        self._finish(ConnectionClosedError(f"{self.name}: the connection is closed"))
+        self._end_for_good(ConnectionClosedError(f"{self.name}: the connection is closed"))
         try:
             await self._receiver.close()
             await self._caller.close()
@@ -286,14 +287,14 @@ class FleetCamera(Camera[ValueT]):
             if not self._shared:
                 await self._program.close()
 
-    def _finish(self, error: LinkError) -> None:
-        """End for good: there will be no further session."""
+    def _end_for_good(self, error: LinkError) -> None:
+        """End the camera's use with this error: there will be no further session."""
         if self._closed is not None:
             return
         self._closed = error
         wanted = isinstance(error, ConnectionClosedError)
-        if self._linked:
-            self._linked = False
+        if self._has_session:
+            self._has_session = False
             self._publish_end("closed by this side" if wanted else str(error), expected=wanted)
         self._counters.end()
         self._fail(error)
@@ -305,10 +306,10 @@ class FleetCamera(Camera[ValueT]):
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         loop = asyncio.get_running_loop()
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
-        self._watching.add(queue)
+        self._change_queues.add(queue)
         why: object = "none yet"
         try:
-            async with asyncio.timeout_at(deadline + grace(timeout)):
+            async with asyncio.timeout_at(deadline + reply_grace(timeout)):
                 while True:
                     if self._closed is not None:
                         raise self._closed.with_traceback(None)
@@ -317,8 +318,8 @@ class FleetCamera(Camera[ValueT]):
                         continue
                     left = max(0.0, deadline - loop.time())
                     try:
-                        # by then the agent has restored the state, or gone back
-                        await self._do("wait_connected", min(left, QUESTION_TIMEOUT))
+                        # the agent answers after it has restored the camera's state
+                        await self._call_agent("wait_connected", min(left, QUESTION_TIMEOUT))
                     except ConnectionLostError:
                         continue
                     except ResponseTimeoutError as exc:  # or the message was lost on the way
@@ -330,22 +331,22 @@ class FleetCamera(Camera[ValueT]):
         except TimeoutError as exc:
             raise ResponseTimeoutError(
                 f"{self.name}: no session within {timeout:g} s; the last error: "
-                f"{self._trouble or why}",
+                f"{self._no_session_error or why}",
                 waited=timeout,
             ) from exc
         finally:
-            self._watching.discard(queue)
+            self._change_queues.discard(queue)
 
     # ------------------------------------------------------------------ hooks
 
-    def _require_session(self) -> Met:
+    def _require_session(self) -> MetAgent:
         if self._closed is not None:
             raise self._closed.with_traceback(None)
-        if self._unreadable is not None:
-            raise self._unreadable
+        if self._layout_error is not None:
+            raise self._layout_error
         met = self._caller.require()
-        if not self._linked:
-            trouble = self._trouble or ConnectionLostError(f"{self.name}: not connected")
+        if not self._has_session:
+            trouble = self._no_session_error or ConnectionLostError(f"{self.name}: not connected")
             raise trouble.with_traceback(None)
         return met
 
@@ -357,54 +358,54 @@ class FleetCamera(Camera[ValueT]):
             return
         if not self._opened:
             return  # open() does this
-        since = self._caller.clock(asyncio.get_running_loop().time())
+        since = self._caller.earliest_agent_time(asyncio.get_running_loop().time())
         for stream in self._listeners.results:
             if stream.since == -math.inf:
                 stream.since = since
-        for future in self._listeners.unmarked():
-            self._listeners.waits_since(future, since)
-        self._receiver.want_results(since)
+        for future in self._listeners.waits_without_start():
+            self._listeners.set_wait_start(future, since)
+        self._receiver.subscribe_results(since)
 
     def _end_of_streams(self) -> tuple[SmartCamError | None] | None:
         if self._closed is None:
             return None
         return (None if isinstance(self._closed, ConnectionClosedError) else self._closed,)
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ messages of the agent
 
-    def _on_met(self, met: Met) -> None:
+    def _on_met(self, met: MetAgent) -> None:
         """Take over the camera's state from an agent that has answered."""
         if self._closed is not None:
             return
         hello = met.hello
-        self._caller.look_at_leases()
-        known = self._about.get("capabilities")  # an agent's camera may have no session yet
-        self._about = hello if known is None else {"capabilities": known, **hello}
-        self._read_as(hello)
+        self._caller.check_leases()
+        known = self._agent_facts.get("capabilities")  # an agent's camera may have no session yet
+        self._agent_facts = hello if known is None else {"capabilities": known, **hello}
+        self._use_agents_layout(hello)
         # later events are newer; the missed ones bring everything in order
         if not self._receiver.misses_states(met):
             self._on_state({"kind": "Hello", **hello})
-        self._receiver.meet(met)
+        self._receiver.begin_agent(met)
         if self._listeners.wants_results:
             self._on_listener_added(self._listeners.results)
 
-    def _read_as(self, hello: dict[str, Any]) -> None:
-        """Use the agent's knowledge of the results' contents, unless this program gives its own."""
+    def _use_agents_layout(self, hello: dict[str, Any]) -> None:
+        """Use the agent's options for results, except for those that this program gives."""
         settings, layout = self.settings, hello.get("interpret_as")
         if isinstance(layout, dict):
             layout = {int(key): value for key, value in layout.items()}
-        offered = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
+        agents_flags = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
         changes: dict[str, Any] = {
-            key: on for key, on in offered.items() if key not in settings.given
+            key: on for key, on in agents_flags.items() if key not in settings.given
         }
         self.settings: CameraSettings = replace(settings, **changes)
         self._agents_layout = layout
         self._interpretations.clear()
-        self._met, self._unreadable = True, None
+        self._has_met_agent, self._layout_error = True, None
         try:
             self._default = self._interpretation(self._default_spec, of_camera=True)
         except ConfigurationError as exc:
-            self._unreadable = exc
+            self._layout_error = exc
 
     def _on_lease_lost(self) -> None:
         """Report that this program has lost its reservation."""
@@ -419,23 +420,23 @@ class FleetCamera(Camera[ValueT]):
 
     def _on_lost(self, error: LinkError) -> None:
         """End the session, since the agent is gone."""
-        self._receiver.lose()
+        self._receiver.lose_agent()
         self._lose(error, str(error))
 
     def _lose(self, error: LinkError, reason: str, *, expected: bool = False) -> None:
-        self._trouble = error
-        self._caller.unlink()
-        if not self._linked:
-            self._stir(error)
+        self._no_session_error = error
+        self._caller.note_session_end()
+        if not self._has_session:
+            self._wake_waits(error)
             return
-        self._linked = False
+        self._has_session = False
         if not expected:
             self._counters.note_loss(error)
             self._observers.error(self.name, error)
         self._publish_end(reason, expected=expected)
         self._fail(error)
         if self.settings.reconnect is None:
-            self._finish(error)
+            self._end_for_good(error)
 
     def _publish_end(self, reason: str, *, expected: bool) -> None:
         self._listeners.publish(
@@ -445,33 +446,33 @@ class FleetCamera(Camera[ValueT]):
     def _fail(self, error: LinkError) -> None:
         """End all waiting calls with the error that ended the session."""
         self._listeners.fail(error)
-        self._stir(error)
+        self._wake_waits(error)
 
-    def _stir(self, what: Status | LinkError) -> None:
+    def _wake_waits(self, what: Status | LinkError) -> None:
         """Wake the callers that wait for a change."""
-        for queue in self._watching:
+        for queue in self._change_queues:
             queue.put_nowait(what)
 
     def _on_state(self, state: dict[str, Any]) -> None:
         """Process an event of the camera, with its present state."""
         if self._closed is not None:
             return
-        if state["kind"] == "Status" and self._changes_status_only(state):
+        if state["kind"] == "Status" and self._is_status_change_only(state):
             self._take_status(_status(state["status"]), state)
             return
-        at = _time(state)
+        at = _time_of(state)
         linked = bool(state.get("connected"))
         if state["kind"] == "Removed":
-            self._caller.removed(str(state.get("why")))
+            self._caller.note_removal(str(state.get("why")))
         elif state["kind"] == "NoticeReceived":
-            self._take_notice(state.get("event", {}), at)
+            self._publish_notice(state.get("event", {}), at)
         elif state["kind"] == "ReservationLost":
-            self._take_reservation_lost(str(state.get("by")), at)
-        if self._trying and not state.get("trying"):
-            self._stir(self._status or Status(0))
-        self._trying = bool(state.get("trying"))
+            self._report_reservation_lost(str(state.get("by")), at)
+        if self._is_first_attempt and not state.get("trying"):
+            self._wake_waits(self._status or Status(0))
+        self._is_first_attempt = bool(state.get("trying"))
         if not linked:
-            error, event = self._trouble_of(state), state.get("event", {})
+            error, event = self._read_session_error(state), state.get("event", {})
             self._lose(
                 error,
                 str(event.get("reason") or error),
@@ -479,33 +480,33 @@ class FleetCamera(Camera[ValueT]):
             )
             if state.get("over") and self._closed is None:
                 self._counters.note_loss(error)
-                self._finish(error)
-        elif not self._linked:
+                self._end_for_good(error)
+        elif not self._has_session:
             self._begin_session(state, at)
         status, application = state.get("status"), state.get("application")
-        if application is not None and application != self._active:
-            previous, self._active = self._active, int(application)
+        if application is not None and application != self._active_application:
+            previous, self._active_application = self._active_application, int(application)
             self._listeners.publish(
                 ApplicationChanged(
-                    camera=self.name, at=at, application=self._active, previous=previous
+                    camera=self.name, at=at, application=self._active_application, previous=previous
                 )
             )
         if status is not None and linked:
             self._take_status(_status(int(status)), state)
 
-    def _changes_status_only(self, state: dict[str, Any]) -> bool:
-        """Return True if an event leaves all but the camera's status as it is known."""
+    def _is_status_change_only(self, state: dict[str, Any]) -> bool:
+        """Return True if an event changes nothing but the camera's status."""
         application = state.get("application")
         return (
-            self._linked
-            and not self._trying
+            self._has_session
+            and not self._is_first_attempt
             and "trying" not in state
             and state.get("connected") is True
             and state.get("status") is not None
-            and (application is None or application == self._active)
+            and (application is None or application == self._active_application)
         )
 
-    def _take_notice(self, fields: dict[str, Any], at: datetime) -> None:
+    def _publish_notice(self, fields: dict[str, Any], at: datetime) -> None:
         """Publish a notice from the camera."""
         self._counters.note_notice()
         kind, code, text = (
@@ -516,15 +517,15 @@ class FleetCamera(Camera[ValueT]):
         event = NoticeReceived(camera=self.name, at=at, kind=kind, code=code, text=text)
         self._listeners.publish(event)
 
-    def _take_reservation_lost(self, program: str, at: datetime) -> None:
-        """Take the agent's report of a lost reservation; this program's may be known already."""
+    def _report_reservation_lost(self, program: str, at: datetime) -> None:
+        """Publish the agent's report of a lost reservation; this program's only once."""
         if program == self._program.name and self._caller.leases:
             self._caller.report_leases_lost()
         else:
             self._publish_reservation_lost(program, at)
 
-    def _trouble_of(self, state: dict[str, Any]) -> LinkError:
-        """Return why the agent has no session with the camera."""
+    def _read_session_error(self, state: dict[str, Any]) -> LinkError:
+        """Return the error that says why the agent has no session with the camera."""
         if "error" not in state:
             return ConnectionLostError(f"{self.name}: the agent has no session with the camera yet")
         error = from_fields(state["error"])
@@ -537,14 +538,14 @@ class FleetCamera(Camera[ValueT]):
         return lost
 
     def _begin_session(self, state: dict[str, Any], at: datetime) -> None:
-        self._linked, self._trouble = True, None
-        self._caller.linked = True
-        self._about |= state.get("about", {})
+        self._has_session, self._no_session_error = True, None
+        self._caller.has_session = True
+        self._agent_facts |= state.get("about", {})
         self._counters.begin(self._wire if not self._sessions else Counters())
         self._sessions += 1
         event = Connected if self._sessions == 1 else Reconnected
         self._listeners.publish(event(camera=self.name, at=at, url=self.url))
-        self._stir(self._status or Status(0))
+        self._wake_waits(self._status or Status(0))
 
     def _take_status(self, status: Status, state: dict[str, Any]) -> None:
         listeners, previous = self._listeners, self._status
@@ -556,12 +557,14 @@ class FleetCamera(Camera[ValueT]):
             return
         if status != previous and listeners.wants_events:
             listeners.publish(
-                StatusChanged(camera=self.name, at=_time(state), status=status, previous=previous)
+                StatusChanged(
+                    camera=self.name, at=_time_of(state), status=status, previous=previous
+                )
             )
-        if self._watching:
-            self._stir(status)
+        if self._change_queues:
+            self._wake_waits(status)
 
-    # ------------------------------------------------------------------ what is known
+    # ------------------------------------------------------------------ the camera's state
 
     @property
     def url(self) -> str:
@@ -569,7 +572,7 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def _place(self) -> Address:
-        url = self._about.get("url")
+        url = self._agent_facts.get("url")
         return self.settings.address if url is None else parse_address(url)
 
     @property
@@ -580,11 +583,11 @@ class FleetCamera(Camera[ValueT]):
     @property
     def met(self) -> bool:
         """True if the camera's agent has answered, and is present."""
-        return self._caller.met is not None
+        return self._caller.agent is not None
 
     @property
     def connected(self) -> bool:
-        return self._linked and self._caller.met is not None
+        return self._has_session and self._caller.agent is not None
 
     @property
     def status(self) -> Status:
@@ -595,20 +598,20 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def active_application(self) -> int | None:
-        return self._active
+        return self._active_application
 
     @property
     def protocol_version(self) -> int | None:
-        return self._about.get("protocol_version")
+        return self._agent_facts.get("protocol_version")
 
     @property
     def endian(self) -> int:
         """Byte order in the camera's status at the first answer of its agent."""
-        return int(self._about.get("endian", 0))
+        return int(self._agent_facts.get("endian", 0))
 
     @property
     def capabilities(self) -> Capabilities:
-        flags = self._about.get("capabilities")
+        flags = self._agent_facts.get("capabilities")
         if flags is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         known = Capabilities.__dataclass_fields__
@@ -616,7 +619,7 @@ class FleetCamera(Camera[ValueT]):
 
     # ------------------------------------------------------------------ calls
 
-    async def _do(
+    async def _call_agent(
         self,
         do: str,
         timeout: float | None,
@@ -624,95 +627,98 @@ class FleetCamera(Camera[ValueT]):
         call: int | None = None,
         **arguments: Any,
     ) -> BusMessage:
-        """Make a call at the agent; first process the events that it sent before its reply."""
+        """Make a call at the agent; process the events that it sent before its reply."""
         limit = self._limit(timeout, self.settings.request_timeout)
         deadline = self._deadline(limit)
-        await self._met_first(deadline)
+        await self._wait_opening(deadline)
         self._require_session()
         reply = await self._caller.call(do, deadline, arguments, blobs, call, limit)
         states, results = reply.fields.get("states"), reply.fields.get("results")
         if isinstance(states, int) and isinstance(results, int):
-            await self._reach(states, results, deadline)
+            await self._wait_received(states, results, deadline)
         return reply
 
-    async def _met_first(self, deadline: float) -> None:
-        """Wait for an agent that has not answered yet; bounded."""
-        opening = self.opening
-        if opening is not None:
-            await asyncio.wait({opening}, timeout=deadline - asyncio.get_running_loop().time())
-            if opening.done():
-                self.opening = None
+    async def _wait_opening(self, deadline: float) -> None:
+        """Wait until the fleet has opened this camera; bounded."""
+        task = self.opening_task
+        if task is not None:
+            await asyncio.wait({task}, timeout=deadline - asyncio.get_running_loop().time())
+            if task.done():
+                self.opening_task = None
 
-    async def _reach(self, states: int, results: int, deadline: float) -> None:
+    async def _wait_received(self, states: int, results: int, deadline: float) -> None:
         """Wait for the messages that the agent sent before its reply."""
-        if not self._receiver.has(states, results):
-            soon = min(deadline, asyncio.get_running_loop().time() + REACH_TIMEOUT)
-            await self._receiver.reach("states", states, soon)
-            await self._receiver.reach("results", results, soon)
+        if not self._receiver.has_received(states, results):
+            wait_until = min(deadline, asyncio.get_running_loop().time() + REACH_TIMEOUT)
+            await self._receiver.wait_received("states", states, wait_until)
+            await self._receiver.wait_received("results", results, wait_until)
 
     async def _trigger(
         self, application: int | None, request: TriggerRequest, timeout: float
     ) -> list[Result]:
-        if self._switch_in_doubt:
-            timeout = await self._settle_switch(timeout)
-        expected = application if application is not None else self._expected
+        if self._is_switch_uncertain:
+            timeout = await self._query_expected_application(timeout)
+        expected = application if application is not None else self._expected_application
         deadline = asyncio.get_running_loop().time() + timeout
-        if self.opening is not None:
-            await self._met_first(deadline)
+        if self.opening_task is not None:
+            await self._wait_opening(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
-        own_call = receiver.own_calls[number] = Own(request.interpretation, expected)
+        own_trigger = receiver.own_triggers[number] = OwnTrigger(request.interpretation, expected)
         try:
             reply = await self._caller.trigger(
                 request, application, expected, number, deadline, timeout
             )
             receiver.take_states(reply)
-            if not receiver.has(reply.states, reply.batch.following):
-                await self._reach(reply.states, reply.batch.following, deadline)
-            return receiver.outcomes(own_call, reply.batch)
+            if not receiver.has_received(reply.states, reply.batch.following):
+                await self._wait_received(reply.states, reply.batch.following, deadline)
+            return receiver.trigger_results(own_trigger, reply.batch)
         finally:
-            del receiver.own_calls[number]
+            del receiver.own_triggers[number]
 
     async def _switch_application(self, application: int | str, timeout: float) -> None:
         self._require_session()
-        self._switch_in_doubt = self._expected is not None
+        self._is_switch_uncertain = self._expected_application is not None
         try:
-            reply = await self._do("switch_application", timeout, application=application)
+            reply = await self._call_agent("switch_application", timeout, application=application)
         except (CommandRejectedError, NotAllowedError, ReservationLostError):
-            self._switch_in_doubt = False
+            self._is_switch_uncertain = False
             raise
-        self._expected, self._switch_in_doubt = reply.fields["answer"]["application"], False
+        self._expected_application, self._is_switch_uncertain = (
+            reply.fields["answer"]["application"],
+            False,
+        )
 
-    async def _settle_switch(self, timeout: float) -> float:
-        """Ask for the active application, whose results are expected then.
+    async def _query_expected_application(self, timeout: float) -> float:
+        """Query the active application, and expect its results from now on.
 
         Returns:
-            The seconds that are left for a trigger.
+            Seconds of the timeout that are left for a trigger.
         """
         loop = asyncio.get_running_loop()
-        begun = loop.time()
+        started_at = loop.time()
         try:
-            self._expected = await self.query_application(timeout=timeout)
+            self._expected_application = await self.query_application(timeout=timeout)
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
-        self._switch_in_doubt = False
-        return max(0.0, timeout - (loop.time() - begun))
+        self._is_switch_uncertain = False
+        return max(0.0, timeout - (loop.time() - started_at))
 
     @contextlib.asynccontextmanager
     async def _in_application(self, application: int) -> AsyncGenerator[Self]:
         limit = self.settings.switch_timeout
         number = self._program.next_call()
-        await self._do("enter", limit, call=number, application=application)
-        before, self._expected = self._expected, application
+        await self._call_agent("enter", limit, call=number, application=application)
+        before, self._expected_application = self._expected_application, application
         try:
             yield self
         except BaseException:
-            self._expected = before
+            self._expected_application = before
             self._caller.notify("leave", {"entered": number, "wait": False})
             raise
-        self._expected = before
+        self._expected_application = before
         if self.connected:
-            await self._do("leave", limit, entered=number)
+            await self._call_agent("leave", limit, entered=number)
         else:  # the next session restores the application first
             self._caller.notify("leave", {"entered": number, "wait": False})
 
@@ -720,15 +726,15 @@ class FleetCamera(Camera[ValueT]):
     async def _reserved(self, timeout: float) -> AsyncGenerator[Self]:
         number, leases = self._program.next_call(), self._caller.leases
         try:
-            reply = await self._do("reserve", timeout, call=number)
+            reply = await self._call_agent("reserve", timeout, call=number)
             leases[number] = Lease(int(reply.fields["epoch"]))
             yield self
-            await self._check_kept(number)
+            await self._check_reservation_kept(number)
         finally:
             leases.pop(number, None)
             self._caller.notify("release", {"reservation": number})
 
-    async def _check_kept(self, reservation: int) -> None:
+    async def _check_reservation_kept(self, reservation: int) -> None:
         """Check with the agent that a reservation has not ended; bounded.
 
         Raises:
@@ -738,20 +744,20 @@ class FleetCamera(Camera[ValueT]):
         deadline = self._deadline(self.settings.request_timeout)
         arguments = {"reservation": reservation}
         while True:
-            caller.lease(reservation)
-            soon = min(deadline, self._deadline(QUESTION_TIMEOUT))
+            caller.require_lease(reservation)
+            question_deadline = min(deadline, self._deadline(QUESTION_TIMEOUT))
             try:
-                reply = await caller.call("reserved", soon, arguments)
+                reply = await caller.call("reserved", question_deadline, arguments)
             except ResponseTimeoutError as exc:
                 why: SmartCamError = exc
-                if soon < deadline:
+                if question_deadline < deadline:
                     continue  # the message was lost on the way
             except SmartCamError as exc:
                 why = exc
             else:
                 if reply.fields["answer"].get("reserved") is not True:
                     caller.lose_lease(reservation, "its agent reported it")
-                caller.lease(reservation)
+                caller.require_lease(reservation)
                 return
             raise ReservationLostError(
                 f"{self.name}: whether the camera was reserved until the end of the block is "
@@ -759,13 +765,15 @@ class FleetCamera(Camera[ValueT]):
             ) from why
 
     async def _start(self, timeout: float) -> None:
-        await self._do("start", timeout)
+        await self._call_agent("start", timeout)
 
     async def _stop(self, timeout: float) -> None:
-        await self._do("stop", timeout)
+        await self._call_agent("stop", timeout)
 
     async def _query_application(self, timeout: float) -> int:
-        return int((await self._do("query_application", timeout)).fields["answer"]["application"])
+        return int(
+            (await self._call_agent("query_application", timeout)).fields["answer"]["application"]
+        )
 
     async def _query_status(self, timeout: float) -> Status:
         return await self._status_of("query_status", timeout)
@@ -777,16 +785,16 @@ class FleetCamera(Camera[ValueT]):
         return await self._status_of("wait_ready", timeout)
 
     async def _status_of(self, do: str, timeout: float) -> Status:
-        return Status(int((await self._do(do, timeout)).fields["answer"]["status"]))
+        return Status(int((await self._call_agent(do, timeout)).fields["answer"]["status"]))
 
     async def _wait_status(self, predicate: Callable[[Status], bool], timeout: float) -> Status:
         deadline = self._deadline(timeout)
         self._require_session()
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
-        self._watching.add(queue)
+        self._change_queues.add(queue)
         try:
             present = self.status
-            reply = await self._do("refresh", timeout)
+            reply = await self._call_agent("refresh", timeout)
             if reply.fields["answer"]["asked"]:  # an earlier status is not the current one
                 present = self.status
                 while not queue.empty():
@@ -810,10 +818,10 @@ class FleetCamera(Camera[ValueT]):
                 waited=timeout,
             ) from exc
         finally:
-            self._watching.discard(queue)
+            self._change_queues.discard(queue)
 
     async def _read_image(self, timeout: float) -> bytes:
-        return (await self._do("read_image", timeout)).blobs[0]
+        return (await self._call_agent("read_image", timeout)).blobs[0]
 
     @cached_property
     def frame_caller(self) -> FrameCaller:
@@ -831,7 +839,7 @@ class FleetCamera(Camera[ValueT]):
     @property
     def has_frames(self) -> bool:
         """True if the agent reported that the camera has frames."""
-        return bool(self._about.get("frames"))
+        return bool(self._agent_facts.get("frames"))
 
     def frame_source(
         self, encoding: StreamEncoding = "raw", quality: int | None = None
@@ -854,58 +862,58 @@ class FleetCamera(Camera[ValueT]):
     async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         age = None if math.isinf(max_age) else max_age
-        return await self.frame_caller.frame(wanted, timeout, max_age=age)
+        return await self.frame_caller.get_frame(wanted, timeout, max_age=age)
 
     async def _frame_after(
         self, moment: float | None, form: FrameRequest, timeout: float
     ) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         if moment is None:
-            return await self.frame_caller.frame(wanted, timeout, fresh=True)
-        return await self.frame_caller.frame(wanted, timeout, moment=moment)
+            return await self.frame_caller.get_frame(wanted, timeout, fresh=True)
+        return await self.frame_caller.get_frame(wanted, timeout, moment=moment)
 
     async def _get_clock(self, timeout: float) -> datetime:
-        reply = await self._do("get_clock", timeout)
+        reply = await self._call_agent("get_clock", timeout)
         return datetime.fromisoformat(reply.fields["answer"]["clock"])
 
     async def _set_clock(self, when: datetime) -> None:
-        await self._do("set_clock", None, when=when.isoformat())
+        await self._call_agent("set_clock", None, when=when.isoformat())
 
     async def _set_input(self, data: bytes) -> None:
-        await self._do("set_input", None, [data])
+        await self._call_agent("set_input", None, [data])
 
     async def _set_sequence_number(self, number: int) -> None:
-        await self._do("set_sequence_number", None, number=number)
+        await self._call_agent("set_sequence_number", None, number=number)
 
     async def reboot(self) -> None:
-        await self._do("reboot", None)
-        # the source learns that the session is over
+        await self._call_agent("reboot", None)
+        # wait until this program knows that the session has ended
         with contextlib.suppress(TimeoutError, LinkError):
             async with asyncio.timeout(REACH_TIMEOUT):
-                await self._stirred_until(lambda: not self.connected)
+                await self._wait_until(lambda: not self.connected)
 
     async def _take_back(self, timeout: float) -> None:
         deadline = self._deadline(timeout)
-        await self._met_first(deadline)
+        await self._wait_opening(deadline)
         if self._closed is not None:
             raise self._closed.with_traceback(None)
         reply = await self._caller.call("take_back", deadline, timeout=timeout)
         fields = reply.fields
-        await self._reach(int(fields["states"]), int(fields["results"]), deadline)
+        await self._wait_received(int(fields["states"]), int(fields["results"]), deadline)
 
     async def _request(
         self, message_id: int | str, payload: bytes, answered: bool | None, timeout: float
     ) -> bytes | None:
         arguments: dict[str, Any] = {"message_id": message_id, "answered": answered}
-        reply = await self._do("request", timeout, [payload], **arguments)
+        reply = await self._call_agent("request", timeout, [payload], **arguments)
         return reply.blobs[0] if reply.blobs else None
 
 
 _status = functools.lru_cache(maxsize=256)(Status)
-"""Return the status with given bits; a new object costs more than a look at the last ones."""
+"""Return the status with these bits; a look-up costs less than a new object."""
 
 
-def _time(state: dict[str, Any]) -> datetime:
+def _time_of(state: dict[str, Any]) -> datetime:
     if "event" not in state:
         return datetime.now(UTC)
     try:

@@ -1,8 +1,8 @@
 """Subscribe once for many cameras, instead of once for each.
 
-A camera of a fleet subscribes to its own keys. For many cameras, :meth:`Exchange.cover` declares
-one subscription for all, and this module distributes the messages by their keys: a dictionary
-costs less than a subscription of the engine, on both sides.
+A camera of a fleet subscribes to its own keys. For many cameras, :meth:`Exchange.subscribe_all`
+declares one common subscription, and this module distributes the messages by their keys. This
+costs less than many subscriptions, both here and at the agents.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ProtocolError
-from smartcam.fleet._agent.bundle import Bundled, decode_bundle
+from smartcam.fleet._agent.bundle import ResultBundle, decode_bundle
 from smartcam.fleet._agent.summary import ask_cameras
 from smartcam.fleet._bus.bus import Bus, Handle, never
 from smartcam.fleet._bus.wire import encode_runs
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 NUMBERS_TIMEOUT = 0.5
-"""Seconds for an agent's answer with its next numbers, after which the question is repeated."""
+"""Seconds for an agent's answer with its next numbers; after that, the question is repeated."""
 
-MAX_AGENTS_NUMBERED = 1000
-"""Largest number of agents whose bundles' numbers are remembered."""
+MAX_AGENTS_REMEMBERED = 1000
+"""Largest number of agents whose next bundle number is remembered."""
 
 
-class _BusPlace(Handle):
+class _KeyReceiver(Handle):
     """Receiver of the messages under one key."""
 
     def __init__(self, exchange: Exchange, key: str, call: Callable[..., None]) -> None:
@@ -47,7 +47,7 @@ class _BusPlace(Handle):
     def close(self) -> None:
         if not self.closed:
             self.closed = True
-            self._exchange.drop(self)
+            self._exchange.remove_receiver(self)
             if self.handle is not None:
                 self.handle.close()
 
@@ -64,93 +64,92 @@ class Exchange(Bus):
         self._bus, self._keys = bus, keys
         self.local = bus.local
         # receivers of each kind, by their keys
-        self._places: dict[str, dict[str, list[_BusPlace]]] = {}
-        self._covers: dict[str, Handle] = {}
+        self._receivers: dict[str, dict[str, list[_KeyReceiver]]] = {}
+        self._common_handles: dict[str, Handle] = {}
         self._present: dict[str, set[str]] = {}  # present agents, by the camera's name
         # epoch and next expected number of each agent
         self._bundles: dict[str, tuple[int, int]] = {}
         # functions that take the presences of all cameras
         self._presence_callbacks: list[Callable[[str, bool], None]] = []
-        self._lacking: set[str] = set()  # agents with missing bundles
-        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._agents_with_gaps: set[str] = set()  # agents of which bundles may be missing
+        self._asking_tasks: dict[str, asyncio.Task[None]] = {}
 
-    # ------------------------------------------------------------------ for many
+    # ------------------------------------------------------------------ common subscriptions
 
-    def see_all(self, on_presence: Callable[[str, bool], None]) -> None:
-        """Watch all cameras' presences from now on, for watchers of one camera or of all.
-
-        ``on_presence(key, present)`` is called for each.
-        """
+    def watch_presences(self, on_presence: Callable[[str, bool], None]) -> None:
+        """Call ``on_presence(key, present)`` for the presence of every camera."""
         self._presence_callbacks.append(on_presence)
-        self.cover("presence/camera")
+        self.subscribe_all("presence/camera")
 
-    def cover(self, kind: str) -> None:
+    def subscribe_all(self, kind: str) -> None:
         """Receive all messages of a kind: ``states``, ``results`` or ``presence/camera``."""
-        if kind in self._covers:
+        if kind in self._common_handles:
             return
         keys, bus = self._keys(), self._bus
         if kind == "states":
-            made = bus.subscribe(keys.states("**"), self._hand_out)
+            handle = bus.subscribe(keys.states("**"), self._on_state)
         elif kind == "results":
-            made = bus.subscribe(keys.bundle("*"), self._on_bundle)
+            handle = bus.subscribe(keys.bundle("*"), self._on_bundle)
         else:
-            made = bus.watch(keys.camera("*", "**"), self._on_presence)
-        self._covers[kind] = made
-        for places in [*self._places.get(kind, {}).values()]:
-            # a message that arrives twice now is taken once, by its number
-            for place in places:
-                handle, place.handle = place.handle, None
-                if handle is not None:
-                    handle.close()
+            handle = bus.watch(keys.camera("*", "**"), self._on_presence)
+        self._common_handles[kind] = handle
+        for receivers in [*self._receivers.get(kind, {}).values()]:
+            # a message that arrives by both subscriptions is taken once, by its number
+            for receiver in receivers:
+                own_handle, receiver.handle = receiver.handle, None
+                if own_handle is not None:
+                    own_handle.close()
 
-    def _uncover(self, kind: str) -> None:
-        self._covers.pop(kind).close()
+    def _unsubscribe_all(self, kind: str) -> None:
+        self._common_handles.pop(kind).close()
         self._bundles.clear()
-        self._lacking.clear()
+        self._agents_with_gaps.clear()
 
-    def _kind(self, key: str) -> str:
+    def _kind_of(self, key: str) -> str:
         tail = key.removeprefix(f"{self._keys().root}/")
-        first, _, behind = tail.partition("/")
-        return f"{first}/{behind.partition('/')[0]}" if first == "presence" else first
+        first, _, rest = tail.partition("/")
+        return f"{first}/{rest.partition('/')[0]}" if first == "presence" else first
 
-    def _enter(
+    def _add_receiver(
         self, key: str, call: Callable[..., None], declare: Callable[[], Handle]
-    ) -> _BusPlace:
-        kind = self._kind(key)
-        place = _BusPlace(self, key, call)
-        self._places.setdefault(kind, {}).setdefault(self._name(key), []).append(place)
-        if kind not in self._covers:
-            place.handle = declare()
-        return place
+    ) -> _KeyReceiver:
+        kind = self._kind_of(key)
+        receiver = _KeyReceiver(self, key, call)
+        self._receivers.setdefault(kind, {}).setdefault(self._receiver_name(key), []).append(
+            receiver
+        )
+        if kind not in self._common_handles:
+            receiver.handle = declare()
+        return receiver
 
-    def _name(self, key: str) -> str:
-        """Return the name in a receiver's key; for a presence, with any agent."""
+    def _receiver_name(self, key: str) -> str:
+        """Return the name of a key's receivers: the key, or for a presence the camera's name."""
         return key.split("/", 5)[5] if "/presence/camera/" in key else key
 
-    def drop(self, place: _BusPlace) -> None:
-        """Drop a receiver that is no longer used."""
-        kind, name = self._kind(place.key), self._name(place.key)
-        places = self._places[kind]
-        places[name].remove(place)
-        if not places[name]:
-            del places[name]
-        if kind == "results" and not places and kind in self._covers:
-            self._uncover(kind)
+    def remove_receiver(self, receiver: _KeyReceiver) -> None:
+        """Remove a closed receiver; after the last one for results, end the common subscription."""
+        kind, name = self._kind_of(receiver.key), self._receiver_name(receiver.key)
+        receivers = self._receivers[kind]
+        receivers[name].remove(receiver)
+        if not receivers[name]:
+            del receivers[name]
+        if kind == "results" and not receivers and kind in self._common_handles:
+            self._unsubscribe_all(kind)
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ messages
 
-    def _hand_out(self, key: str, payload: bytes) -> None:
-        for place in tuple(self._places.get("states", {}).get(key, ())):
-            place.call(key, payload)
+    def _on_state(self, key: str, payload: bytes) -> None:
+        for receiver in tuple(self._receivers.get("states", {}).get(key, ())):
+            receiver.call(key, payload)
 
     def _on_presence(self, key: str, present: bool) -> None:
-        name = self._name(key)
+        name = self._receiver_name(key)
         presences = self._present.setdefault(name, set())
         (presences.add if present else presences.discard)(key)
         for on_presence in self._presence_callbacks:
             on_presence(key, present)
-        for place in tuple(self._places.get("presence/camera", {}).get(name, ())):
-            place.call(key, present)
+        for receiver in tuple(self._receivers.get("presence/camera", {}).get(name, ())):
+            receiver.call(key, present)
 
     def _on_bundle(self, key: str, payload: bytes) -> None:
         agent = key.rpartition("/")[2]
@@ -159,47 +158,47 @@ class Exchange(Bus):
         except ProtocolError as exc:
             logger.warning("! %s", exc)
             return
-        self._give(bundle)
+        self._distribute_bundle(bundle)
         known = self._bundles.get(agent)
         self._bundles[agent] = bundle.epoch, bundle.following
         if known != (bundle.epoch, bundle.number):
-            self._lacking.add(agent)
+            self._agents_with_gaps.add(agent)
             self._find_gaps(agent)
-        if len(self._bundles) > MAX_AGENTS_NUMBERED:
+        if len(self._bundles) > MAX_AGENTS_REMEMBERED:
             del self._bundles[next(iter(self._bundles))]
 
-    def _give(self, bundle: Bundled) -> None:
-        places, stem = self._places.get("results", {}), self._keys().results("")
+    def _distribute_bundle(self, bundle: ResultBundle) -> None:
+        receivers, stem = self._receivers.get("results", {}), self._keys().results("")
         for name, runs in bundle.parts:
             key = stem + name
-            for place in tuple(places.get(key, ())):
-                place.call(key, runs)
+            for receiver in tuple(receivers.get(key, ())):
+                receiver.call(key, runs)
 
     def _find_gaps(self, agent: str) -> None:
-        """Ask for an agent's numbers after a lost bundle, or its first one."""
-        asking = self._asking.get(agent)
+        """Start to ask for an agent's numbers, unless this is under way."""
+        asking = self._asking_tasks.get(agent)
         if asking is None or asking.done():
-            self._asking[agent] = asyncio.get_running_loop().create_task(
+            self._asking_tasks[agent] = asyncio.get_running_loop().create_task(
                 self._ask_numbers(agent), name=f"smartcam.fleet.{agent}.numbers"
             )
-            self._asking[agent].add_done_callback(partial(self._end_asking, agent))
+            self._asking_tasks[agent].add_done_callback(partial(self._end_asking, agent))
 
     def _end_asking(self, agent: str, task: asyncio.Task[None]) -> None:
-        if self._asking.get(agent) is task:
-            del self._asking[agent]
+        if self._asking_tasks.get(agent) is task:
+            del self._asking_tasks[agent]
 
     async def _ask_numbers(self, agent: str) -> None:
-        """Ask for the next result numbers of an agent's cameras, by which gaps are found."""
+        """Ask for the next result numbers of an agent's cameras, so that receivers find gaps."""
         keys, bus = self._keys(), self._bus
-        while agent in self._lacking:
-            self._lacking.discard(agent)
+        while agent in self._agents_with_gaps:
+            self._agents_with_gaps.discard(agent)
             cameras = await ask_cameras(bus, keys, agent, "**", NUMBERS_TIMEOUT)
             for camera in cameras:
-                places = self._places.get("results", {})
-                for place in tuple(places.get(keys.results(camera.summary.camera), ())):
-                    place.call(place.key, encode_runs(camera.epoch, camera.following, []))
+                receivers = self._receivers.get("results", {})
+                for receiver in tuple(receivers.get(keys.results(camera.summary.camera), ())):
+                    receiver.call(receiver.key, encode_runs(camera.epoch, camera.following, []))
             if not cameras and await bus.present(keys.agent(agent), NUMBERS_TIMEOUT):
-                self._lacking.add(agent)
+                self._agents_with_gaps.add(agent)
                 await asyncio.sleep(NUMBERS_TIMEOUT)
 
     # ------------------------------------------------------------------ as a bus
@@ -207,18 +206,22 @@ class Exchange(Bus):
     def subscribe(
         self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        if "*" in pattern or self._kind(pattern) not in {"states", "results"}:
+        if "*" in pattern or self._kind_of(pattern) not in {"states", "results"}:
             return self._bus.subscribe(pattern, on_message, patient=patient)
-        return self._enter(pattern, on_message, lambda: self._bus.subscribe(pattern, on_message))
+        return self._add_receiver(
+            pattern, on_message, lambda: self._bus.subscribe(pattern, on_message)
+        )
 
     def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
-        if self._kind(pattern) != "presence/camera" or "*" in self._name(pattern):
+        if self._kind_of(pattern) != "presence/camera" or "*" in self._receiver_name(pattern):
             return self._bus.watch(pattern, on_presence)
-        place = self._enter(pattern, on_presence, lambda: self._bus.watch(pattern, on_presence))
-        if place.handle is None:
-            for key in sorted(self._present.get(self._name(pattern), ())):
+        receiver = self._add_receiver(
+            pattern, on_presence, lambda: self._bus.watch(pattern, on_presence)
+        )
+        if receiver.handle is None:
+            for key in sorted(self._present.get(self._receiver_name(pattern), ())):
                 on_presence(key, True)
-        return place
+        return receiver
 
     @property
     def reached(self) -> bool:
@@ -237,18 +240,18 @@ class Exchange(Bus):
         await self._bus.open(timeout)
         return self
 
-    async def leave(self) -> None:
+    async def stop_receiving(self) -> None:
         """Stop receiving. Idempotent."""
-        tasks = [*self._asking.values()]
+        tasks = [*self._asking_tasks.values()]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        for handle in self._covers.values():
+        for handle in self._common_handles.values():
             handle.close()
-        self._covers.clear()
+        self._common_handles.clear()
 
     async def close(self) -> None:
-        await self.leave()
+        await self.stop_receiving()
         await self._bus.close()
 
     def put(self, key: str, payload: bytes) -> None:

@@ -36,7 +36,7 @@ from smartcam.fleet._agent.outlet_service import (
     ask_stores,
 )
 from smartcam.fleet._agent.reload_service import reload_agents
-from smartcam.fleet._agent.summary import ask_cameras, by_name
+from smartcam.fleet._agent.summary import ask_cameras, best_by_name
 from smartcam.fleet._bus.address import FleetAddress, check_name, check_pattern
 from smartcam.fleet._bus.keys import meets
 from smartcam.fleet._program.camera import FleetCamera
@@ -58,15 +58,15 @@ if TYPE_CHECKING:
     from smartcam.models import Result, SubscriberStatistics
 
 MAX_CAMERAS_MET = 256
-"""Largest number of cameras of a fleet that are met when it is opened: their agents are asked for
-their state. In a larger fleet each camera is met when it is used."""
+"""Largest number of cameras of a fleet that are met when it is opened. To meet a camera is to ask
+its agent for its state. In a larger fleet each camera is met when it is used."""
 
 MAX_CAMERAS_AT_ONCE = 100
-"""Largest number of cameras that are met, or closed, at a time."""
+"""Largest number of cameras that are met, or closed, at the same time."""
 
 MAX_CAMERAS_SUBSCRIBED = 64
-"""Largest number of cameras with a subscription each; for more, if they are most of the fleet,
-there is one subscription for all."""
+"""Largest number of cameras that have a subscription each. For more cameras, if they are more than
+half of the fleet, there is one subscription for all."""
 
 STATUS_TIMEOUT = 5.0
 """Seconds of the timeout for the answers of all agents."""
@@ -92,7 +92,7 @@ class FleetEvent:
 
 @dataclass(frozen=True, slots=True)
 class AgentJoined(FleetEvent):
-    """An agent has come."""
+    """An agent is present now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class CameraLeft(FleetEvent):
 
 
 class _QueueBell(asyncio.Event):
-    """Calls a function when a queue gets an item, or ends."""
+    """An event for a queue that calls a function when the queue gets an item, or ends."""
 
     def __init__(self, ring: Callable[[], None]) -> None:
         super().__init__()
@@ -150,7 +150,7 @@ class FleetResults(Generic[ValueT]):
         self._streams: dict[str, list[Subscription[Result[ValueT]]]] = {}
         # subscriptions that have results
         self._ready_streams: collections.deque[Subscription[Result[ValueT]]] = collections.deque()
-        self._queued: set[Subscription[Result[ValueT]]] = set()
+        self._marked: set[Subscription[Result[ValueT]]] = set()
         self._ready = asyncio.Event()
         self._ended = False
 
@@ -161,18 +161,18 @@ class FleetResults(Generic[ValueT]):
             return
         stream = self._subscribe(camera)
         known.append(stream)
-        stream.share(_QueueBell(functools.partial(self._queue, stream)))
+        stream.share(_QueueBell(functools.partial(self._mark_ready, stream)))
 
-    def _queue(self, stream: Subscription[Result[ValueT]]) -> None:
-        if stream not in self._queued:
-            self._queued.add(stream)
+    def _mark_ready(self, stream: Subscription[Result[ValueT]]) -> None:
+        if stream not in self._marked:
+            self._marked.add(stream)
             self._ready_streams.append(stream)
         self._ready.set()
 
     def statistics(self) -> dict[str, SubscriberStatistics]:
         """Return the counters of each camera's queue."""
         return {
-            name: _sum([stream.statistics() for stream in streams])
+            name: _sum_accounts([stream.statistics() for stream in streams])
             for name, streams in self._streams.items()
             if streams
         }
@@ -199,25 +199,25 @@ class FleetResults(Generic[ValueT]):
             InterpretationError: a result cannot be interpreted; the stream stays usable.
             SubscriberOverflowError: a camera's queue overflowed, with ``overflow="error"``; the
                 stream has no further results of this camera, the others continue.
-            LinkError: the same, for a camera that is lost for good.
+            LinkError: a camera is lost for good; the other cameras' results continue.
             StopAsyncIteration: the stream or the fleet was closed.
         """
         while True:
             while self._ready_streams:
                 stream = self._ready_streams.popleft()
-                self._queued.discard(stream)
+                self._marked.discard(stream)
                 if not stream.waiting:
                     if not stream.ended:
                         continue
                     try:
-                        return await anext(stream)  # raises the stream's error, once
+                        return await anext(stream)  # raises the stream's error, if it has one
                     except StopAsyncIteration:
                         continue
                 try:
                     return await anext(stream)  # a result is queued, so there is no wait
                 finally:
                     if stream.waiting or stream.ended:
-                        self._queue(stream)  # after the others
+                        self._mark_ready(stream)  # the other streams are read first
             if self._ended:
                 raise StopAsyncIteration
             self._ready.clear()
@@ -232,8 +232,8 @@ class FleetResults(Generic[ValueT]):
         self.close()
 
 
-def _sum(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
-    """Return the sum of the counters of consecutive queues."""
+def _sum_accounts(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
+    """Return the sum of the counters of a camera's queues, which followed each other."""
     *_, last = accounts
     counts = ("offered", "taken", "dropped", "queued", "queued_bytes", "missed")
     return dataclasses.replace(
@@ -270,24 +270,24 @@ class Fleet:
     ) -> None:
         self._address = address
         self._exchange = Exchange(bus, lambda: self._program.keys)
-        called = None if address is None else address.program
-        self._program = Program(self._exchange, fleet, guest=guest, called=called)
+        display_name = None if address is None else address.program
+        self._program = Program(self._exchange, fleet, guest=guest, display_name=display_name)
         self._around, self._timeout = around, timeout
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}
         self._present: set[str] = set()  # present agents
         self._agents: dict[str, set[str]] = {}  # agents that share each camera
         self._handles: list[Handle] = []
-        self._opening: dict[str, asyncio.Task[None]] = {}
+        self._opening_tasks: dict[str, asyncio.Task[None]] = {}
         self._events: Subscribers[FleetEvent] = Subscribers()
         self._results: list[tuple[str, weakref.ref[FleetResults[Any]]]] = []
         self._stack = contextlib.AsyncExitStack()
         self._state: Literal["new", "open", "closed"] = "new"
-        self._meets = True  # whether every camera is met at once, since there are few
+        self._meets_all_at_open = True  # as there are few cameras
         self._meeting_slots = asyncio.Semaphore(MAX_CAMERAS_AT_ONCE)
-        self._make("camera")  # raises for wrong options now
+        self._make_camera("camera")  # raises for wrong options now
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ open and close
 
     async def open(self) -> Self:
         """Connect to the fleet, and meet its cameras.
@@ -309,18 +309,18 @@ class Fleet:
             await self._program.open(self._timeout)
             keys, bus = self._program.keys, self._program.bus
             present = await bus.present(keys.camera("*", "**"), max(0.0, deadline - loop.time()))
-            self._meets = len(present) <= MAX_CAMERAS_MET
+            self._meets_all_at_open = len(present) <= MAX_CAMERAS_MET
             for key in present:
                 self._on_camera(key, True)
-            if self._meets:
+            if self._meets_all_at_open:
                 self._handles.append(bus.watch(keys.camera("*", "**"), self._on_camera))
             else:
-                self._exchange.see_all(self._on_camera)
-                self._exchange.cover("states")
+                self._exchange.watch_presences(self._on_camera)
+                self._exchange.subscribe_all("states")
             self._handles.append(bus.watch(keys.agent("*"), self._on_agent))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout_at(deadline):
-                    await self._met(self._opening.values())
+                    await self._wait_met(self._opening_tasks.values())
         except BaseException:
             await self.close()
             raise
@@ -332,17 +332,17 @@ class Fleet:
         for handle in self._handles:
             handle.close()
         self._handles = []
-        for task in self._opening.values():
+        for task in self._opening_tasks.values():
             task.cancel()
-        await asyncio.gather(*self._opening.values(), return_exceptions=True)
+        await asyncio.gather(*self._opening_tasks.values(), return_exceptions=True)
         cameras = [*self._cameras.values()]
         for begin in range(0, len(cameras), MAX_CAMERAS_AT_ONCE):
             await close_all(camera.close for camera in cameras[begin : begin + MAX_CAMERAS_AT_ONCE])
-        for results in self._subscribed("**"):
+        for results in self._matching_results("**"):
             results.end()
         for stream in self._events:
             stream.end(None)
-        await self._exchange.leave()
+        await self._exchange.stop_receiving()
         await self._program.close()
         await self._stack.aclose()
 
@@ -403,10 +403,10 @@ class Fleet:
         return url
 
     def _known_camera(self, name: str) -> FleetCamera[Any]:
-        """Return a camera; in a large fleet it is met now, if it was not before."""
+        """Return a camera; meet it first if it was not met before."""
         camera = self._cameras.get(name)
         if camera is None:
-            camera = self._meet(name)
+            camera = self._meet_camera(name)
         return camera
 
     def agents(self, pattern: str = "**") -> list[str]:
@@ -420,7 +420,7 @@ class Fleet:
         return sorted({agent for agents in sharing for agent in agents})
 
     def __getitem__(self, name: str) -> FleetCamera[Any]:
-        """Return a camera that an agent shares or has shared.
+        """Return a camera that an agent shares now, or has shared before.
 
         For a camera that was given up (taken by another client, or lost with ``reconnect=None``)
         there is a new object once an agent shares it again.
@@ -460,15 +460,19 @@ class Fleet:
         """
         cameras = self.cameras(pattern)
         self._require_open()
-        meeting = [self._opening[camera.name] for camera in cameras if camera.name in self._opening]
-        await self._met(meeting)
+        meeting = [
+            self._opening_tasks[camera.name]
+            for camera in cameras
+            if camera.name in self._opening_tasks
+        ]
+        await self._wait_met(meeting)
         self._require_open()
         return cameras
 
-    async def _met(self, meeting: Iterable[asyncio.Task[None]]) -> None:
-        """Wait until cameras were met; after a cancellation the meeting goes on."""
-        if left := {*meeting}:
-            await asyncio.wait(left)
+    async def _wait_met(self, meeting: Iterable[asyncio.Task[None]]) -> None:
+        """Wait until cameras were met; a cancellation does not cancel the meeting."""
+        if tasks := {*meeting}:
+            await asyncio.wait(tasks)
 
     async def status(
         self, pattern: str = "**", *, timeout: float = STATUS_TIMEOUT
@@ -493,7 +497,9 @@ class Fleet:
         self._require_open()
         program = self._program
         summaries = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
-        best = by_name(summaries, lambda camera: (camera.summary.connected, camera.summary.agent))
+        best = best_by_name(
+            summaries, lambda camera: (camera.summary.connected, camera.summary.agent)
+        )
         return {name: best[name].summary for name in sorted(best)}
 
     async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ReportedOutlet]:
@@ -565,19 +571,19 @@ class Fleet:
             return stream
         at = datetime.now(UTC)
         for agent in self.agents():
-            stream.offer(AgentJoined(self._name, at, agent), 0.0)
+            stream.offer(AgentJoined(self._fleet_name, at, agent), 0.0)
         for camera, agents in sorted(self._agents.items()):
             for agent in sorted(agents):
-                stream.offer(CameraJoined(self._name, at, agent, camera), 0.0)
+                stream.offer(CameraJoined(self._fleet_name, at, agent, camera), 0.0)
         self._events.add(stream)
         return stream
 
     def _publish(self, kind: type[FleetEvent], *names: str) -> None:
         for stream in self._events:
-            stream.offer(kind(self._name, datetime.now(UTC), *names), 0.0)
+            stream.offer(kind(self._fleet_name, datetime.now(UTC), *names), 0.0)
 
     @property
-    def _name(self) -> str:
+    def _fleet_name(self) -> str:
         return self._program.keys.fleet
 
     def _on_agent(self, key: str, present: bool) -> None:
@@ -589,7 +595,7 @@ class Fleet:
             self._publish(AgentJoined, agent)
             return
         for name in sorted(name for name, agents in self._agents.items() if agent in agents):
-            self._leave(agent, name)
+            self._remove_camera(agent, name)
         self._present.discard(agent)
         self._publish(AgentLeft, agent)
 
@@ -601,17 +607,17 @@ class Fleet:
         if present == (agent in sharing):
             return
         if not present:
-            self._leave(agent, name)
+            self._remove_camera(agent, name)
             return
         self._on_agent(keys.agent(agent), True)  # the agent's event is before its cameras'
         sharing.add(agent)
         known = self._cameras.get(name)
-        wanted = self._meets or bool(self._subscribed(name))
+        wanted = self._meets_all_at_open or bool(self._matching_results(name))
         if (known is None and wanted) or (known is not None and known.ended):
-            self._meet(name)
+            self._meet_camera(name)
         self._publish(CameraJoined, agent, name)
 
-    def _leave(self, agent: str, name: str) -> None:
+    def _remove_camera(self, agent: str, name: str) -> None:
         self._agents[name].discard(agent)
         camera = self._cameras.get(name)
         if camera is not None:
@@ -623,32 +629,34 @@ class Fleet:
     def _address_of(self, name: str) -> Any:
         return (self._address or FleetAddress("fleet", "", 0)).of(name)
 
-    def _make(self, name: str) -> FleetCamera[Any]:
+    def _make_camera(self, name: str) -> FleetCamera[Any]:
         own_options = {"name": name, "connect_timeout": self._timeout}
         settings = CameraSettings.of(self._address_of(name), {**self._options, **own_options})
         return FleetCamera[Any](settings, name, self._program, shared=True)
 
-    def _meet(self, name: str) -> FleetCamera[Any]:
-        before = self._cameras.get(name)
-        camera = self._cameras[name] = self._make(name)
-        for results in self._subscribed(name):
+    def _meet_camera(self, name: str) -> FleetCamera[Any]:
+        previous = self._cameras.get(name)
+        camera = self._cameras[name] = self._make_camera(name)
+        for results in self._matching_results(name):
             results.add(camera)
         task = asyncio.get_running_loop().create_task(
-            self._attend(camera, before), name=f"smartcam.fleet.{name}.open"
+            self._follow_camera(camera, previous), name=f"smartcam.fleet.{name}.open"
         )
-        self._opening[name] = task
+        self._opening_tasks[name] = task
 
-        def forget(done: asyncio.Task[None]) -> None:
-            if self._opening.get(name) is done:
-                del self._opening[name]
+        def on_done(task: asyncio.Task[None]) -> None:
+            if self._opening_tasks.get(name) is task:
+                del self._opening_tasks[name]
 
-        task.add_done_callback(forget)
-        camera.opening = task
+        task.add_done_callback(on_done)
+        camera.opening_task = task
         return camera
 
-    async def _attend(self, camera: FleetCamera[Any], before: FleetCamera[Any] | None) -> None:
-        if before is not None:
-            await before.close()
+    async def _follow_camera(
+        self, camera: FleetCamera[Any], previous: FleetCamera[Any] | None
+    ) -> None:
+        if previous is not None:
+            await previous.close()
         async with self._meeting_slots:
             await camera.follow(self._timeout)
 
@@ -674,7 +682,9 @@ class Fleet:
 
         Cancellation: cancels each; which cameras were triggered is unknown.
         """
-        return await self._each(pattern, lambda camera: camera.trigger(timeout=timeout, **options))
+        return await self._call_each(
+            pattern, lambda camera: camera.trigger(timeout=timeout, **options)
+        )
 
     async def reload(
         self, agent: str | None = None, *, timeout: float = 30.0
@@ -709,7 +719,7 @@ class Fleet:
         wanted = agents if agent is None else [agent]
         return await reload_agents(program.bus, program.keys, wanted, timeout)
 
-    async def _each(
+    async def _call_each(
         self, pattern: str, do: Callable[[FleetCamera[Any]], Coroutine[Any, Any, Any]]
     ) -> dict[str, Any]:
         pattern = check_pattern(pattern)
@@ -772,14 +782,14 @@ class Fleet:
         self._results.append((pattern, weakref.ref(results)))
         names = {*self.names(pattern), *(name for name in self._cameras if meets(pattern, name))}
         if len(names) > MAX_CAMERAS_SUBSCRIBED and 2 * len(names) > len(self):
-            self._exchange.cover("results")
+            self._exchange.subscribe_all("results")
         for name in names:
             results.add(self._known_camera(name))
         if self._state == "closed":
             results.end()
         return results
 
-    def _subscribed(self, name: str) -> list[FleetResults[Any]]:
-        """Return the streams whose pattern has a name in common with a name or pattern."""
+    def _matching_results(self, name: str) -> list[FleetResults[Any]]:
+        """Return the streams of results whose pattern can match this name or pattern."""
         streams = [results() for pattern, results in self._results if meets(pattern, name)]
         return [stream for stream in streams if stream is not None]

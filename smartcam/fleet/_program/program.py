@@ -33,22 +33,22 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 AGENT_SEARCH_INTERVAL = 0.1
 """Seconds between two checks for an agent."""
 
-OTHER_FLEETS_TIMEOUT = 1.0
-"""Seconds of the timeout for finding other fleets than the wanted one."""
+SIMILAR_NAMES_TIMEOUT = 1.0
+"""Seconds to find cameras with similar names, for an error text."""
 
 
 Reply = BusMessage | TriggerReply
 
 
-class Called(Protocol):
-    """A camera that calls are made to.
+class CalledCamera(Protocol):
+    """A camera that receives calls.
 
     Attributes:
-        streamed: whether this program takes all results of the camera; they are handed on before
-            the caller of a trigger goes on.
+        streams_results: whether this program takes all results of the camera. They are then passed
+            on before a trigger returns.
     """
 
-    streamed: bool
+    streams_results: bool
 
 
 class Pending(NamedTuple):
@@ -57,10 +57,10 @@ class Pending(NamedTuple):
     Attributes:
         camera: the camera that is called.
         reply: the future of the reply.
-        deadline: loop time until which the reply is waited for.
+        deadline: loop time at which the call fails without a reply.
     """
 
-    camera: Called
+    camera: CalledCamera
     reply: Outcome
     deadline: float
 
@@ -70,10 +70,10 @@ class Program:
 
     Args:
         bus: the program's own end of the bus.
-        fleet: name of the fleet; None for the only fleet with the camera.
-        camera: camera to look for: a name, or a pattern.
+        fleet: name of the fleet; None for the only fleet that has the camera.
+        camera: name or pattern of the camera, to find the fleet.
         guest: whether another object opens and closes the end.
-        called: name of the program for people; None: its script's.
+        display_name: name of the program for people; None: the name of its script.
 
     Attributes:
         keys: keys of the fleet, once the program is open.
@@ -89,18 +89,18 @@ class Program:
         camera: str = "**",
         *,
         guest: bool = False,
-        called: str | None = None,
+        display_name: str | None = None,
     ) -> None:
         self.bus: Bus = bus
         self._guest = guest
         self._fleet, self._camera = fleet, camera
-        self._called = called
-        self._set_name(ProgramName.new(ANYONE, called))
-        self._calls = 0
-        self._pending: dict[int, Pending] = {}
-        self._expiry = DeadlineTimer(self._expire)
-        self._expires_at = math.inf  # no later than the first deadline of those pending
-        self._declared: list[Handle] = []
+        self._called = display_name
+        self._set_name(ProgramName.new(ANYONE, display_name))
+        self._call_count = 0
+        self._pending_calls: dict[int, Pending] = {}
+        self._deadline_timer = DeadlineTimer(self._expire)
+        self._timer_at = math.inf  # no later than the first deadline of the pending calls
+        self._handles: list[Handle] = []
         self.frames: FrameCollector = FrameCollector(self)
 
     async def open(self, timeout: float) -> Self:
@@ -115,11 +115,11 @@ class Program:
         self._bell = make_doorbell(loop)
         if not self._guest:
             await self.bus.open(timeout)
-        self.keys = Keys(self._fleet or await self._find(deadline, timeout))
+        self.keys = Keys(self._fleet or await self._find_fleet(deadline, timeout))
         if self.bus.identity is not None:
-            called = self._called or self.bus.identity.name or None
-            self._set_name(ProgramName.new(self.bus.identity.role, called))
-        self._declared = [
+            display_name = self._called or self.bus.identity.name or None
+            self._set_name(ProgramName.new(self.bus.identity.role, display_name))
+        self._handles = [
             self.bus.subscribe(self.keys.reply(self.name), self._on_reply),
             self.bus.be_present(self.keys.program(self.token)),
         ]
@@ -143,7 +143,7 @@ class Program:
         """The role at the start of the program's name."""
         return self._name.role
 
-    async def _find(self, deadline: float, timeout: float) -> str:
+    async def _find_fleet(self, deadline: float, timeout: float) -> str:
         """Return the name of the only fleet that has the camera."""
         loop = asyncio.get_running_loop()
         # there may be thousands of cameras, but only a few agents
@@ -151,8 +151,8 @@ class Program:
         pattern = keys_of.camera("*", self._camera)
         if self._camera == "**":
             pattern = keys_of.agent("*")
-        while (left := deadline - loop.time()) > 0:
-            keys = await self.bus.present(pattern, left)
+        while (remaining := deadline - loop.time()) > 0:
+            keys = await self.bus.present(pattern, remaining)
             fleets = sorted({key.split("/")[1] for key in keys})
             if len(fleets) == 1:
                 return fleets[0]
@@ -161,34 +161,34 @@ class Program:
                     f"{self._camera}: there are several fleets: {', '.join(fleets)}; choose one: "
                     f"?fleet={fleets[0]}"
                 )
-            await asyncio.sleep(min(AGENT_SEARCH_INTERVAL, left))
-        thing, meant = "camera", ""
+            await asyncio.sleep(min(AGENT_SEARCH_INTERVAL, remaining))
+        wanted, suggestion = "camera", ""
         if "*" not in self._camera:
-            keys = await self.bus.present(Keys("*").camera("*", "**"), OTHER_FLEETS_TIMEOUT)
-            meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
-            thing = f"camera {self._camera}"
-        whose = self.bus.identity
-        seen = "" if whose is None else f"; or {whose} may not see it"
-        why = f"no agent there has a {thing}: none came within {timeout:g} s{meant}{seen}"
+            keys = await self.bus.present(Keys("*").camera("*", "**"), SIMILAR_NAMES_TIMEOUT)
+            suggestion = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
+            wanted = f"camera {self._camera}"
+        identity = self.bus.identity
+        hidden = "" if identity is None else f"; or {identity} may not see it"
+        why = f"no agent there has a {wanted}: none came within {timeout:g} s{suggestion}{hidden}"
         raise ConnectFailedError(why, attempts=(why,))
 
     async def close(self) -> None:
         """Leave the bus, and end running calls. Idempotent."""
-        for pending in [*self._pending.values()]:
+        for pending in [*self._pending_calls.values()]:
             if not pending.reply.done():
                 pending.reply.set_exception(ConnectionClosedError("closed"))
-        self._expiry.cancel()
-        declared, self._declared = self._declared, []
+        self._deadline_timer.cancel()
+        handles, self._handles = self._handles, []
         self.frames.close()
-        for handle in declared:
+        for handle in handles:
             handle.close()
         if not self._guest:
             await self.bus.close()
 
     def next_call(self) -> int:
         """Return a new number for a call."""
-        self._calls += 1
-        return self._calls
+        self._call_count += 1
+        return self._call_count
 
     def send(self, key: str, fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> int:
         """Send a message to an agent; return its number of bytes."""
@@ -199,43 +199,45 @@ class Program:
         self.bus.put(key, payload)
         return len(payload)
 
-    def expect(self, number: int, camera: Called, deadline: float = math.inf) -> Outcome:
-        """Return the future of the reply to a call; :meth:`forget` the call in the end.
+    def expect_reply(
+        self, number: int, camera: CalledCamera, deadline: float = math.inf
+    ) -> Outcome:
+        """Return the future of the reply to a call; :meth:`forget_call` must follow in the end.
 
-        Without a reply by ``deadline`` (loop time) it raises :exc:`TimeoutError`.
+        Without a reply by ``deadline`` (loop time) the future raises :exc:`TimeoutError`.
         """
         reply = self._bell.outcome()
-        self._pending[number] = new_tuple(Pending, (camera, reply, deadline))
-        if deadline < self._expires_at:
-            self._expires_at = deadline
-            self._expiry.set(deadline)
+        self._pending_calls[number] = new_tuple(Pending, (camera, reply, deadline))
+        if deadline < self._timer_at:
+            self._timer_at = deadline
+            self._deadline_timer.set(deadline)
         return reply
 
-    def forget(self, number: int) -> None:
+    def forget_call(self, number: int) -> None:
         """Drop a call whose reply is not awaited any more."""
-        self._pending.pop(number, None)
-        if not self._pending:
-            self._expires_at = math.inf
-            self._expiry.clear()
+        self._pending_calls.pop(number, None)
+        if not self._pending_calls:
+            self._timer_at = math.inf
+            self._deadline_timer.clear()
 
     def _expire(self) -> None:
-        """End the calls whose deadline is over, and wait for the next one."""
-        now, first = asyncio.get_running_loop().time(), math.inf
-        for _, reply, deadline in self._pending.values():
+        """End the calls whose deadline has passed, and set the timer to the next deadline."""
+        now, next_deadline = asyncio.get_running_loop().time(), math.inf
+        for _, reply, deadline in self._pending_calls.values():
             if reply.done():
                 continue
             if deadline <= now:
                 reply.set_exception(TimeoutError())
             else:
-                first = min(first, deadline)
-        self._expires_at = first
-        if first < math.inf:
-            self._expiry.set(first)
+                next_deadline = min(next_deadline, deadline)
+        self._timer_at = next_deadline
+        if next_deadline < math.inf:
+            self._deadline_timer.set(next_deadline)
 
-    def fail(self, camera: Called, error: Callable[[], SmartCamError]) -> None:
-        """End all calls to a camera: there will be no replies."""
-        for owner, reply, _ in self._pending.values():
-            if owner is camera and not reply.done():
+    def fail_calls(self, camera: CalledCamera, error: Callable[[], SmartCamError]) -> None:
+        """End all calls to a camera with an error, since there will be no replies."""
+        for called_camera, reply, _ in self._pending_calls.values():
+            if called_camera is camera and not reply.done():
                 reply.set_exception(error())
 
     def _on_reply(self, key: str, payload: bytes) -> None:
@@ -247,13 +249,13 @@ class Program:
             else:
                 message = decoded = decode(payload, "a reply")
                 number = decoded.fields["call"]
-            pending = self._pending.get(number)
+            pending = self._pending_calls.get(number)
         except (ProtocolError, KeyError, TypeError) as exc:
             logger.warning("%s ! a reply that cannot be read: %s", self.name, exc)
             return
         if pending is None or pending.reply.done():
             return
-        if pending.camera.streamed:
+        if pending.camera.streams_results:
             pending.reply.set_result(message)
         else:
             self._bell.give(pending.reply, message)

@@ -39,7 +39,7 @@ class ProgramName(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Name and secret in the form for agents."""
+        """Name and secret as one text, which is sent to agents."""
         return f"{self.name}.{self.secret}"
 
     @property
@@ -48,25 +48,25 @@ class ProgramName(NamedTuple):
         return role_of(self.name)
 
     @property
-    def genuine(self) -> bool:
-        """True if the name has the digest of the secret, and begins with a role."""
+    def is_genuine(self) -> bool:
+        """True if the name begins with a role, and ends with the digest of the secret."""
         return self.role in ROLES_OF_NAMES and self.name.rpartition("-")[2] == _digest(self.secret)
 
     @classmethod
-    def of(cls, token: str) -> ProgramName:
-        """Return the name and secret from a program; they may not be genuine."""
+    def from_token(cls, token: str) -> ProgramName:
+        """Return the name and secret in a program's token, without a check of them."""
         name, _, secret = token.partition(".")
         return cls(name, secret)
 
     @classmethod
-    def new(cls, role: str, called: str | None = None) -> ProgramName:
+    def new(cls, role: str, display_name: str | None = None) -> ProgramName:
         """Return a name for this process that no other program has.
 
-        ``called``: name of the program for people; default: its script's.
+        ``display_name``: name of the program for people; None: the name of its script.
         """
         secret = secrets.token_hex(SECRET_BYTES)
         role = role if role in ROLES else ANYONE
-        return cls(f"{role}-{_process(called)}-{_digest(secret)}", secret)
+        return cls(f"{role}-{_process_name(display_name)}-{_digest(secret)}", secret)
 
 
 def role_of(name: str) -> str:
@@ -74,12 +74,12 @@ def role_of(name: str) -> str:
     return name.partition("-")[0]
 
 
-def names_of(role: str) -> str:
-    """Return the pattern of the names of all programs of a role."""
+def names_pattern(role: str) -> str:
+    """Return the pattern that the names of all programs of a role match."""
     return f"{role}-$*"
 
 
-_PARTS = re.compile(r"[^-]+-(?P<called>.+)@(?P<host>.+)-(?P<pid>\d+)-[0-9a-f]+")
+_PARTS = re.compile(r"[^-]+-(?P<display_name>.+)@(?P<host>.+)-(?P<pid>\d+)-[0-9a-f]+")
 
 
 def in_words(name: str) -> str:
@@ -88,23 +88,25 @@ def in_words(name: str) -> str:
     A name that is not one of a program of smartcam is returned unchanged.
     """
     parts = _PARTS.fullmatch(name)
-    return name if parts is None else "{called} on {host}, pid {pid}".format(**parts.groupdict())
+    return (
+        name if parts is None else "{display_name} on {host}, pid {pid}".format(**parts.groupdict())
+    )
 
 
 def _digest(secret: str) -> str:
     return hashlib.blake2b(secret.encode(), digest_size=SECRET_BYTES).hexdigest()
 
 
-def _process(called: str | None) -> str:
-    """Return a name of this process: its name for people, its host and number."""
+def _process_name(display_name: str | None) -> str:
+    """Return a name of this process: its name for people, its host and its process id."""
     path = Path(sys.argv[0] if sys.argv else "")
     script = path.parent.name if path.stem == "__main__" else path.stem
     if script in {"", "-c", "-m"}:
         script = "python"
     host = socket.gethostname().partition(".")[0]
-    return f"{_plain(called or script)}@{_plain(host)}-{os.getpid()}"
+    return f"{_key_text(display_name or script)}@{_key_text(host)}-{os.getpid()}"
 
 
-def _plain(text: str) -> str:
+def _key_text(text: str) -> str:
     """Return a text with only characters that a key of the bus may have."""
     return re.sub(r"[^a-z0-9-]", "_", text.lower())

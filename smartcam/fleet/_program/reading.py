@@ -1,4 +1,4 @@
-"""Read an agent's message about a result: its value, and all of it as JSON."""
+"""Interpret results in an agent's messages, and return them as objects or as fields for JSON."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.wire import ResultRun
 
 
-def singles(run: ResultRun) -> Iterator[ResultRun]:
-    """Yield each container of a run as its own run."""
-    for place in range(len(run.payloads)):
-        yield run._replace(number=run.number + place, payloads=run.payloads[place : place + 1])
+def split_run(run: ResultRun) -> Iterator[ResultRun]:
+    """Yield each container of a run as a run of one container."""
+    for index in range(len(run.payloads)):
+        yield run._replace(number=run.number + index, payloads=run.payloads[index : index + 1])
 
 
-def interpreted(
+def interpret_run(
     run: ResultRun, interpretation: Interpretation, camera: str, at: datetime | None = None
 ) -> Interpreted:
-    """Return the contents of the one container of ``run``.
+    """Return the interpreted contents of a run that has one container.
 
     Args:
         run: run of one container.
         interpretation: interpretation of the container.
         camera: name of the camera.
-        at: time of receipt, if it is known already.
+        at: time of receipt; None: compute it from the run.
 
     Raises:
         InterpretationError: the container does not fit the interpretation.
@@ -45,20 +45,20 @@ def interpreted(
     cells = fault = None
     if run.cells:
         content: dict[str, Any] = json.loads(run.cells)
-        fault, given = content.get("fault"), content.get("cells")
-        cells = None if given is None else tuple(given)
+        fault, cell_list = content.get("fault"), content.get("cells")
+        cells = None if cell_list is None else tuple(cell_list)
     (data,) = run.payloads
     container = ResultContainer(application=run.application, data=data, cells=cells, fault=fault)
-    # by the method's name: a call of the object itself costs four times as much
+    # calling __call__ by its name takes a quarter of the time of calling the object
     return interpretation.__call__(
         container, run.endian, camera=camera, number=run.number, at=at or run.received_at
     )
 
 
-def as_result(
+def to_result(
     run: ResultRun, camera: str, value: Any, sequence: int | None, at: datetime | None = None
 ) -> Result[Any]:
-    """Return the one container of ``run`` as a result with this value; ``at``: time of receipt."""
+    """Return a result with this value for a run of one container; ``at``: time of receipt."""
     latency = None if math.isnan(run.latency) else run.latency
     number, triggered_at, received_at = run.number, run.trigger_time, at or run.received_at
     times = number, triggered_at, received_at, latency
@@ -70,31 +70,31 @@ def as_result(
 def result_fields(
     run: ResultRun, interpretation: Interpretation | None, camera: str
 ) -> dict[str, Any]:
-    """Return the JSON fields of the one container of ``run``, with its ``error`` if there is one.
+    """Return the fields for JSON of a run that has one container.
 
-    The value is None with an error, and without an interpretation.
+    The value is None if there is an error, or no interpretation; ``error`` is empty without error.
     """
     value = sequence = None
     outcome: dict[str, Any] = {"error": ""}
     if interpretation is not None:
         try:
-            value, sequence, _ = interpreted(run, interpretation, camera)
-            if localizations_of(value) is None:  # there is a faster way for localizations
+            value, sequence, _ = interpret_run(run, interpretation, camera)
+            if localizations_of(value) is None:  # localizations can be encoded as they are
                 value = plain(value)
         except InterpretationError as error:
-            value, outcome = None, failure(error)
+            value, outcome = None, error_fields(error)
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:  # noqa: BLE001 - a plug-in's value cannot become JSON
             value, outcome = (
                 None,
-                failure(InterpretationError(f"the value is no JSON: {exc!r:.200}")),
+                error_fields(InterpretationError(f"the value is no JSON: {exc!r:.200}")),
             )
-    return {**as_result(run, camera, value, sequence)._asdict(), **outcome}
+    return {**to_result(run, camera, value, sequence)._asdict(), **outcome}
 
 
-def failure(error: BaseException) -> dict[str, Any]:
-    """Return an error for answers and results in JSON: ``error`` is never empty."""
+def error_fields(error: BaseException) -> dict[str, Any]:
+    """Return the fields for JSON that describe an error; ``error`` is never empty."""
     described = to_fields(error, 0)
     fields: dict[str, Any] = {
         "error": described["text"] or described["kind"],

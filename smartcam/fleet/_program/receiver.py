@@ -18,7 +18,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._bus.log import Feed
 from smartcam.fleet._bus.wire import CURRENT, LATE, ResultRun, decode, decode_runs, decode_state
-from smartcam.fleet._program.reading import as_result, interpreted, singles
+from smartcam.fleet._program.reading import interpret_run, split_run, to_result
 from smartcam.models import Result
 
 if TYPE_CHECKING:
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from smartcam._client._inside import ClientCounters, Interpretation
     from smartcam.fleet._bus.bus import Handle
     from smartcam.fleet._bus.wire import Batch, BusMessage, TriggerReply
-    from smartcam.fleet._program.caller import Caller, Met
+    from smartcam.fleet._program.caller import Caller, MetAgent
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-FILL_TIMEOUT = 5.0
-"""Seconds for the answer to a request for missing messages; then it is sent again."""
+MISSING_TIMEOUT = 5.0
+"""Seconds for the answer to a request for missing messages; after that, it is sent again."""
 
 
 class StateMessage(NamedTuple):
@@ -40,7 +40,7 @@ class StateMessage(NamedTuple):
 
     Attributes:
         number: number of the event.
-        next: number of the event after it.
+        next: number of the following event.
         fields: fields of the event and of the camera's state.
     """
 
@@ -54,11 +54,11 @@ class StateMessage(NamedTuple):
         return 500
 
     def since(self, number: int) -> StateMessage:
-        """Return this state, which has one number only."""
+        """Return the message unchanged, since it has only one number."""
         return self
 
 
-def state(data: bytes) -> StateMessage:
+def read_state(data: bytes) -> StateMessage:
     """Return the event from an agent's bytes.
 
     Raises:
@@ -71,48 +71,53 @@ def state(data: bytes) -> StateMessage:
 
 
 class FleetListeners(Listeners):
-    """Skips listeners that came later than the results that are passed on."""
+    """Listeners of a fleet's camera, which get only results that came after their own start."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._since: weakref.WeakKeyDictionary[asyncio.Future[Result], float] = (
+        self._wanted_since: weakref.WeakKeyDictionary[asyncio.Future[Result], float] = (
             weakref.WeakKeyDictionary()
         )
 
-    def unmarked(self) -> list[asyncio.Future[Result]]:
-        """Return the waiters whose start is not known yet."""
-        return [wait for wait in self._next_results if wait not in self._since]
+    def waits_without_start(self) -> list[asyncio.Future[Result]]:
+        """Return the waits for the next result whose start is not set yet."""
+        return [wait for wait in self._next_results if wait not in self._wanted_since]
 
-    def waits_since(self, future: asyncio.Future[Result], clock: float) -> None:
-        """Note that a waiter for the next result needs one from ``clock`` on."""
-        self._since[future] = clock
+    def set_wait_start(self, future: asyncio.Future[Result], clock: float) -> None:
+        """Set the agent's time from which a result can end this wait for the next result."""
+        self._wanted_since[future] = clock
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
         horizon = self.results.horizon
-        late = [wait for wait in self._next_results if self._since.get(wait, -math.inf) > horizon]
+        later_waits = [
+            wait for wait in self._next_results if self._wanted_since.get(wait, -math.inf) > horizon
+        ]
         taken = super()._take_next_results()
-        if late:
-            self._next_results.update(late)
-            taken = [wait for wait in taken if wait not in late]
+        if later_waits:
+            self._next_results.update(later_waits)
+            taken = [wait for wait in taken if wait not in later_waits]
         return taken
 
-    def miss(self, count: int, then: ResultRun | None) -> None:
-        """Report to the streams that results before ``then`` are missed.
+    def report_missed(self, count: int, following: ResultRun | None) -> None:
+        """Report to the streams that ``count`` results before ``following`` are missed.
 
-        A stream that subscribed in between cannot know how many it has missed: it counts all.
+        A stream that subscribed within this gap cannot know how many it has missed: it counts all.
         """
-        self.results.horizon = math.inf if then is None else then.clock
+        self.results.horizon = math.inf if following is None else following.clock
         for stream in self.results:
             stream.miss(count)
         self.results.horizon = math.inf
 
 
-class Own:
-    """A trigger of this program, while its caller waits.
+class OwnTrigger:
+    """A trigger of this program whose caller waits for the results.
 
     Args:
         interpretation: interpretation of the trigger's results.
         expected: application whose results are expected; None for any.
+
+    Attributes:
+        outcomes: result, or error, of each result number that was received for this trigger.
     """
 
     def __init__(self, interpretation: Interpretation, expected: int | None) -> None:
@@ -129,7 +134,7 @@ class Receiver:
         caller: caller that asks the agent for missing messages.
         listeners: listeners for results.
         counters: counters of results.
-        interpretation: function that returns the interpretation, unless a trigger has its own.
+        interpretation: function that returns the interpretation of results without an own trigger.
         on_state: callback for the camera's events.
         expected: function that returns the expected application; None for any.
     """
@@ -145,29 +150,32 @@ class Receiver:
         on_state: Callable[[dict[str, Any]], None],
         expected: Callable[[], int | None],
     ) -> None:
-        self.own_calls: dict[int, Own] = {}
+        self.own_triggers: dict[int, OwnTrigger] = {}
         self._name, self._camera, self._caller = name, camera, caller
         self._listeners, self._counters = listeners, counters
         self._interpretation, self._on_state, self._expected = interpretation, on_state, expected
         self._program = 0  # the agent's number for this program
         self._states: Feed[StateMessage] = Feed(
-            self._take_state, _ignore, lambda: self._lack("states")
+            self._take_state, _ignore_missed, lambda: self._fetch_soon("states")
         )
         self._results: Feed[ResultRun] = Feed(
-            self._take_run, listeners.miss, lambda: self._lack("results"), returns=True
+            self._pass_run,
+            listeners.report_missed,
+            lambda: self._fetch_soon("results"),
+            resumes_epochs=True,
         )
         self._handles: dict[str, Handle] = {}
-        self._since = math.inf  # agent's time from which results are needed
+        self._results_since = math.inf  # agent's time from which results are needed
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._reaching: list[tuple[Feed[Any], int, asyncio.Future[None]]] = []
+        self._receive_waits: list[tuple[Feed[Any], int, asyncio.Future[None]]] = []
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ open and close
 
     def open(self) -> None:
         """Subscribe to the camera's states."""
         program = self._caller.program
         key = program.keys.states(self._camera)
-        self._handles["states"] = program.bus.subscribe(key, self._take_state_message)
+        self._handles["states"] = program.bus.subscribe(key, self._on_state_message)
 
     async def close(self) -> None:
         """Unsubscribe."""
@@ -178,194 +186,198 @@ class Receiver:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        self._wake(everyone=True)
+        self._wake_waits(every_wait=True)
 
-    def misses_states(self, met: Met) -> bool:
-        """Return True if an agent, met again, has sent states that were not received."""
+    def misses_states(self, met: MetAgent) -> bool:
+        """Return True if the same agent has sent states meanwhile that were not received."""
         feed = self._states
         return feed.epoch == met.epoch and 0 < feed.expected < int(met.hello["states"])
 
-    def meet(self, met: Met) -> None:
-        """Start with an agent that has answered with its next numbers."""
+    def begin_agent(self, met: MetAgent) -> None:
+        """Expect the next messages of an agent, whose numbers are in its answer to the hello."""
         hello = met.hello
         self._program = int(hello.get("program", 0))
         states, results = int(hello["states"]), int(hello["results"])
         self._states.begin(met.epoch, states, states)
         if "results" not in self._handles:
             return
-        if self._results.expected:  # after a new start, or a takeover, all results
+        if self._results.expected:  # after a restart or takeover of the agent: all its results
             self._results.begin(met.epoch, int(hello.get("began", 1)), results)
         else:
-            self._begin("find", self._find())
+            self._start_task("find", self._find_first_result())
 
-    def lose(self) -> None:
-        """Stop asking, since the agent is lost; missing messages are requested at its return."""
+    def lose_agent(self) -> None:
+        """Stop requests to the lost agent; missing messages are requested when an agent is back."""
         for task in self._tasks.values():
             task.cancel()
         self._tasks.clear()
         self._states.interrupt()
         if self._results.expected:
             self._results.interrupt()
-        self._wake(everyone=True)
+        self._wake_waits(every_wait=True)
 
     @property
     def epoch(self) -> int:
         """Epoch of the agent of the last received states; 0 before."""
         return self._states.epoch
 
-    # ------------------------------------------------------------------ on demand
+    # ------------------------------------------------------------------ results on demand
 
-    def want_results(self, since: float) -> None:
-        """Note that results from ``since`` on (the agent's clock) are needed."""
+    def subscribe_results(self, since: float) -> None:
+        """Receive results from ``since`` on, a time of the agent's clock. Idempotent."""
         if "results" in self._handles:
             return
         program = self._caller.program
         key = program.keys.results(self._camera)
-        self._since, self._caller.streamed = since, True
-        self._handles["results"] = program.bus.subscribe(key, self._take_result_message)
-        self._begin("find", self._find())
+        self._results_since, self._caller.streams_results = since, True
+        self._handles["results"] = program.bus.subscribe(key, self._on_result_message)
+        self._start_task("find", self._find_first_result())
 
-    def _leave_results(self) -> None:
+    def _unsubscribe_results(self) -> None:
         self._handles.pop("results").close()
-        self._caller.streamed = False
+        self._caller.streams_results = False
         self._results.stop()
-        self._wake(everyone=True)
+        self._wake_waits(every_wait=True)
 
-    async def _find(self) -> None:
-        """Find the first needed result: earlier ones came before there was a listener."""
-        while self._caller.met is not None:
-            met = self._caller.met
+    async def _find_first_result(self) -> None:
+        """Ask the agent for the number of the first result that came after the first listener."""
+        while self._caller.agent is not None:
+            met = self._caller.agent
             with contextlib.suppress(SmartCamError):
-                reply = await self._caller.call("find", self._soon(), {"since": self._since})
+                reply = await self._caller.call(
+                    "find", self._fetch_deadline(), {"since": self._results_since}
+                )
                 answer = reply.fields["answer"]
                 self._results.begin(met.epoch, int(answer["first"]), int(answer["following"]))
-                self._wake()
+                self._wake_waits()
                 return
 
-    async def reach(self, kind: str, number: int, deadline: float) -> None:
-        """Wait until all messages before ``number`` were received; bounded, and never fails."""
+    async def wait_received(self, kind: str, number: int, deadline: float) -> None:
+        """Wait until all messages before ``number`` were received, or until the deadline."""
         feed: Feed[Any] = self._states if kind == "states" else self._results
         if kind not in self._handles or feed.expected >= number:
             return
         reached: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._reaching.append((feed, number, reached))
+        self._receive_waits.append((feed, number, reached))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(deadline):
                 await reached
 
-    def has(self, states: int, results: int) -> bool:
+    def has_received(self, states: int, results: int) -> bool:
         """Return True if all states, and subscribed results, before these numbers were received."""
-        enough = "results" not in self._handles or self._results.expected >= results
-        return enough and self._states.expected >= states
+        has_results = "results" not in self._handles or self._results.expected >= results
+        return has_results and self._states.expected >= states
 
-    def _wake(self, *, everyone: bool = False) -> None:
-        if not self._reaching:
+    def _wake_waits(self, *, every_wait: bool = False) -> None:
+        if not self._receive_waits:
             return
-        left: list[tuple[Feed[Any], int, asyncio.Future[None]]] = []
-        for feed, number, reached in self._reaching:
-            if everyone or feed.expected >= number:
+        remaining: list[tuple[Feed[Any], int, asyncio.Future[None]]] = []
+        for feed, number, reached in self._receive_waits:
+            if every_wait or feed.expected >= number:
                 if not reached.done():
                     reached.set_result(None)
             elif not reached.done():
-                left.append((feed, number, reached))
-        self._reaching = left
+                remaining.append((feed, number, reached))
+        self._receive_waits = remaining
 
     # ------------------------------------------------------------------ missing messages
 
-    def _lack(self, kind: str) -> None:
-        if kind not in self._tasks and self._caller.met is not None:
-            self._begin(kind, self._fill(kind))
+    def _fetch_soon(self, kind: str) -> None:
+        if kind not in self._tasks and self._caller.agent is not None:
+            self._start_task(kind, self._fetch_missing(kind))
 
-    def _begin(self, kind: str, work: Any) -> None:
+    def _start_task(self, kind: str, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(
             work, name=f"smartcam.fleet.{self._camera}.{kind}"
         )
         self._tasks[kind] = task
 
-        def done(ended: asyncio.Task[None]) -> None:
-            if self._tasks.get(kind) is ended:
+        def on_done(task: asyncio.Task[None]) -> None:
+            if self._tasks.get(kind) is task:
                 del self._tasks[kind]
-            if not ended.cancelled() and ended.exception() is not None:
-                logger.error("%s ! %s", self._name, ended.exception(), exc_info=ended.exception())
+            if not task.cancelled() and task.exception() is not None:
+                logger.error("%s ! %s", self._name, task.exception(), exc_info=task.exception())
 
-        task.add_done_callback(done)
+        task.add_done_callback(on_done)
 
-    async def _fill(self, kind: str) -> None:
+    async def _fetch_missing(self, kind: str) -> None:
         """Request missing messages until none is missing."""
         feed: Feed[Any] = self._states if kind == "states" else self._results
-        while feed.lacking and feed.expected and self._caller.met is not None:
+        while feed.has_gap and feed.expected and self._caller.agent is not None:
             epoch = feed.epoch
             try:
-                reply = await self._caller.call(kind, self._soon(), {"first": feed.expected})
+                reply = await self._caller.call(
+                    kind, self._fetch_deadline(), {"first": feed.expected}
+                )
             except SmartCamError:
                 continue
             try:
                 answer = reply.fields["answer"]
                 first, following = int(answer["first"]), int(answer["following"])
-                things = _things(kind, reply)
+                messages = _decode_messages(kind, reply)
             except (ProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! what was missing cannot be read: %s", self._name, exc)
                 first = following = feed.expected + 1  # skip it, to not request it forever
-                things = []
-            feed.fill(epoch, first, following, things)
-            self._wake()
+                messages = []
+            feed.fill(epoch, first, following, messages)
+            self._wake_waits()
 
-    def _soon(self) -> float:
-        return asyncio.get_running_loop().time() + FILL_TIMEOUT
+    def _fetch_deadline(self) -> float:
+        return asyncio.get_running_loop().time() + MISSING_TIMEOUT
 
     # ------------------------------------------------------------------ messages
 
-    def _take_state_message(self, key: str, payload: bytes) -> None:
+    def _on_state_message(self, key: str, payload: bytes) -> None:
         origin = f"the agent's message about {self._camera}"
         try:
             message = decode(payload, origin)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
-            self._count(payload)
-            known = 0  # states that came with replies
+            self._count_message(payload)
+            known_count = 0  # states that came before, with replies
             if epoch == self.epoch:
-                known = max(0, self._states.expected - following + len(message.blobs))
-            states = [state(blob) for blob in message.blobs[known:]]
+                known_count = max(0, self._states.expected - following + len(message.blobs))
+            states = [read_state(blob) for blob in message.blobs[known_count:]]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
             logger.warning("%s ! %s: %s", self._name, origin, exc)
             return
-        self._see(epoch)
+        self._check_restart(epoch)
         self._states.receive(epoch, following, states)
-        self._wake()
+        self._wake_waits()
 
     def take_states(self, reply: TriggerReply) -> None:
         """Take the states in a reply, which the agent has not published yet."""
         if not reply.new_states:
             return
         try:
-            states = [state(reported) for reported in reply.new_states]
+            states = [read_state(reported) for reported in reply.new_states]
         except ValueError as exc:
             logger.warning("%s ! the states in a reply are not valid: %s", self._camera, exc)
             return
         self._states.receive(reply.epoch, reply.states, states)
-        self._wake()
+        self._wake_waits()
 
-    def _take_result_message(self, key: str, payload: bytes) -> None:
+    def _on_result_message(self, key: str, payload: bytes) -> None:
         try:
             batch = decode_runs(payload, f"results of {self._camera}")
         except ProtocolError as exc:
             logger.warning("%s ! %s", self._name, exc)
             return
-        self._count(payload)
+        self._count_message(payload)
         listeners = self._listeners
         if not (listeners.wants_results or listeners.has_result_observer):
-            self._leave_results()
+            self._unsubscribe_results()
             return
-        self._see(batch.epoch)
+        self._check_restart(batch.epoch)
         self._results.receive(batch.epoch, batch.following, batch.runs)
-        self._wake()
+        self._wake_waits()
 
-    def _see(self, epoch: int) -> None:
-        """Check whether the agent was restarted: presence does not show a quick restart."""
-        met = self._caller.met
-        if met is not None and self._caller.restarted(epoch):
-            self._caller.lose(f"the agent {met.agent} was restarted")
+    def _check_restart(self, epoch: int) -> None:
+        """Drop the agent if it was restarted, which its presence on the bus may not show."""
+        met = self._caller.agent
+        if met is not None and self._caller.has_restarted(epoch):
+            self._caller.lose_agent(f"the agent {met.name} was restarted")
 
-    def _count(self, payload: bytes) -> None:
+    def _count_message(self, payload: bytes) -> None:
         counters = self._caller.counters
         counters.frames_received += 1
         counters.bytes_received += len(payload)
@@ -375,16 +387,16 @@ class Receiver:
 
     # ------------------------------------------------------------------ results
 
-    def outcomes(self, own_call: Own, batch: Batch) -> list[Result]:
-        """Return a trigger's results.
+    def trigger_results(self, own_trigger: OwnTrigger, batch: Batch) -> list[Result]:
+        """Return the results in the reply to an own trigger.
 
         Raises:
-            InterpretationError: a result cannot be interpreted; the error of the first one.
+            InterpretationError: results cannot be interpreted; this is the first one's error.
         """
         results: list[Result] = []
         error, latency = None, math.nan
         for run in batch.runs:
-            outcome, latency = self._outcome(own_call, run), run.latency
+            outcome, latency = self._trigger_outcome(own_trigger, run), run.latency
             if not isinstance(outcome, InterpretationError):
                 results.append(outcome)
             elif error is None:
@@ -395,19 +407,24 @@ class Receiver:
             raise error
         return results
 
-    def _outcome(self, own_call: Own, run: ResultRun) -> Result | InterpretationError:
-        """Return a trigger's result, made and counted once, though it comes in two ways."""
-        known = own_call.outcomes.get(run.number)
+    def _trigger_outcome(
+        self, own_trigger: OwnTrigger, run: ResultRun
+    ) -> Result | InterpretationError:
+        """Return a trigger's result, or its error.
+
+        A result can arrive twice: in the reply, and for all programs. It is counted once.
+        """
+        known = own_trigger.outcomes.get(run.number)
         if known is not None:
             return known
         counters = self._counters
         try:
-            if own_call.expected is not None and run.application != own_call.expected:
+            if own_trigger.expected is not None and run.application != own_trigger.expected:
                 counters.count("wrong_application")
-                raise self._wrong_application_error(run, own_call.expected)
+                raise self._wrong_application_error(run, own_trigger.expected)
             try:
                 outcome: Result | InterpretationError = self._interpret(
-                    run, own_call.interpretation
+                    run, own_trigger.interpretation
                 )
             except InterpretationError:
                 counters.count("uninterpretable")
@@ -415,28 +432,30 @@ class Receiver:
             counters.count("triggered")
         except InterpretationError as error:
             outcome = error
-        own_call.outcomes[run.number] = outcome
+        own_trigger.outcomes[run.number] = outcome
         return outcome
 
-    def _take_run(self, run: ResultRun) -> None:
-        """Pass containers that came together to listeners that came before them."""
+    def _pass_run(self, run: ResultRun) -> None:
+        """Pass results to the listeners that came before these results."""
         listeners = self._listeners
         listeners.results.horizon = run.clock
         try:
             now = asyncio.get_running_loop().time()
-            own_call = (
-                self.own_calls.get(run.call) if run.owner and run.owner == self._program else None
+            own_trigger = (
+                self.own_triggers.get(run.call)
+                if run.owner and run.owner == self._program
+                else None
             )
-            if own_call is not None:
-                self._offer(run, self._outcome(own_call, run), now, owned=True)
+            if own_trigger is not None:
+                self._offer(run, self._trigger_outcome(own_trigger, run), now, owned=True)
                 return
             expected = self._expected()
             if expected is not None and run.application != expected:
                 self._counters.count("wrong_application", len(run.payloads))
                 return
-            if listeners.only_streams_results and self._take_burst(run, now):
+            if listeners.only_streams_results and self._pass_burst(run, now):
                 return
-            for single in singles(run):
+            for single in split_run(run):
                 fate = "late" if run.flags & LATE else "streamed"
                 try:
                     outcome: Result | InterpretationError = self._interpret(
@@ -459,11 +478,11 @@ class Receiver:
         else:
             listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 
-    def _take_burst(self, run: ResultRun, now: float) -> bool:
-        """Pass containers to streams, all at once; return False if that is not possible."""
+    def _pass_burst(self, run: ResultRun, now: float) -> bool:
+        """Pass all results of a run to streams at once; return whether that was possible."""
         if run.cells or not run.flags & CURRENT:
             return False
-        done = self._interpretation().burst(
+        interpreted = self._interpretation().burst(
             run.application,
             run.payloads,
             run.endian,
@@ -471,9 +490,9 @@ class Receiver:
             number=run.number,
             at=run.received_at,
         )
-        if done is None:
+        if interpreted is None:
             return False
-        values, empty_slots = done
+        values, empty_slots = interpreted
         count, name, at, trigger = len(values), self._name, run.received_at, run.trigger_time
         latency = None if math.isnan(run.latency) else run.latency
         results = [
@@ -489,10 +508,10 @@ class Receiver:
 
     def _interpret(self, run: ResultRun, interpretation: Interpretation) -> Result:
         at = run.received_at
-        value, sequence, empty_slots = interpreted(run, interpretation, self._name, at)
+        value, sequence, empty_slots = interpret_run(run, interpretation, self._name, at)
         if empty_slots:
             self._counters.skip(empty_slots)
-        return as_result(run, self._name, value, sequence, at)
+        return to_result(run, self._name, value, sequence, at)
 
     def _wrong_application_error(self, run: ResultRun, expected: int) -> WrongApplicationError:
         return WrongApplicationError(
@@ -503,11 +522,11 @@ class Receiver:
         )
 
 
-def _things(kind: str, reply: BusMessage) -> list[Any]:
+def _decode_messages(kind: str, reply: BusMessage) -> list[Any]:
     if kind == "states":
-        return [state(blob) for blob in reply.blobs]
+        return [read_state(blob) for blob in reply.blobs]
     return decode_runs(reply.blobs[0], "results that were asked for").runs
 
 
-def _ignore(_count: int, _then: StateMessage | None) -> None:
-    """Ignore missed states: the next one has the camera's state."""
+def _ignore_missed(_count: int, _following: StateMessage | None) -> None:
+    """Ignore missed states, since each message has the whole state of the camera."""

@@ -1,4 +1,4 @@
-"""A plant's own certificate authority, in a folder, and its certificates."""
+"""Make certificates with a plant's own authority, which is in a folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 AUTHORITY = "authority"
-"""Folder of the authority's own files, whose name no certificate can have."""
+"""Name of the folder of the authority's own files; no certificate can have this name."""
 
 CA_FILE, CERT_FILE, KEY_FILE = CERTIFICATE_FILES
 
@@ -34,17 +34,18 @@ LIFETIME = timedelta(days=365)
 AUTHORITY_LIFETIME = timedelta(days=3650)
 
 RENEWAL_TIME = timedelta(days=30)
-"""Time before its end, or a third of its lifetime if less, at which a certificate is renewed."""
+"""Remaining lifetime at which a certificate is renewed; or a third of its lifetime, if that is
+less."""
 
-BEFORE = timedelta(days=1)
-"""Time before now at which certificates begin, since clocks in a plant differ."""
+START_MARGIN = timedelta(days=1)
+"""Time by which a certificate's validity begins before now, since clocks in a plant differ."""
 
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Hosts in every agent's certificate."""
 
 HOST = re.compile(r"[\w.:-]+", re.ASCII)
 
-LISTENING = frozenset({AGENT, ROUTER})
+LISTENING_ROLES = frozenset({AGENT, ROUTER})
 
 
 class MadeCertificate(NamedTuple):
@@ -76,16 +77,17 @@ def make_certificates(
 ) -> list[MadeCertificate]:
     """Make a plant's missing certificates, and renew certificates that end soon; blocks.
 
-    Each has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text on its use.
-    The authority is made the first time, in ``authority``, and never again. A renewed certificate
-    keeps its key, so that one file is replaced, in one step.
+    Each certificate has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text
+    on its use. The first call makes the authority, in ``authority``. A renewed certificate keeps
+    its key, so only one file is replaced, in one step.
 
     Args:
         folder: folder of the plant's certificates.
         wanted: names by role.
-        hosts: names and addresses of agents and routers, besides this computer's own; an agent of
-            ``wanted`` without one of them gets a new certificate.
-        lifetime: lifetime of new certificates, which ends with the authority's at the latest.
+        hosts: names and addresses of agents and routers, in addition to this computer's own. An
+            agent of ``wanted`` whose certificate lacks one of them gets a new certificate.
+        lifetime: lifetime of new certificates; they end with the authority's certificate at the
+            latest.
 
     Raises:
         ConfigurationError: a name is not valid, or is another role's; the authority is not
@@ -93,28 +95,28 @@ def make_certificates(
     """
     x509_module()
     names: dict[str, str] = {}
-    for role, several in wanted.items():
-        for name in several:
+    for role, names_of_role in wanted.items():
+        for name in names_of_role:
             if check_word(name, role) == AUTHORITY or names.setdefault(name, role) != role:
                 raise ConfigurationError(f"certificates: {name} is taken: expected another name")
     unique_hosts = [*dict.fromkeys(hosts)]
     for host in unique_hosts:
         if not HOST.fullmatch(host):
             raise ConfigurationError(f"certificates: {host!r:.80} is no name or address of a host")
-    authority = _Authority.of(folder)
-    known: dict[str, str] = {}
-    for place in sorted(folder.iterdir()):
-        if place.name != AUTHORITY and (place / CERT_FILE).is_file():
-            known[place.name] = authority.read(place).role
+    authority = _Authority.open_or_create(folder)
+    roles: dict[str, str] = {}
+    for subfolder in sorted(folder.iterdir()):
+        if subfolder.name != AUTHORITY and (subfolder / CERT_FILE).is_file():
+            roles[subfolder.name] = authority.read_role(subfolder)
     for name, role in names.items():
-        if known.setdefault(name, role) != role:
+        if roles.setdefault(name, role) != role:
             raise ConfigurationError(
-                f"certificates: {name} has the role {known[name]} already: expected another name "
+                f"certificates: {name} has the role {roles[name]} already: expected another name "
                 f"for the {role}, or delete {folder / name}"
             )
     return [
-        authority.make(role, name, unique_hosts if name in names else [], lifetime)
-        for name, role in sorted(known.items())
+        authority.make_certificate(role, name, unique_hosts if name in names else [], lifetime)
+        for name, role in sorted(roles.items())
     ]
 
 
@@ -129,77 +131,79 @@ class _Authority:
         self._folder, self._certificate, self._key = folder, certificate, key
 
     @classmethod
-    def of(cls, folder: Path) -> _Authority:
+    def open_or_create(cls, folder: Path) -> _Authority:
         """Return the authority of a folder; make one if there is none."""
         from cryptography import x509
 
-        place = folder / AUTHORITY
-        has_authority = (place / CA_FILE).exists()
-        foreign = (folder / CA_FILE).exists()
-        if foreign or (has_authority and not (place / KEY_FILE).exists()):
+        own_folder = folder / AUTHORITY
+        has_authority = (own_folder / CA_FILE).exists()
+        is_foreign = (folder / CA_FILE).exists()
+        if is_foreign or (has_authority and not (own_folder / KEY_FILE).exists()):
             raise ConfigurationError(
-                f"certificates: {(folder if foreign else place) / CA_FILE} is of an authority "
-                f"whose key is not in {place}, and it is not overwritten: expected a folder that "
-                "this command made, or an empty one"
+                f"certificates: {(folder if is_foreign else own_folder) / CA_FILE} is of an "
+                f"authority whose key is not in {own_folder}, and it is not overwritten: expected "
+                "a folder that this command made, or an empty one"
             )
         if not has_authority:
-            cls._create(place)
+            cls._create(own_folder)
         try:
-            made = x509.load_pem_x509_certificate((place / CA_FILE).read_bytes())
+            certificate = x509.load_pem_x509_certificate((own_folder / CA_FILE).read_bytes())
         except (OSError, ValueError) as exc:
             raise ConfigurationError(
-                f"certificates: {place / CA_FILE} cannot be read: {exc}"
+                f"certificates: {own_folder / CA_FILE} cannot be read: {exc}"
             ) from exc
-        return cls(folder, made, _key_in(place))
+        return cls(folder, certificate, _load_or_make_key(own_folder))
 
     @staticmethod
     def _create(place: Path) -> None:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
 
-        key = _key_in(place)
+        key = _load_or_make_key(place)
         name = _subject("smartcam plant", "")
-        made = (
+        certificate = (
             _builder(name, name, key.public_key(), datetime.now(UTC) + AUTHORITY_LIFETIME)
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-            .add_extension(_usage(signs=True), critical=True)
+            .add_extension(_key_usage(signs=True), critical=True)
             .sign(key, hashes.SHA256())
         )
-        _write(place / CA_FILE, _pem(made))
+        _write(place / CA_FILE, _pem(certificate))
 
-    def read(self, place: Path) -> Any:
-        """Return the identity in the certificate of a folder."""
+    def read_role(self, place: Path) -> str:
+        """Return the role in the certificate of a folder."""
         identity = read_identity(place)
         if identity.role not in ROLES:
             raise ConfigurationError(
                 f"certificates: {place} has one with the role {identity.role!r:.40}: expected one "
                 f"of {', '.join(ROLES)}"
             )
-        return identity
+        return identity.role
 
-    def make(self, role: str, name: str, hosts: list[str], lifetime: timedelta) -> MadeCertificate:
-        """Return the certificate of a name; it is made, or renewed, if needed."""
+    def make_certificate(
+        self, role: str, name: str, hosts: list[str], lifetime: timedelta
+    ) -> MadeCertificate:
+        """Make the certificate of a name, or renew it, if needed; return the outcome."""
         place = self._folder / name
-        old = self._old(place)
+        certificate = self._read_certificate(place)
         done = "kept"
-        if role in LISTENING:
-            had = [] if old is None else _hosts_of(old)
-            wanted = [*LOCAL_HOSTS, *(hosts or ([] if had else [socket.gethostname()]))]
-            hosts = [*dict.fromkeys([*had, *wanted])]
-            stale = bool({*hosts} - {*had})
+        if role in LISTENING_ROLES:
+            old_hosts = [] if certificate is None else _hosts_of(certificate)
+            wanted = [*LOCAL_HOSTS, *(hosts or ([] if old_hosts else [socket.gethostname()]))]
+            hosts = [*dict.fromkeys([*old_hosts, *wanted])]
+            lacks_hosts = bool({*hosts} - {*old_hosts})
         else:
-            hosts, stale = [], False
-        if old is None or stale or _ends_soon(old):
-            done = "made" if old is None else "renewed"
-            old = self._sign(role, name, hosts, lifetime, place)
-        use = _use(role, name, place, hosts)
+            hosts, lacks_hosts = [], False
+        if certificate is None or lacks_hosts or _ends_soon(certificate):
+            done = "made" if certificate is None else "renewed"
+            certificate = self._sign(role, name, hosts, lifetime, place)
+        use = _usage_text(role, name, place, hosts)
         if role == ROUTER and not (place / ROUTER_FILE).exists():
-            _write(place / ROUTER_FILE, _router(place))
+            _write(place / ROUTER_FILE, _router_config(place))
         if not (place / HOW_TO_USE).exists():
             _write(place / HOW_TO_USE, use.encode())
-        return MadeCertificate(role, name, str(place), done, old.not_valid_after_utc, use)
+        return MadeCertificate(role, name, str(place), done, certificate.not_valid_after_utc, use)
 
-    def _old(self, place: Path) -> Any:
+    def _read_certificate(self, place: Path) -> Any:
         from cryptography import x509
 
         if not (place / CERT_FILE).is_file():
@@ -221,39 +225,39 @@ class _Authority:
         from cryptography.hazmat.primitives import hashes
         from cryptography.x509.oid import ExtendedKeyUsageOID
 
-        key = _key_in(place)
+        key = _load_or_make_key(place)
         ends = min(datetime.now(UTC) + lifetime, self._certificate.not_valid_after_utc)
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
-        if role in LISTENING:  # so that no other certificate can serve as an agent's
+        if role in LISTENING_ROLES:  # other certificates cannot serve as an agent's
             uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
         identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
         subject, issuer = _subject(role, name), self._certificate.subject
         builder = (
             _builder(subject, issuer, key.public_key(), ends)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_usage(signs=False), critical=True)
+            .add_extension(_key_usage(signs=False), critical=True)
             .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
             .add_extension(identifier, critical=False)
         )
         if hosts:
-            names = x509.SubjectAlternativeName([_general(host) for host in hosts])
+            names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
             builder = builder.add_extension(names, critical=False)
-        made = builder.sign(self._key, hashes.SHA256())
+        certificate = builder.sign(self._key, hashes.SHA256())
         _write(place / CA_FILE, _pem(self._certificate))
-        _write(place / CERT_FILE, _pem(made))
-        return made
+        _write(place / CERT_FILE, _pem(certificate))
+        return certificate
 
 
-def _key_in(place: Path) -> Any:
-    """Return the key of a folder; make one if there is none."""
+def _load_or_make_key(place: Path) -> Any:
+    """Return the key in a folder; make a new key if there is none."""
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
     path = place / KEY_FILE
     if not path.is_file():
-        made = ec.generate_private_key(ec.SECP256R1())
-        _write_key(place, made)
-        return made
+        key = ec.generate_private_key(ec.SECP256R1())
+        _write_key(place, key)
+        return key
     try:
         return serialization.load_pem_private_key(path.read_bytes(), None)
     except (OSError, ValueError, TypeError) as exc:
@@ -278,13 +282,13 @@ def _builder(subject: Any, issuer: Any, key: Any, ends: datetime) -> Any:
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(datetime.now(UTC) - BEFORE)
+        .not_valid_before(datetime.now(UTC) - START_MARGIN)
         .not_valid_after(ends)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
 
 
-def _usage(*, signs: bool) -> Any:
+def _key_usage(*, signs: bool) -> Any:
     from cryptography import x509
 
     return x509.KeyUsage(
@@ -300,7 +304,7 @@ def _usage(*, signs: bool) -> Any:
     )
 
 
-def _general(host: str) -> Any:
+def _general_name(host: str) -> Any:
     from cryptography import x509
 
     with contextlib.suppress(ValueError):
@@ -320,7 +324,7 @@ def _hosts_of(certificate: Any) -> list[str]:
 
 def _ends_soon(certificate: Any) -> bool:
     ends, begins = certificate.not_valid_after_utc, certificate.not_valid_before_utc
-    lifetime = ends - begins - BEFORE
+    lifetime = ends - begins - START_MARGIN
     return bool(ends - datetime.now(UTC) <= min(RENEWAL_TIME, lifetime / 3))
 
 
@@ -340,7 +344,7 @@ def _write(path: Path, body: bytes) -> None:
 
 
 def _write_key(place: Path, key: Any) -> None:
-    """Write a new key, which only its owner may read from its first byte on."""
+    """Write a new key to a file that only its owner can ever read."""
     from cryptography.hazmat.primitives import serialization
 
     body = key.private_bytes(
@@ -361,7 +365,7 @@ def _write_key(place: Path, key: Any) -> None:
         ) from exc
 
 
-def _use(role: str, name: str, place: Path, hosts: list[str]) -> str:
+def _usage_text(role: str, name: str, place: Path, hosts: list[str]) -> str:
     """Return a text on how to use a certificate."""
     host = next((host for host in reversed(hosts) if host not in LOCAL_HOSTS), "HOST")
     if role == ROUTER:
@@ -381,14 +385,14 @@ def _use(role: str, name: str, place: Path, hosts: list[str]) -> str:
     )
 
 
-def _router(place: Path) -> bytes:
+def _router_config(place: Path) -> bytes:
     """Return a complete configuration of Zenoh's own router."""
     link = BusLink((f"tls/0.0.0.0:{DEFAULT_PORT}",), (), str(place.absolute()))
-    wanted = {"access_control": access_control()}
+    config: dict[str, Any] = {"access_control": access_control()}
     for path, value in link.settings(10.0).items():
-        inner: dict[str, Any] = wanted
-        *above, last = path.split("/")
-        for part in above:
-            inner = inner.setdefault(part, {})
-        inner[last] = value
-    return json.dumps(wanted, indent=2).encode()
+        section = config
+        *names, last = path.split("/")
+        for name in names:
+            section = section.setdefault(name, {})
+        section[last] = value
+    return json.dumps(config, indent=2).encode()

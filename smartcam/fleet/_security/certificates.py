@@ -1,4 +1,4 @@
-"""Read certificates (owner, role, end), and find out why a handshake failed."""
+"""Read certificates (owner, role, end), and find out why a TLS handshake failed."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ MAX_BYTES = 1 << 20
 """Largest number of bytes of a file with certificates or a key; each certificate has about 1 kB."""
 
 WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
-"""Times before a certificate's end at which there is a warning."""
+"""Remaining lifetimes of a certificate at which a warning is logged."""
 
 DAY = timedelta(days=1)
 
 DIAGNOSIS_TIMEOUT = 1.0
-"""Seconds of the timeout for finding out why a handshake failed."""
+"""Seconds for finding out why a handshake failed."""
 
 RENEW = "smartcam fleet certificates DIR makes a new one"
 
-VERIFY: dict[int, str] = {
+VERIFY_TEXTS: dict[int, str] = {
     9: "its certificate counts from a later time than now: look at the clocks",
     10: "its certificate has expired",
     18: "its certificate is of another authority than ca.pem",
@@ -44,9 +44,9 @@ VERIFY: dict[int, str] = {
     62: "its certificate is for other hosts than {host}; smartcam fleet certificates takes --host",
     64: "its certificate is for other hosts than {host}; smartcam fleet certificates takes --host",
 }
-"""Meanings of OpenSSL's verdicts (X509_V_ERR_...)."""
+"""Texts for OpenSSL's errors of verification (X509_V_ERR_...), by their numbers."""
 
-ALERTS: dict[str, str] = {
+REASON_TEXTS: dict[str, str] = {
     "CERTIFICATE_REQUIRED": "it wants a certificate of this program",
     "HANDSHAKE_FAILURE": "it wants a certificate of this program",
     "UNKNOWN_CA": "the certificate of this program is of an authority that it does not know",
@@ -56,7 +56,7 @@ ALERTS: dict[str, str] = {
     "WRONG_VERSION_NUMBER": "nothing there speaks TLS: is it fleet://, without +tls?",
     "RECORD_LAYER_FAILURE": "nothing there speaks TLS: is it fleet://, without +tls?",
 }
-"""Meanings of the endings of OpenSSL's reasons."""
+"""Texts for OpenSSL's reasons of other errors, by the end of the reason."""
 
 
 SILENT = "nothing there answers a TLS handshake: is it fleet://, without +tls?"
@@ -71,7 +71,7 @@ class Identity(NamedTuple):
         name: organisational unit in the certificate; empty if there is none.
         ends: end of the certificate, UTC.
         authority_ends: end of its authority's certificate, UTC.
-        digest: digest of all three files.
+        digest: digest of the contents of all three files.
     """
 
     folder: Path
@@ -86,49 +86,53 @@ class Identity(NamedTuple):
 
     @property
     def expired(self) -> str:
-        """Text that the certificate has expired; empty if it has not."""
+        """Text which says that a certificate has expired; empty if none has."""
         now = datetime.now(UTC)
-        for certificate, ends in self._endings:
+        for certificate, ends in self._certificate_ends:
             if now >= ends:
                 return f"{certificate} has expired on {_day(ends)}; {RENEW}"
         return ""
 
     @property
     def warning(self) -> str:
-        """Text that the certificate ends soon, or has expired; empty otherwise."""
-        return self.expired or ends_soon(*min(self._endings, key=lambda ending: ending[1]))
+        """Text which says that a certificate ends soon, or has expired; empty otherwise."""
+        return self.expired or ends_soon(*min(self._certificate_ends, key=lambda ending: ending[1]))
 
     @property
     def urgency(self) -> int:
         """Number of past warning times; one more when the certificate has expired."""
-        return sum(self._left <= limit for limit in (*WARN_BEFORE, timedelta()))
+        return sum(self._time_left <= limit for limit in (*WARN_BEFORE, timedelta()))
 
     @property
-    def look_after(self) -> float:
-        """Seconds until the next warning, at most a day, since it may be renewed by then."""
-        times = [self._left - limit for limit in (*WARN_BEFORE, timedelta()) if self._left > limit]
+    def next_check_delay(self) -> float:
+        """Seconds until the next warning may be due; at most a day, as the files may be renewed."""
+        times = [
+            self._time_left - limit
+            for limit in (*WARN_BEFORE, timedelta())
+            if self._time_left > limit
+        ]
         return min([DAY, *times]).total_seconds() + 0.1
 
     @property
-    def _left(self) -> timedelta:
+    def _time_left(self) -> timedelta:
         return min(self.ends, self.authority_ends) - datetime.now(UTC)
 
     @property
-    def _endings(self) -> tuple[tuple[str, datetime], ...]:
+    def _certificate_ends(self) -> tuple[tuple[str, datetime], ...]:
         own_text = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
         authority_text = f"that of its authority ({self.folder / CERTIFICATE_FILES[0]})"
         return (own_text, self.ends), (authority_text, self.authority_ends)
 
 
 def ends_soon(certificate: str, ends: datetime | None) -> str:
-    """Return a text that a certificate ends soon; empty if it does not."""
-    if ends is None or (left := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
+    """Return a text which says that a certificate ends soon; empty if it does not."""
+    if ends is None or (remaining := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
         return ""
-    return f"{certificate} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
+    return f"{certificate} ends on {_day(ends)}, in {_span(remaining)}; {RENEW}"
 
 
 def may_command(role: str) -> bool:
-    """Return True if a role may command; a role that is not smartcam's counts as allowed."""
+    """Return True for operators, and for roles that are not smartcam's."""
     return role not in ROLES or role == OPERATOR
 
 
@@ -136,8 +140,12 @@ def _day(when: datetime) -> str:
     return f"{when:%Y-%m-%d %H:%M} UTC"
 
 
-def _span(left: timedelta) -> str:
-    return f"{left.days} days" if left.days > 1 else f"{left.total_seconds() / 3600:.2g} hours"
+def _span(remaining: timedelta) -> str:
+    return (
+        f"{remaining.days} days"
+        if remaining.days > 1
+        else f"{remaining.total_seconds() / 3600:.2g} hours"
+    )
 
 
 def x509_module() -> Any:
@@ -174,7 +182,7 @@ def read_identity(folder: Path) -> Identity:
     except ValueError as exc:
         raise ConfigurationError(f"certificates: {folder}: no certificate: {exc}") from exc
     try:  # check that certificate and key belong together
-        context(folder)
+        tls_context(folder)
     except (ssl.SSLError, OSError) as exc:
         raise ConfigurationError(
             f"certificates: {folder}: cert.pem and key.pem do not go together: {exc}"
@@ -182,30 +190,30 @@ def read_identity(folder: Path) -> Identity:
     oid = x509.NameOID
     return Identity(
         folder,
-        _named(certificate, oid.COMMON_NAME),
-        _named(certificate, oid.ORGANIZATIONAL_UNIT_NAME),
+        _subject_attribute(certificate, oid.COMMON_NAME),
+        _subject_attribute(certificate, oid.ORGANIZATIONAL_UNIT_NAME),
         certificate.not_valid_after_utc,
         max(authority.not_valid_after_utc for authority in authorities),
         hashlib.sha256(b"\0".join(bodies)).digest(),
     )
 
 
-def _named(certificate: x509.Certificate, oid: Any) -> str:
+def _subject_attribute(certificate: x509.Certificate, oid: Any) -> str:
     attributes = certificate.subject.get_attributes_for_oid(oid)
     return str(attributes[0].value) if attributes else ""
 
 
-def context(folder: Path) -> ssl.SSLContext:
+def tls_context(folder: Path) -> ssl.SSLContext:
     """Return the TLS context for a handshake with the certificates of a folder; blocks.
 
     Raises:
         ssl.SSLError: the files are not certificates.
     """
     ca, cert, key = (folder / name for name in CERTIFICATE_FILES)
-    made = ssl.create_default_context(cafile=str(ca))
-    made.verify_flags &= ~ssl.VERIFY_X509_STRICT  # the engine is not stricter
-    made.load_cert_chain(cert, key, password="")  # otherwise a password is asked for
-    return made
+    context = ssl.create_default_context(cafile=str(ca))
+    context.verify_flags &= ~ssl.VERIFY_X509_STRICT  # the engine is not stricter
+    context.load_cert_chain(cert, key, password="")  # without a password, OpenSSL would ask for one
+    return context
 
 
 class Handshake(NamedTuple):
@@ -223,14 +231,14 @@ class Handshake(NamedTuple):
 async def shake_hands(
     host: str, port: int, folder: Path, within: float = DIAGNOSIS_TIMEOUT
 ) -> Handshake:
-    """Try a handshake, and return its outcome ``within`` seconds."""
+    """Try a handshake for at most ``within`` seconds, and return its outcome."""
     loop = asyncio.get_running_loop()
     writer: asyncio.StreamWriter | None = None
     ends: datetime | None = None
     try:
         async with asyncio.timeout(within):
-            made = await loop.run_in_executor(None, context, folder)
-            reader, writer = await asyncio.open_connection(host, port, ssl=made)
+            context = await loop.run_in_executor(None, tls_context, folder)
+            reader, writer = await asyncio.open_connection(host, port, ssl=context)
             peer: Any = writer.get_extra_info("peercert") or {}
             if "notAfter" in peer:
                 ends = datetime.fromtimestamp(ssl.cert_time_to_seconds(peer["notAfter"]), UTC)
@@ -238,12 +246,14 @@ async def shake_hands(
     except TimeoutError:  # an endpoint that waits for data has accepted it
         return Handshake(SILENT if writer is None else "", ends)
     except ssl.SSLCertVerificationError as exc:
-        why = VERIFY.get(exc.verify_code, f"its certificate is not good: {exc.verify_message}")
+        why = VERIFY_TEXTS.get(
+            exc.verify_code, f"its certificate is not good: {exc.verify_message}"
+        )
         return Handshake(why.format(host=host), ends)
     except ssl.SSLError as exc:
         reason = exc.reason or str(exc)
-        known = (text for end, text in ALERTS.items() if reason.endswith(end))
-        return Handshake(next(known, f"TLS: {reason}"), ends)
+        texts = (text for end, text in REASON_TEXTS.items() if reason.endswith(end))
+        return Handshake(next(texts, f"TLS: {reason}"), ends)
     except OSError as exc:
         return Handshake(os.strerror(exc.errno) if exc.errno else str(exc), ends)
     finally:

@@ -1,11 +1,12 @@
 """Filter connections to an agent's port, since the engine accepts every connection.
 
-The engine has no bounds: a silent connection stays for 10 s, and after each failed handshake no
-connection is accepted for 0.1 s. So the system drops requests for a further connection, by a filter
-on the listening socket:
+The engine has no bounds: a silent connection stays for 10 s, and after each failed handshake the
+engine accepts no connection for 0.1 s. So a filter on the listening socket makes the system drop
+requests for a further connection:
 
 - from an address that has many half-open connections, whose handshake has not ended;
-- from all addresses while few file descriptors are left, which cameras and health need.
+- from all addresses while few file descriptors are left, since cameras and the health page need
+  them.
 
 Existing connections are not affected; TCP repeats a dropped request by itself. The filter cannot
 look at contents, since connections inherit it from the listening socket.
@@ -33,46 +34,47 @@ if TYPE_CHECKING:
 if sys.platform != "win32":
     import resource
 
-Place = tuple[str, int]
+HostPort = tuple[str, int]
 """An address and a port."""
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-LOOK_EVERY, LOOK_EVERY_IF_CALM = 0.01, 0.05
-"""Seconds between two checks of the free descriptors, and the same if there are hardly fewer than
-at the last check. A new connection causes a check at once."""
+DESCRIPTOR_CHECK_INTERVAL, CALM_CHECK_INTERVAL = 0.01, 0.05
+"""Seconds between two checks of the free descriptors: in general, and if hardly more were in use
+than at the check before."""
 
 CHECK_INTERVAL = 0.25
-"""Seconds between two checks of connections while some are half-open and no other comes."""
+"""Seconds between two checks of connections while some are half-open. A new connection causes a
+check at once."""
 
 CHECK_PAUSE_FACTOR = 4.0
-"""Pause after a check of connections, in multiples of its duration: it reads every descriptor, and
-an agent may have thousands of cameras."""
+"""Pause after a check of connections, in multiples of its duration. A check reads every descriptor,
+and an agent may have thousands of cameras."""
 
 MAX_CALM_GROWTH = 8
 """Largest growth of used descriptors since the last check that counts as calm."""
 
-CHECK_AFTER = 50
-"""Number of checks between two searches for the engine's sockets, which change with renewed
-certificates."""
+CHECKS_PER_SEARCH = 50
+"""Number of checks after which the engine's listening sockets are checked, too. Renewed
+certificates change them."""
 
 RESERVED_DESCRIPTORS: Final = 256
-"""Descriptors that the port leaves to cameras and health; at most a quarter of all."""
+"""Number of descriptors that the port leaves to cameras and health; at most a quarter of all."""
 
 MAX_HALF_OPEN_CONNECTIONS: Final = 16
-"""Largest number of half-open connections of one address, which gets no further one then."""
+"""Number of half-open connections of an address from which on it gets no further connection."""
 
 RESUMING_HALF_OPEN: Final = 4
-"""Number of half-open connections at which an address gets a further one again."""
+"""Number of half-open connections at which a blocked address gets connections again."""
 
 MAX_BLOCKED_ADDRESSES: Final = 256
-"""Largest number of addresses in a filter, those with most connections."""
+"""Largest number of blocked addresses: those with the most half-open connections."""
 
 BACKLOG: Final = 64
-"""Connections that the system keeps for the engine; these are accepted even if it is shut."""
+"""Number of connections that the system keeps for the engine. The filter cannot drop these."""
 
-MAX_WANTED: Final = 65_536
-"""Number of descriptors that an agent requests from the system, if it may."""
+MAX_DESCRIPTORS: Final = 65_536
+"""Number of descriptors that an agent requests from the system, as far as that is allowed."""
 
 ATTACH_FILTER, DETACH_FILTER = 26, 27
 """Linux' SO_ATTACH_FILTER and SO_DETACH_FILTER."""
@@ -81,7 +83,7 @@ LOAD_WORD, LOAD_BYTE, SHIFT_RIGHT, IF_EQUAL, RETURN = 0x20, 0x30, 0x74, 0x15, 0x
 """Instructions of the classic packet filter."""
 
 IP_HEADER: Final = 0xFFF00000
-"""The offset of a packet's IP header."""
+"""Offset in filters that stands for the start of a packet's IP header."""
 
 
 class _Instruction(NamedTuple):
@@ -90,26 +92,27 @@ class _Instruction(NamedTuple):
     Attributes:
         code: operation of the instruction.
         value: operand of the instruction.
-        yes, no: numbers of instructions to skip if a condition is true, and if it is false.
+        if_true, if_false: numbers of instructions to skip if a condition is true, and if it is
+            false.
     """
 
     code: int
     value: int = 0
-    yes: int = 0
-    no: int = 0
+    if_true: int = 0
+    if_false: int = 0
 
 
 _DROP, _PASS = _Instruction(RETURN, 0), _Instruction(RETURN, 0xFFFFFFFF)
 
 
-def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
+def packet_filter(*, refuse_all: bool, blocked: Iterable[str]) -> list[_Instruction]:
     """Return the filter of a listening socket.
 
     Args:
-        shut: whether all connections are refused.
+        refuse_all: whether all connections are refused.
         blocked: addresses whose connections are refused.
     """
-    if shut:
+    if refuse_all:
         return [_DROP]
     steps: list[_Instruction] = []
     for host in blocked:
@@ -121,10 +124,10 @@ def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
             _Instruction(IF_EQUAL, address.version, 0, 2 * words + 1),
         ]
         for number, (word,) in enumerate(struct.iter_unpack("!I", address.packed)):
-            left = words - number - 1
+            remaining = words - number - 1
             steps += [
                 _Instruction(LOAD_WORD, IP_HEADER + offset + 4 * number),
-                _Instruction(IF_EQUAL, word, 0, 2 * left + 1),
+                _Instruction(IF_EQUAL, word, 0, 2 * remaining + 1),
             ]
         steps.append(_DROP)
     return [*steps, _PASS]
@@ -135,13 +138,13 @@ def raise_descriptor_limit() -> None:
     if sys.platform == "win32":
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = MAX_WANTED if hard == resource.RLIM_INFINITY else min(MAX_WANTED, hard)
+    wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(MAX_DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         with contextlib.suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-class Door:
+class ConnectionFilter:
     """Filters connections to the ports of this process' engine; only on Linux.
 
     Args:
@@ -150,28 +153,28 @@ class Door:
             40123)``; None if they are not known.
 
     Attributes:
-        shut: whether all connections are refused.
+        refuses_all: whether all connections are refused.
         blocked: addresses that get no further connections.
     """
 
     def __init__(
-        self, ports: frozenset[int], links: Callable[[], set[Place] | None] = lambda: None
+        self, ports: frozenset[int], links: Callable[[], set[HostPort] | None] = lambda: None
     ) -> None:
         self._ports, self._links = ports, links
-        self.shut = False
+        self.refuses_all = False
         self.blocked: frozenset[str] = frozenset()
         self._listeners: list[int] = []  # descriptors, which may have been reused meanwhile
         self._timer: asyncio.TimerHandle | None = None
-        self._looks = self._lowest = 0
-        self._coming: asyncio.TimerHandle | None = None
-        self._rested = 0.0
-        self._knocks: select.epoll | None = None
+        self._check_count = self._last_lowest = 0
+        self._check_timer: asyncio.TimerHandle | None = None
+        self._next_check_at = 0.0
+        self._connection_epoll: select.epoll | None = None
 
     def open(self) -> None:
         """Start to check."""
         if sys.platform == "linux" and self._ports:
-            self._find_again()
-            self._look()
+            self._renew_listeners()
+            self._check_descriptors()
 
     def close(self) -> None:
         """Stop checking, and remove the filter. Idempotent."""
@@ -179,125 +182,125 @@ class Door:
             return
         self._timer.cancel()
         self._timer = None
-        self._expect_look(None)
-        self._forget_knocks()
-        if self.shut or self.blocked:
-            self.shut, self.blocked = False, frozenset()
-            self._set()
+        self._schedule_check(None)
+        self._stop_watching()
+        if self.refuses_all or self.blocked:
+            self.refuses_all, self.blocked = False, frozenset()
+            self._set_filters()
 
-    def _look(self) -> None:
+    def _check_descriptors(self) -> None:
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        lowest, before = _lowest_free(most), self._lowest
-        self._lowest = lowest
-        calm = not self.shut and lowest <= before + MAX_CALM_GROWTH
-        delay = LOOK_EVERY_IF_CALM if calm else LOOK_EVERY
-        self._timer = asyncio.get_running_loop().call_later(delay, self._look)
-        self._looks += 1
-        if self._looks % CHECK_AFTER == 0 and not self._all_ours():
-            self._find_again()  # the engine has opened new sockets
+        lowest, previous = _lowest_free(most), self._last_lowest
+        self._last_lowest = lowest
+        is_calm = not self.refuses_all and lowest <= previous + MAX_CALM_GROWTH
+        delay = CALM_CHECK_INTERVAL if is_calm else DESCRIPTOR_CHECK_INTERVAL
+        self._timer = asyncio.get_running_loop().call_later(delay, self._check_descriptors)
+        self._check_count += 1
+        if self._check_count % CHECKS_PER_SEARCH == 0 and not self._are_listeners_unchanged():
+            self._renew_listeners()  # the engine has opened new sockets
         if most == resource.RLIM_INFINITY:
             return
-        left = most - lowest
+        free_count = most - lowest
         reserve = min(RESERVED_DESCRIPTORS, most // 4)
-        if not self.shut and left <= reserve:
-            self.shut = True
-            self._set()
+        if not self.refuses_all and free_count <= reserve:
+            self.refuses_all = True
+            self._set_filters()
             logger.warning(
                 "! the port of the fleet accepts no connection: %d file descriptors are left, %d "
                 "of them for cameras and health",
-                left,
+                free_count,
                 reserve,
             )
-        elif self.shut and left > reserve + reserve // 4:
-            self.shut = False
-            self._set()
+        elif self.refuses_all and free_count > reserve + reserve // 4:
+            self.refuses_all = False
+            self._set_filters()
             logger.warning("= the port of the fleet accepts connections again")
 
     # ------------------------------------------------------------------ connections
 
     def _watch_connections(self) -> None:
-        """Check at each new connection, which the engine accepts in its own threads."""
-        self._forget_knocks()
-        self._knocks = select.epoll()
+        """Call :meth:`_on_connection` at each new connection; the engine's threads accept it."""
+        self._stop_watching()
+        self._connection_epoll = select.epoll()
         for number in self._listeners:
             with contextlib.suppress(OSError):  # the descriptor was reused, or closed
-                self._knocks.register(number, select.EPOLLIN | select.EPOLLET)
-        asyncio.get_running_loop().add_reader(self._knocks.fileno(), self._on_knock)
+                self._connection_epoll.register(number, select.EPOLLIN | select.EPOLLET)
+        asyncio.get_running_loop().add_reader(self._connection_epoll.fileno(), self._on_connection)
 
-    def _forget_knocks(self) -> None:
-        knocks, self._knocks = self._knocks, None
-        if knocks is not None:
-            asyncio.get_running_loop().remove_reader(knocks.fileno())
-            knocks.close()
+    def _stop_watching(self) -> None:
+        epoll, self._connection_epoll = self._connection_epoll, None
+        if epoll is not None:
+            asyncio.get_running_loop().remove_reader(epoll.fileno())
+            epoll.close()
 
-    def _on_knock(self) -> None:
-        if self._knocks is not None:
-            self._knocks.poll(0)
-        self._expect_look(max(0.0, self._rested - asyncio.get_running_loop().time()))
+    def _on_connection(self) -> None:
+        if self._connection_epoll is not None:
+            self._connection_epoll.poll(0)
+        self._schedule_check(max(0.0, self._next_check_at - asyncio.get_running_loop().time()))
 
-    def _expect_look(self, delay: float | None) -> None:
-        """Check the port in ``delay`` seconds, or not at all; this replaces an earlier plan."""
-        if self._coming is not None:
-            self._coming.cancel()
-            self._coming = None
+    def _schedule_check(self, delay: float | None) -> None:
+        """Check for half-open connections in ``delay`` seconds; None: cancel the planned check."""
+        if self._check_timer is not None:
+            self._check_timer.cancel()
+            self._check_timer = None
         if delay is not None:
             loop = asyncio.get_running_loop()
-            self._coming = loop.call_later(delay, self._look_who_comes)
+            self._check_timer = loop.call_later(delay, self._check_half_open)
 
-    def _look_who_comes(self) -> None:
+    def _check_half_open(self) -> None:
         """Block addresses that have too many half-open connections."""
         loop, links = asyncio.get_running_loop(), self._links()
-        self._expect_look(None)
+        self._schedule_check(None)
         if links is None:
             return
-        begun = loop.time()
-        coming = collections.Counter(host for host, _ in self._connected() - links)
-        self._rested = loop.time() + CHECK_PAUSE_FACTOR * (loop.time() - begun)
-        if coming:
-            self._expect_look(CHECK_INTERVAL)
-        many = [
+        started_at = loop.time()
+        half_open = collections.Counter(host for host, _ in self._peer_addresses() - links)
+        self._next_check_at = loop.time() + CHECK_PAUSE_FACTOR * (loop.time() - started_at)
+        if half_open:
+            self._schedule_check(CHECK_INTERVAL)
+        blocked = [
             host
-            for host, count in coming.most_common(MAX_BLOCKED_ADDRESSES)
+            for host, count in half_open.most_common(MAX_BLOCKED_ADDRESSES)
             if count >= MAX_HALF_OPEN_CONNECTIONS
             or (host in self.blocked and count > RESUMING_HALF_OPEN)
         ]
-        if self.blocked == {*many}:
+        if self.blocked == {*blocked}:
             return
-        for host in sorted({*many} - self.blocked):
+        for host in sorted({*blocked} - self.blocked):
             logger.warning(
                 "! the port of the fleet accepts no further connection from %s: %d from there are "
                 "half-open",
                 host,
-                coming[host],
+                half_open[host],
             )
-        self.blocked = frozenset(many)
-        self._set()
+        self.blocked = frozenset(blocked)
+        self._set_filters()
 
-    def _connected(self) -> set[Place]:
+    def _peer_addresses(self) -> set[HostPort]:
         """Return the other ends of all connections of the ports."""
-        ends: set[Place] = set()
+        ends: set[HostPort] = set()
         for sock in _sockets():
             with contextlib.suppress(OSError, IndexError):  # not a connection, or ended
-                if sock.getsockname()[1] in self._ports and not _listens(sock):
+                if sock.getsockname()[1] in self._ports and not _is_listening(sock):
                     host, port, *_ = sock.getpeername()
                     ends.add((plain_host(host), port))
         return ends
 
     # ------------------------------------------------------------------ filters
 
-    def _set(self) -> None:
-        done = [self._filter(number) for number in self._listeners]
-        if not all(done):
-            self._find_again()
+    def _set_filters(self) -> None:
+        results = [self._set_filter(number) for number in self._listeners]
+        if not all(results):
+            self._renew_listeners()
 
-    def _find_again(self) -> None:
+    def _renew_listeners(self) -> None:
         with contextlib.suppress(OSError):  # no descriptor is left for the search
-            self._listeners = self._find()
+            self._listeners = self._find_listeners()
             self._watch_connections()
         for number in self._listeners:
-            self._filter(number)
+            self._set_filter(number)
 
-    def _all_ours(self) -> bool:
+    def _are_listeners_unchanged(self) -> bool:
         """Return True if all listening sockets are still the same."""
         for number in self._listeners:
             try:
@@ -305,27 +308,27 @@ class Door:
             except OSError:
                 return False
             try:
-                if not self._is_ours(listener):
+                if not self._is_engine_listener(listener):
                     return False
             finally:
                 listener.detach()
         return bool(self._listeners)
 
-    def _filter(self, number: int) -> bool:
+    def _set_filter(self, number: int) -> bool:
         """Set the filter of one listening socket; return False if it is not the engine's."""
         try:
             listener = socket.socket(fileno=number)
         except OSError:
             return False
         try:
-            if not self._is_ours(listener):
+            if not self._is_engine_listener(listener):
                 return False
-            steps = packet_filter(shut=self.shut, blocked=sorted(self.blocked))
+            steps = packet_filter(refuse_all=self.refuses_all, blocked=sorted(self.blocked))
             if steps == [_PASS]:
                 with contextlib.suppress(FileNotFoundError):  # the socket has no filter
                     listener.setsockopt(socket.SOL_SOCKET, DETACH_FILTER, 0)
             else:
-                attach(listener, steps)
+                set_filter(listener, steps)
         except OSError:
             return False
         else:
@@ -333,28 +336,28 @@ class Door:
         finally:
             listener.detach()
 
-    def _find(self) -> list[int]:
+    def _find_listeners(self) -> list[int]:
         """Return the descriptors of the engine's listening sockets."""
         numbers: list[int] = []
         for sock in _sockets():
             with contextlib.suppress(OSError):
-                if self._is_ours(sock):
+                if self._is_engine_listener(sock):
                     sock.listen(BACKLOG)
                     numbers.append(sock.fileno())
         return numbers
 
-    def _is_ours(self, sock: socket.socket) -> bool:
-        return _listens(sock) and sock.getsockname()[1] in self._ports
+    def _is_engine_listener(self, sock: socket.socket) -> bool:
+        return _is_listening(sock) and sock.getsockname()[1] in self._ports
 
 
-def attach(sock: socket.socket, steps: list[_Instruction]) -> None:
+def set_filter(sock: socket.socket, steps: list[_Instruction]) -> None:
     """Set the filter of a socket in the system.
 
     Raises:
         OSError: the system refuses the filter.
     """
     packed = b"".join(
-        struct.pack("HBBI", step.code, step.yes, step.no, step.value) for step in steps
+        struct.pack("HBBI", step.code, step.if_true, step.if_false, step.value) for step in steps
     )
     program_buffer = ctypes.create_string_buffer(packed, len(packed))
     program = struct.pack("HP", len(steps), ctypes.addressof(program_buffer))
@@ -362,12 +365,12 @@ def attach(sock: socket.socket, steps: list[_Instruction]) -> None:
 
 
 def plain_host(text: str) -> str:
-    """Return an address for comparisons: without a scope, IPv4 within IPv6 as IPv4."""
+    """Return an address for comparisons: without a scope, and an IPv4-mapped one as IPv4."""
     address = ipaddress.ip_address(text.strip("[]").partition("%")[0])
     return str(getattr(address, "ipv4_mapped", None) or address)
 
 
-def _listens(sock: socket.socket) -> bool:
+def _is_listening(sock: socket.socket) -> bool:
     internet = sock.family in {socket.AF_INET, socket.AF_INET6}
     return internet and bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
 
@@ -386,7 +389,7 @@ def _sockets() -> Iterator[socket.socket]:
 
 
 def _lowest_free(most: int) -> int:
-    """Return the lowest free descriptor: all below are in use."""
+    """Return the lowest free descriptor; ``most`` if none is free."""
     try:
         number = os.dup(0)
     except OSError as exc:

@@ -1,4 +1,4 @@
-"""Use renewed certificates in a running agent."""
+"""Use renewed certificates in an agent without a restart."""
 
 from __future__ import annotations
 
@@ -21,27 +21,28 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 CHECK_INTERVAL = 10.0
 """Seconds between two checks of the files."""
 
-MAX_WAIT = 600.0
-"""Largest number of seconds to wait for a moment without a command, since a renewal can wait."""
+MAX_BUSY_WAIT = 600.0
+"""Largest number of seconds to wait for a moment in which no command runs."""
 
-LOOK_AGAIN = 0.05
+BUSY_CHECK_INTERVAL = 0.05
 
 REOPEN_TIMEOUT = 10.0
 
-RETRY_AFTER = 1.0
+RETRY_DELAY = 1.0
 
 
 class CertificateWatch:
     """Opens an agent's end of the bus again when its certificates have changed.
 
-    Ends that only connect need nothing: the engine reads the files at each connection. An end that
-    listens reads them only at its start.
+    This is only needed for an end that listens: the engine reads its files only at the start. For
+        an
+    end that only connects, the engine reads the files at each connection.
 
     Args:
         end: the agent's end of the bus, open.
         listens: whether the end listens.
         busy: function that returns whether a command runs.
-        away: context around a new session: on entry everything that cannot stay is closed.
+        without_nodes: context for the time of opening again; it closes the nodes of ROS.
     """
 
     def __init__(
@@ -50,54 +51,59 @@ class CertificateWatch:
         *,
         listens: bool,
         busy: Callable[[], bool],
-        away: Callable[[], AbstractAsyncContextManager[None]] = contextlib.nullcontext,
+        without_nodes: Callable[[], AbstractAsyncContextManager[None]] = contextlib.nullcontext,
     ) -> None:
-        self._end, self._listens, self._busy, self._away = end, listens, busy, away
-        self._trouble = ""
+        self._end, self._listens, self._busy, self._without_nodes = (
+            end,
+            listens,
+            busy,
+            without_nodes,
+        )
+        self._logged_error = ""
 
     async def run(self) -> None:
         """Check the files periodically, forever."""
-        seen = self._end.identity
+        identity = self._end.identity
         while True:
             await asyncio.sleep(CHECK_INTERVAL)
             try:
-                seen = await self._follow(seen)
+                identity = await self._use_renewed(identity)
             except Exception:
                 logger.exception("certificates ! looking at them failed; it is tried again")
 
-    async def _follow(self, seen: Identity | None) -> Identity | None:
-        """Use the current certificates; return their identity."""
-        identity = await self._look()
-        if identity is not None and seen is not None and identity.digest != seen.digest:
+    async def _use_renewed(self, known: Identity | None) -> Identity | None:
+        """Use the certificates if they differ from the known ones; return their identity."""
+        identity = await self._check_files()
+        if identity is not None and known is not None and identity.digest != known.digest:
             if self._listens:
                 await self._reopen()
             text = "certificates ! those of %s were renewed: until %s"
             logger.info(text, identity, identity.ends)
-        return identity or seen
+        return identity or known
 
-    async def _look(self) -> Identity | None:
-        """Return the identity in the certificates; None, logged once, if they are not valid."""
+    async def _check_files(self) -> Identity | None:
+        """Return the identity in the files; None if they are not valid, which is logged once."""
         try:
-            identity = await self._end.look_at_certificates()
+            identity = await self._end.check_certificates()
         except SmartCamError as exc:
-            if str(exc) != self._trouble:
+            if str(exc) != self._logged_error:
                 logger.error("certificates ! not taken; all goes on as it was: %s", exc)  # noqa: TRY400 - the text says it
-            self._trouble = str(exc)
+            self._logged_error = str(exc)
             return None
-        self._trouble = ""
+        self._logged_error = ""
         return identity
 
     async def _reopen(self) -> None:
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(MAX_WAIT):
-                while self._busy():  # noqa: ASYNC110 - many things end it
-                    await asyncio.sleep(LOOK_AGAIN)
-        async with self._away():
+            async with asyncio.timeout(MAX_BUSY_WAIT):
+                while self._busy():  # noqa: ASYNC110 - there is no event for it
+                    await asyncio.sleep(BUSY_CHECK_INTERVAL)
+        async with self._without_nodes():
             while True:
                 try:
                     await self._end.reopen(REOPEN_TIMEOUT)
                 except ConnectFailedError as exc:
                     logger.error("certificates ! %s; it is tried again", exc)  # noqa: TRY400
-                    await asyncio.sleep(RETRY_AFTER)
+                    await asyncio.sleep(RETRY_DELAY)
                 else:
                     return

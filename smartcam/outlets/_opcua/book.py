@@ -1,4 +1,4 @@
-"""The last results of all cameras, which clients may request."""
+"""Keep the last results of all cameras, which clients may request."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ MAX_BOOK_CHARACTERS = 1 << 28
 """Largest total length of the values, as JSON, of all results that a server keeps, characters."""
 
 MAX_HANDLES = 10_000
-"""Largest number of handles that clients have not released; beyond it the oldest are removed."""
+"""Largest number of handles that clients have not released; the oldest beyond it are removed."""
 
 
 class KeptResult(NamedTuple):
-    """A result that is kept.
+    """A result that clients may request.
 
     Attributes:
         result: the result.
-        structure: result as the nodeset's structure.
-        recipe: name of its recipe.
+        structure: the result as the nodeset's structure.
+        recipe: name of the result's recipe.
         values_json: values of the result as JSON; "" without values.
     """
 
@@ -37,37 +37,39 @@ class ResultBook:
     """The last results, by their ids, and the handles that clients have on them.
 
     Args:
-        most: largest number of results; beyond it the oldest are removed.
+        max_results: largest number of results; the oldest beyond it are removed.
     """
 
-    def __init__(self, most: int) -> None:
-        self._most, self._characters = most, 0
+    def __init__(self, max_results: int) -> None:
+        self._max_results, self._characters = max_results, 0
         self._results: collections.OrderedDict[str, KeptResult] = collections.OrderedDict()
         self._handles: collections.OrderedDict[int, None] = collections.OrderedDict()
         self._last_handle = 0
 
     def add(self, kept: KeptResult) -> None:
         """Add a result; an earlier one with the same id is replaced."""
-        before = self._results.pop(kept.result.id, None)
+        replaced = self._results.pop(kept.result.id, None)
         self._characters += len(kept.values_json) - (
-            0 if before is None else len(before.values_json)
+            0 if replaced is None else len(replaced.values_json)
         )
         self._results[kept.result.id] = kept
-        while len(self._results) > self._most or (
+        while len(self._results) > self._max_results or (
             self._characters > MAX_BOOK_CHARACTERS and len(self._results) > 1
         ):
-            _, gone = self._results.popitem(last=False)
-            self._characters -= len(gone.values_json)
+            _, oldest = self._results.popitem(last=False)
+            self._characters -= len(oldest.values_json)
 
     def get(self, key: str, camera: str) -> KeptResult | None:
         """Return a camera's result by its id; None if it is unknown, or no longer kept."""
         kept = self._results.get(key)
         return kept if kept is not None and kept.result.camera == camera else None
 
-    def newest(self, camera: str, fits: Callable[[KeptResult], bool]) -> Iterator[KeptResult]:
-        """Yield a camera's results that fit, the newest first."""
+    def find_results(
+        self, camera: str, matches: Callable[[KeptResult], bool]
+    ) -> Iterator[KeptResult]:
+        """Yield a camera's results for which ``matches`` is true, the newest first."""
         for kept in reversed(self._results.values()):
-            if kept.result.camera == camera and fits(kept):
+            if kept.result.camera == camera and matches(kept):
                 yield kept
 
     def new_handle(self, timeout: int) -> int:

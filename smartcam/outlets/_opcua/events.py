@@ -1,4 +1,4 @@
-"""Events of the nodeset, each field with its own type."""
+"""Raise events of the nodeset, with the right type for each field."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SEVERITIES: Mapping[str, int] = {
     "VisionPersistentErrorConditionType": 800,
     "VisionDiagnosticInfoEventType": 500,
 }
-"""Severities of events, 1 to 1000; all others have 100."""
+"""Severities of events, 1 to 1000; other events have 100."""
 
 _TYPES: Mapping[str, ua.VariantType] = {
     "BlockReaction": ua.VariantType.Boolean,
@@ -41,7 +41,7 @@ _TYPES: Mapping[str, ua.VariantType] = {
     "ResultState": ua.VariantType.Int32,
     "StopReaction": ua.VariantType.Boolean,
 }
-"""Types of fields that asyncua takes for null, since their data types are abstract or derived."""
+"""Types of fields whose data types are abstract or derived; asyncua would send null for them."""
 
 _NODE_IDS = ("FromState/Id", "ToState/Id", "Transition/Id", "NodeId")
 
@@ -64,11 +64,11 @@ class Events:
         """Raise an event.
 
         Args:
-            kind: name of its type.
+            kind: name of the event's type.
             source: node of the camera.
             name: name of the camera.
             message: text of the event.
-            fields: other fields of the event; missing ones stay null.
+            fields: other fields of the event; missing fields stay null.
 
         Raises:
             KeyError: the event's type has no such field.
@@ -103,17 +103,17 @@ class Events:
             known = await events.get_event_obj_from_type_node(node)
             if "EnabledState" in known.data_types:
                 known.add_property("NodeId", None, ua.VariantType.NodeId)
-            for field, of in known.data_types.items():
-                known.data_types[field] = _type_of(field, of)
+            for field, data_type in known.data_types.items():
+                known.data_types[field] = _variant_type(field, data_type)
             self._templates[kind] = known
         return known
 
 
-def _type_of(field: str, data_type: Any) -> ua.VariantType:
+def _variant_type(field: str, data_type: Any) -> ua.VariantType:
     if field in _NODE_IDS:
         return ua.VariantType.NodeId
     if field in _TYPES:
         return _TYPES[field]
-    if isinstance(data_type, ua.NodeId):  # type of a time
+    if isinstance(data_type, ua.NodeId):  # only times have a node id here
         return ua.VariantType.DateTime
     return ua.VariantType(data_type)

@@ -1,4 +1,4 @@
-"""Pictures of results, which clients read from temporary files."""
+"""Serve pictures of results, which clients read as temporary files."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.nodes import CameraNodes
 
 MAX_FILES = 32
-"""Largest number of files that are open at a time; a client that wants another one is refused."""
+"""Largest number of files that are open at the same time; further ones are refused."""
 
 MAX_FILE_BYTES = 1 << 26
-"""Largest number of bytes of a picture; a larger one is not transferred."""
+"""Largest number of bytes of a picture; larger pictures are not transferred."""
 
 MAX_READ_BYTES = 1 << 20
 """Largest number of bytes of one answer to ``Read``."""
 
-FILE_SECONDS = 60.0
-"""Seconds from a client's last call until its file is closed."""
+FILE_TIMEOUT = 60.0
+"""Seconds after a client's last call at which its file is closed."""
 
 _TRANSFER = "ResultManagement.ResultTransfer"
 
@@ -48,7 +48,7 @@ class TransferFiles:
         self._server, self._own_index = server, own_index
         self._files: dict[int, _OpenFile] = {}
         self._numbers = itertools.count(1)
-        self._closing: set[asyncio.Task[None]] = set()
+        self._closing_tasks: set[asyncio.Task[None]] = set()
 
     async def link(self, nodes: CameraNodes, book: ResultBook) -> None:
         """Link the methods of a camera's ``ResultTransfer``."""
@@ -66,11 +66,11 @@ class TransferFiles:
         ):
             self._server.link_method(self._server.get_node(nodes.id(f"{_TRANSFER}.{name}")), call)
         timeout = self._server.get_node(nodes.id(f"{_TRANSFER}.ClientProcessingTimeout"))
-        await timeout.write_value(FILE_SECONDS * 1000, ua.VariantType.Double)
+        await timeout.write_value(FILE_TIMEOUT * 1000, ua.VariantType.Double)
 
     async def _generate(self, nodes: CameraNodes, book: ResultBook, options: Any) -> Any:
-        given = getattr(getattr(options, "Value", None), "Id", None)
-        key = getattr(given, "Id", given)
+        result_id = getattr(getattr(options, "Value", None), "Id", None)
+        key = getattr(result_id, "Id", result_id)
         kept = book.get(key, nodes.name) if isinstance(key, str) else None
         path = None if kept is None else kept.result.picture
         if path is None:
@@ -78,20 +78,20 @@ class TransferFiles:
         if len(self._files) >= MAX_FILES:
             return _status(ua.StatusCodes.BadTooManyOperations)
         number = next(self._numbers)
-        self._files[number] = file = _OpenFile(None, b"", self._timer(number))
+        self._files[number] = file = _OpenFile(None, b"", self._start_timer(number))
         try:
             file.data = await asyncio.to_thread(_read, path)
-            file.node = await self._make(nodes, number, len(file.data))
+            file.node = await self._make_node(nodes, number, len(file.data))
         except OSError:
-            self._forget(number)
+            self._close_file(number)
             return _status(ua.StatusCodes.BadNotFound)
         handle = ua.Variant(number, ua.VariantType.UInt32)
         return [ua.Variant(file.node.nodeid), handle, ua.Variant(ua.NodeId())]
 
-    def _timer(self, number: int) -> asyncio.TimerHandle:
-        return asyncio.get_running_loop().call_later(FILE_SECONDS, self._forget, number)
+    def _start_timer(self, number: int) -> asyncio.TimerHandle:
+        return asyncio.get_running_loop().call_later(FILE_TIMEOUT, self._close_file, number)
 
-    async def _make(self, nodes: CameraNodes, number: int, size: int) -> Any:
+    async def _make_node(self, nodes: CameraNodes, number: int, size: int) -> Any:
         root = nodes.id(f"{_TRANSFER}.File{number}")
         await instantiate(
             self._server.get_node(nodes.id(_TRANSFER)),
@@ -100,32 +100,32 @@ class TransferFiles:
             bname=ua.QualifiedName(f"File{number}", self._own_index),
             instantiate_optional=False,
         )
-        for name, value, of in (
+        for name, value, value_type in (
             ("Size", size, ua.VariantType.UInt64),
             ("OpenCount", 1, ua.VariantType.UInt16),
             ("Writable", False, ua.VariantType.Boolean),
             ("UserWritable", False, ua.VariantType.Boolean),
         ):
             node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own_index))
-            await node.write_value(value, of)
-        for name, call in self._calls(number).items():
+            await node.write_value(value, value_type)
+        for name, call in self._file_methods(number).items():
             node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own_index))
             self._server.link_method(node, call)
         return self._server.get_node(root)
 
-    def _calls(self, number: int) -> dict[str, Any]:
+    def _file_methods(self, number: int) -> dict[str, Any]:
         """Return the methods of a file by their names."""
 
-        def guarded(do: Any) -> Any:
+        def check_handle(method: Any) -> Any:
             async def call(_parent: ua.NodeId, *arguments: ua.Variant) -> Any:
                 file = self._files.get(number)
                 values = [argument.Value for argument in arguments]
                 if file is None or not values or values[0] != number:
                     return _status(ua.StatusCodes.BadInvalidArgument)
                 file.timer.cancel()
-                file.timer = self._timer(number)
+                file.timer = self._start_timer(number)
                 try:
-                    return do(file, *values[1:])
+                    return method(file, *values[1:])
                 except (TypeError, ValueError):
                     return _status(ua.StatusCodes.BadInvalidArgument)
 
@@ -138,27 +138,27 @@ class TransferFiles:
             return _status(ua.StatusCodes.BadNotWritable)
 
         def close(_file: _OpenFile) -> list[ua.Variant]:
-            self._forget(number)
+            self._close_file(number)
             return []
 
         return {
             "Open": open_again,
-            "Write": guarded(write),
-            "Read": guarded(_read_some),
-            "GetPosition": guarded(_position),
-            "SetPosition": guarded(_set_position),
-            "Close": guarded(close),
+            "Write": check_handle(write),
+            "Read": check_handle(_read_bytes),
+            "GetPosition": check_handle(_position),
+            "SetPosition": check_handle(_set_position),
+            "Close": check_handle(close),
         }
 
-    def _forget(self, number: int) -> None:
+    def _close_file(self, number: int) -> None:
         file = self._files.pop(number, None)
         if file is None:
             return
         file.timer.cancel()
         if file.node is not None:
             task = asyncio.get_running_loop().create_task(self._delete(file.node))
-            self._closing.add(task)
-            task.add_done_callback(self._closing.discard)
+            self._closing_tasks.add(task)
+            task.add_done_callback(self._closing_tasks.discard)
 
     async def _delete(self, node: Any) -> None:
         await self._server.delete_nodes([node], recursive=True)
@@ -166,10 +166,10 @@ class TransferFiles:
     def close(self) -> None:
         """Close all files."""
         for number in [*self._files]:
-            self._forget(number)
+            self._close_file(number)
 
 
-def _read_some(file: _OpenFile, length: int) -> list[ua.Variant]:
+def _read_bytes(file: _OpenFile, length: int) -> list[ua.Variant]:
     if length < 0:
         raise ValueError("a length below 0")
     end = file.position + min(length, MAX_READ_BYTES)

@@ -1,4 +1,4 @@
-"""Jobs, their results, and the error numbers of methods."""
+"""Define jobs, their results, and the error numbers of methods."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ ERRORS: tuple[tuple[type[BaseException], int], ...] = (
     (LinkError, -5),
     (TimeoutError, -4),
 )
-"""Numbers of errors in a method's argument ``Error``; the first class that fits decides."""
+"""Numbers of errors in a method's output ``Error``; the first class that matches decides."""
 
 NOT_FOUND = -7
 """Number of the error for a result, handle or picture that is unknown or no longer kept."""
 
 
 def code_of(error: BaseException) -> int:
-    """Return the number of an error in a method's outputs; -1 for one without its own."""
+    """Return the number of an error in a method's outputs; -1 if its class has no number."""
     return next((code for kind, code in ERRORS if isinstance(error, kind)), -1)
 
 
@@ -65,46 +65,47 @@ class VisionJob:
 
     Attributes:
         id: id of the job.
-        single: True for one trigger, False for continuous execution.
+        is_single: True for one trigger, False for continuous execution.
         meas: id of the measurement, as the client gave it; None without one.
         part: id of the part, as the client gave it; None without one.
         product: id of the product, as the client gave it; None without one.
         application: application that was ready when the job began.
-        started: time of its start, UTC.
-        trigger: time of its trigger, from the camera's client, by which its result is found.
-        seen: event that is set when its result is published.
-        ended_clock: clock of the event loop at its end; None while it is under way.
+        started_at: time of the job's start, UTC.
+        triggered_at: time of the job's trigger, from the camera's client, which the result has,
+            too.
+        result_published: event that is set when the job's result is published.
+        ended_at: time of the event loop at the job's end; None while the job is under way.
         task: task that carries out the job.
     """
 
     id: str
-    single: bool
+    is_single: bool
     meas: Any
     part: Any
     product: Any
     application: int | None
-    started: datetime = field(default_factory=lambda: datetime.now(UTC))
-    trigger: datetime | None = None
-    seen: asyncio.Event = field(default_factory=asyncio.Event)
-    ended_clock: float | None = None
+    started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    triggered_at: datetime | None = None
+    result_published: asyncio.Event = field(default_factory=asyncio.Event)
+    ended_at: float | None = None
     task: asyncio.Task[None] | None = None
 
 
 @dataclass(slots=True, frozen=True, eq=False)
 class VisionResult:
-    """A result as clients get it, or the end of a job without one.
+    """A result as clients get it, or the end of a job without a result.
 
     Attributes:
         id: id of the result.
         camera: name of the camera.
-        state: number of its state, as the nodeset numbers them.
-        application: application that made it; None if that is not known.
+        state: number of the result's state in the nodeset.
+        application: application that made the result; None if it is not known.
         job: job that the result belongs to; None for a result without a job.
-        created: time at which it came, UTC.
-        fields: fields of its JSON object.
-        error: text that says why there are no values; "" if there are.
-        picture: file of its picture; None without one.
-        simulated: True for an emulated camera, False for a real one, None if that is not known.
+        created: time at which the result was received, UTC.
+        fields: fields of the result's JSON object.
+        error: reason why there are no values; "" if there are.
+        picture: file of the result's picture; None without one.
+        simulated: True for an emulated camera, False for a real one, None if this is not known.
     """
 
     id: str
@@ -120,5 +121,5 @@ class VisionResult:
 
     @property
     def job_id(self) -> str:
-        """Id of its job; "" without one."""
+        """Id of the result's job; "" without a job."""
         return "" if self.job is None else self.job.id

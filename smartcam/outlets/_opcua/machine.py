@@ -1,4 +1,4 @@
-"""The states of a vision system, which change only by transitions of the nodeset."""
+"""Keep the states of a vision system, which change only by transitions of the nodeset."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ class WrongStateError(OutletError):
 
 
 class VisionStates:
-    """The states of both machines of a vision system.
+    """The states of both state machines of a vision system.
 
     Attributes:
         vision: name of the state of the whole system.
-        automatic: name of the state of the machine of jobs; "" if the system is not operational.
+        automatic: name of the state of the state machine for jobs; "" if the system is not
+            operational.
     """
 
     def __init__(self) -> None:
@@ -23,13 +24,13 @@ class VisionStates:
         self.automatic = ""
 
     @property
-    def both(self) -> str:
-        """The state as a text."""
+    def text(self) -> str:
+        """Both states as a text."""
         return f"{self.vision} {self.automatic}".rstrip()
 
     def allows(self, cause: str) -> bool:
         """Return True if a method causes a transition from the present state."""
-        return self._find("", cause) is not None
+        return self._find_transition("", cause) is not None
 
     def move(self, target: str, cause: str = "") -> Transition:
         """Move to a state and return the transition.
@@ -41,9 +42,9 @@ class VisionStates:
         Raises:
             WrongStateError: there is no such transition.
         """
-        transition = self._find(target, cause)
+        transition = self._find_transition(target, cause)
         if transition is None:
-            raise WrongStateError(f"{cause or 'nothing'} leads from {self.both} to {target}")
+            raise WrongStateError(f"{cause or 'nothing'} leads from {self.text} to {target}")
         if transition.machine == AUTOMATIC:
             self.automatic = target
         else:
@@ -51,8 +52,8 @@ class VisionStates:
             self.automatic = "Initialized" if target == "Operational" else ""
         return transition
 
-    def _find(self, target: str, cause: str) -> Transition | None:
-        """Return the transition from the present state, one that stays within its machine."""
+    def _find_transition(self, target: str, cause: str) -> Transition | None:
+        """Return a transition from the present state; ``target`` "": to any state."""
         states = {VISION: self.vision, AUTOMATIC: self.automatic}
         sources = {(transition.machine, transition.source) for transition in transitions()}
         for transition in transitions():

@@ -1,4 +1,4 @@
-"""The methods of a camera, with checked arguments and a timeout."""
+"""Carry out the methods of a camera, with checked arguments and a timeout."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ MAX_TEXT_CHARACTERS = 1000
 """Largest number of characters of an id or a text that a client gives."""
 
 MAX_LISTED = 100
-"""Largest number of results or recipes of one answer; a client requests the rest by
+"""Largest number of results or recipes in one answer; a client requests the others by
 ``StartIndex``."""
 
-CALL_SECONDS = 700.0
-"""Seconds within which every call ends: longer than the camera's own timeouts."""
+CALL_TIMEOUT = 700.0
+"""Seconds after which a call is cancelled; it is longer than all timeouts of cameras."""
 
-_NUMBERS = {1: bool, 6: int, 7: int}
-"""Python types of the types of OPC UA, by their numbers."""
+_PYTHON_TYPES = {1: bool, 6: int, 7: int}
+"""Python types of arguments, by the numbers of OPC UA's types."""
 
-_DERIVED = {"Handle": 7, "ResultStateDataType": 6, "TriStateBooleanDataType": 6}
-"""Numbers of the types that the nodeset derives from plain ones."""
+_DERIVED_TYPES = {"Handle": 7, "ResultStateDataType": 6, "TriStateBooleanDataType": 6}
+"""Numbers of the built-in types from which types of the nodeset are derived."""
 
 
 class MethodArgumentError(Exception):
-    """A client's argument is not of its type."""
+    """A client's argument does not have the method's type."""
 
 
 class Method(NamedTuple):
     """A method that a client may call.
 
     Attributes:
-        do: function that carries out the method with plain arguments, and returns its outputs
-            without the error.
-        empty: outputs of a call that failed, without the error.
+        carry_out: function that carries out the method with plain arguments, and returns its
+            outputs without the error.
+        failed_outputs: outputs of a call that failed, without the error.
     """
 
-    do: Callable[..., Awaitable[list[ua.Variant]]]
-    empty: tuple[ua.Variant, ...] = ()
+    carry_out: Callable[..., Awaitable[list[ua.Variant]]]
+    failed_outputs: tuple[ua.Variant, ...] = ()
 
 
 class Methods:
@@ -67,8 +67,8 @@ class Methods:
         system: states and jobs of the camera.
         nodes: nodes of the camera.
         values: values of the server.
-        book: results that clients may ask for.
-        settled: function that returns when earlier events and values are published.
+        book: results that clients may request.
+        wait_published: function that waits until earlier events and values are published.
     """
 
     def __init__(
@@ -77,10 +77,10 @@ class Methods:
         nodes: CameraNodes,
         values: VisionValues,
         book: ResultBook,
-        settled: Callable[[], Awaitable[None]],
+        wait_published: Callable[[], Awaitable[None]],
     ) -> None:
         self._system, self._nodes, self._values, self._book = system, nodes, values, book
-        self._settled = settled
+        self._wait_published = wait_published
 
     def table(self) -> dict[str, Method]:
         """Return the methods by the paths of their nodes below the camera's."""
@@ -90,28 +90,28 @@ class Methods:
         job = (self._id("JobIdDataType", ""),)
         recipe = (self._id("RecipeIdInternalDataType", ""),)
         return {
-            f"{STATE_MACHINE}.Halt": Method(self._changes("Halt", "Halted")),
-            f"{STATE_MACHINE}.Reset": Method(self._changes("Reset", "Preoperational")),
+            f"{STATE_MACHINE}.Halt": Method(self._change_method("Halt", "Halted")),
+            f"{STATE_MACHINE}.Reset": Method(self._change_method("Reset", "Preoperational")),
             f"{STATE_MACHINE}.SelectModeAutomatic": Method(
-                self._changes("SelectModeAutomatic", "Operational")
+                self._change_method("SelectModeAutomatic", "Operational")
             ),
             f"{STATE_MACHINE}.ConfirmAll": Method(self._confirm),
-            f"{AUTOMATIC_MACHINE}.Stop": Method(self._ends("Stop")),
-            f"{AUTOMATIC_MACHINE}.Abort": Method(self._ends("Abort")),
-            f"{AUTOMATIC_MACHINE}.StartSingleJob": Method(self._starts(single=True), job),
-            f"{AUTOMATIC_MACHINE}.StartContinuous": Method(self._starts(single=False), job),
+            f"{AUTOMATIC_MACHINE}.Stop": Method(self._end_method("Stop")),
+            f"{AUTOMATIC_MACHINE}.Abort": Method(self._end_method("Abort")),
+            f"{AUTOMATIC_MACHINE}.StartSingleJob": Method(self._start_method(single=True), job),
+            f"{AUTOMATIC_MACHINE}.StartContinuous": Method(self._start_method(single=False), job),
             "RecipeManagement.PrepareRecipe": Method(self._prepare, (*recipe, _boolean(False))),
             "RecipeManagement.UnprepareRecipe": Method(self._unprepare, recipe),
-            "RecipeManagement.GetRecipeListFiltered": Method(self._recipes, _no_list()),
+            "RecipeManagement.GetRecipeListFiltered": Method(self._recipes, _empty_list_outputs()),
         }
 
     def _results_table(self) -> dict[str, Method]:
-        nothing = ua.Variant()
-        components = (_boolean(False), _number(0), *[nothing] * len(_COMPONENTS))
+        null = ua.Variant()
+        components = (_boolean(False), _number(0), *[null] * len(_COMPONENTS))
         return {
-            "ResultManagement.GetResultById": Method(self._result, (_number(0), nothing)),
+            "ResultManagement.GetResultById": Method(self._result_by_id, (_number(0), null)),
             "ResultManagement.GetResultComponentsById": Method(self._components, components),
-            "ResultManagement.GetResultListFiltered": Method(self._results, _no_list()),
+            "ResultManagement.GetResultListFiltered": Method(self._results, _empty_list_outputs()),
             "ResultManagement.ReleaseResultHandle": Method(self._release),
         }
 
@@ -126,38 +126,42 @@ class Methods:
     async def call(
         self, method: Method, types: Sequence[int], arguments: Sequence[ua.Variant]
     ) -> ua.CallMethodResult | ua.StatusCode | list[ua.Variant]:
-        """Carry out a method, and return its outputs, with the error's number last.
+        """Carry out a method, and return its outputs; the last one is the error's number.
 
         Args:
             method: the method.
-            types: numbers of its arguments' types; 0 for ids and lists.
+            types: numbers of the arguments' types; 0 for ids and lists.
             arguments: the client's arguments.
         """
         if len(arguments) != len(types):
-            few = len(arguments) < len(types)
+            too_few = len(arguments) < len(types)
             codes = ua.StatusCodes
-            return ua.StatusCode(codes.BadArgumentsMissing if few else codes.BadTooManyArguments)
+            return ua.StatusCode(
+                codes.BadArgumentsMissing if too_few else codes.BadTooManyArguments
+            )
         try:
-            given = [_argument(argument, of) for argument, of in zip(arguments, types, strict=True)]
+            values = [
+                _argument(argument, kind) for argument, kind in zip(arguments, types, strict=True)
+            ]
         except MethodArgumentError:
             return _wrong_arguments(arguments, types)
         try:
-            async with asyncio.timeout(CALL_SECONDS):
-                outputs = await method.do(*given)
-                await self._settled()
+            async with asyncio.timeout(CALL_TIMEOUT):
+                outputs = await method.carry_out(*values)
+                await self._wait_published()
         except WrongStateError:
             return ua.StatusCode(ua.StatusCodes.BadInvalidState)
         except (SmartCamError, TimeoutError, LookupError) as exc:
-            self._nodes.message(str(exc), type(exc).__name__, None)
+            self._nodes.show_message(str(exc), type(exc).__name__, None)
             code = NOT_FOUND if isinstance(exc, LookupError) else code_of(exc)
-            return [*method.empty, _error(code)]
+            return [*method.failed_outputs, _error(code)]
         except asyncio.CancelledError:
             raise
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:
             logger.exception("outlet: camera %s", self._nodes.name)
-            self._nodes.message(text_of(exc), type(exc).__name__, None)
+            self._nodes.show_message(text_of(exc), type(exc).__name__, None)
             return ua.StatusCode(ua.StatusCodes.BadInternalError)
         return [*outputs, _error(0)]
 
@@ -167,25 +171,25 @@ class Methods:
 
     # ------------------------------------------------------------------ states and jobs
 
-    def _changes(self, name: str, target: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
+    def _change_method(self, name: str, target: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
         async def change(_cause: int = 0, why: str = "") -> list[ua.Variant]:
-            self._system.change(name, target, why)
+            self._system.change_state(name, target, why)
             return []
 
         return change
 
     async def _confirm(self, _comment: Any) -> list[ua.Variant]:
-        self._nodes.confirmed()
+        self._nodes.confirm_trouble()
         return []
 
-    def _ends(self, name: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
+    def _end_method(self, name: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
         async def end(_cause: int, why: str) -> list[ua.Variant]:
             self._system.end_job(name, why)
             return []
 
         return end
 
-    def _starts(self, *, single: bool) -> Callable[..., Awaitable[list[ua.Variant]]]:
+    def _start_method(self, *, single: bool) -> Callable[..., Awaitable[list[ua.Variant]]]:
         async def start(
             meas: Any, part: Any, recipe: Any, product: Any, _more: Any
         ) -> list[ua.Variant]:
@@ -200,7 +204,7 @@ class Methods:
         return start
 
     def _client_id(self, kind: str, value: Any) -> Any:
-        """Return the client's id, which the result will carry; None without one."""
+        """Return the client's id, which the result will have; None without an id."""
         text, description = _text(value), getattr(value, "Description", None)
         if not text and description is None:
             return None
@@ -211,7 +215,7 @@ class Methods:
 
     async def _start_plain(self, meas: str, part: str, recipe: str) -> list[ua.Variant]:
         """Start a single job for a client that does not support structures."""
-        (job,) = await self._starts(single=True)(meas, part, recipe, None, None)
+        (job,) = await self._start_method(single=True)(meas, part, recipe, None, None)
         return [ua.Variant(job.Value.Id, ua.VariantType.String)]
 
     async def _prepare_plain(self, recipe: str) -> list[ua.Variant]:
@@ -222,7 +226,7 @@ class Methods:
     async def _result_plain(self, job: str) -> list[ua.Variant]:
         """Return state, values and error of a job's result as plain values."""
         kept = next(
-            self._book.newest(self._nodes.name, lambda each: each.result.job_id == job), None
+            self._book.find_results(self._nodes.name, lambda kept: kept.result.job_id == job), None
         )
         if not job or kept is None:
             raise KeyError(f"there is no result of job {job!r:.80}")
@@ -239,7 +243,7 @@ class Methods:
 
     async def _unprepare(self, external: Any, internal: Any) -> list[ua.Variant]:
         application = self._system.application_of(_text(external), _text(internal))
-        if application != self._system.prepared:
+        if application != self._system.prepared_application:
             raise UnknownRecipeError(f"recipe {application} is not prepared")
         self._system.unprepare()
         return [self._id("RecipeIdInternalDataType", str(application))]
@@ -247,21 +251,21 @@ class Methods:
     async def _recipes(
         self, external: Any, product: Any, prepared: int, most: int, first: int, timeout: int
     ) -> list[ua.Variant]:
-        del timeout  # the answer has the whole list
-        ready, name = self._system.prepared, _text(external)
-        known = dict.fromkeys(self._system.recipes.values())
+        del timeout  # the answer does not need a handle
+        ready, name = self._system.prepared_application, _text(external)
+        numbers = dict.fromkeys(self._system.recipes.values())
         if self._system.application:
-            known[self._system.application] = None
-        fits = [
+            numbers[self._system.application] = None
+        matching = [
             number
-            for number in known
+            for number in numbers
             if prepared not in (0, 1) or (number == ready) == bool(prepared)
             if not name or name in (self._system.recipe_name(number), str(number))
             if not _text(product)
         ]
-        page = fits[first : first + _most(most)]
+        page = matching[first : first + _limit(most)]
         listed = [self._values.identity("RecipeIdInternalDataType", str(number)) for number in page]
-        complete = first + len(page) >= len(fits)
+        complete = first + len(page) >= len(matching)
         return [_boolean(complete), _number(len(page)), _number(0), _list(listed)]
 
     # ------------------------------------------------------------------ results
@@ -273,7 +277,7 @@ class Methods:
             raise KeyError(f"there is no result {text!r:.120}")
         return kept
 
-    async def _result(self, result: Any, timeout: int) -> list[ua.Variant]:
+    async def _result_by_id(self, result: Any, timeout: int) -> list[ua.Variant]:
         kept = self._kept_result(result)
         value = ua.Variant(kept.structure, ua.VariantType.ExtensionObject)
         return [_number(self._book.new_handle(timeout)), value]
@@ -282,9 +286,9 @@ class Methods:
         value = self._kept_result(result).structure
         handle = _number(self._book.new_handle(timeout))
         outputs = [_boolean(bool(value.HasTransferableDataOnFile)), handle]
-        for name, of in _COMPONENTS:
+        for name, value_type in _COMPONENTS:
             component = getattr(value, name)
-            outputs.append(ua.Variant() if component is None else ua.Variant(component, of))
+            outputs.append(ua.Variant() if component is None else ua.Variant(component, value_type))
         return outputs
 
     async def _results(self, state: int, *arguments: Any) -> list[ua.Variant]:
@@ -295,7 +299,7 @@ class Methods:
             if (text := _text(filter_id))
         ]
 
-        def fits(kept: KeptResult) -> bool:
+        def matches(kept: KeptResult) -> bool:
             if state and kept.result.state != state:
                 return False
             identities = [getattr(kept.structure, name) for name, _ in wanted]
@@ -305,8 +309,8 @@ class Methods:
                 for identity, text in zip(identities, texts, strict=True)
             )
 
-        limit = _most(most)
-        matching = self._book.newest(self._nodes.name, fits)
+        limit = _limit(most)
+        matching = self._book.find_results(self._nodes.name, matches)
         page = [*itertools.islice(matching, first, first + limit + 1)]
         listed = [kept.structure for kept in page[:limit]]
         handle = _number(self._book.new_handle(timeout))
@@ -347,23 +351,23 @@ _COMPONENTS = (
 )
 
 
-def kind_of(data_type: ua.NodeId, rank: int) -> int:
+def type_number(data_type: ua.NodeId, rank: int) -> int:
     """Return the number of an argument's type; 0 for ids, lists and other structures."""
     if rank >= 0:
         return 0
     if data_type.NamespaceIndex == 0:
         number = int(data_type.Identifier)
         return 0 if number in (ua.ObjectIds.Structure, ua.ObjectIds.BaseDataType) else number
-    derived = {node_ids()[name]: number for name, number in _DERIVED.items()}
+    derived = {node_ids()[name]: number for name, number in _DERIVED_TYPES.items()}
     return derived.get(int(data_type.Identifier), 0)
 
 
-def _argument(given: ua.Variant, kind: int) -> Any:
+def _argument(argument: ua.Variant, kind: int) -> Any:
     """Return a client's argument as a plain value."""
-    value = given.Value
-    of = _NUMBERS.get(kind)
-    if of is not None:
-        if not isinstance(value, of) or (of is int and isinstance(value, bool)):
+    value = argument.Value
+    python_type = _PYTHON_TYPES.get(kind)
+    if python_type is not None:
+        if not isinstance(value, python_type) or (python_type is int and isinstance(value, bool)):
             raise MethodArgumentError
         return value
     if kind == ua.ObjectIds.String:
@@ -380,12 +384,12 @@ def _text(value: Any) -> str:
         MethodArgumentError: the id is of another type, or too long.
     """
     if isinstance(value, int) and not isinstance(value, bool):
-        return str(value)  # a recipe's number; "" would mean any recipe
+        return str(value)  # the number of a recipe
     text = value if isinstance(value, str) else getattr(value, "Id", None)
     while text is not None and not isinstance(text, str):  # an id within an id
         text = getattr(text, "Id", None)
-    empty = value is None or (isinstance(value, ua.ExtensionObject) and not value.Body)
-    if text is None and not empty and not hasattr(value, "Id"):
+    is_empty = value is None or (isinstance(value, ua.ExtensionObject) and not value.Body)
+    if text is None and not is_empty and not hasattr(value, "Id"):
         raise MethodArgumentError
     text = (text or "").strip()
     if len(text) > MAX_TEXT_CHARACTERS:
@@ -394,21 +398,21 @@ def _text(value: Any) -> str:
 
 
 def _wrong_arguments(arguments: Sequence[ua.Variant], types: Sequence[int]) -> ua.CallMethodResult:
-    """Return the answer to a call with wrong types of arguments, with a status for each."""
+    """Return the answer to a call whose arguments have wrong types, with a status for each one."""
     result = ua.CallMethodResult()
     result.StatusCode = ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
-    for argument, of in zip(arguments, types, strict=True):
+    for argument, kind in zip(arguments, types, strict=True):
         status = ua.StatusCode()
         try:
-            _argument(argument, of)
+            _argument(argument, kind)
         except MethodArgumentError:
             status = ua.StatusCode(ua.StatusCodes.BadTypeMismatch)
         result.InputArgumentResults.append(status)
     return result
 
 
-def _most(wanted: int) -> int:
-    return min(wanted, MAX_LISTED) if wanted else MAX_LISTED
+def _limit(requested: int) -> int:
+    return min(requested, MAX_LISTED) if requested else MAX_LISTED
 
 
 def _error(code: int) -> ua.Variant:
@@ -427,5 +431,5 @@ def _list(values: list[Any]) -> ua.Variant:
     return ua.Variant(values, ua.VariantType.ExtensionObject, is_array=True)
 
 
-def _no_list() -> tuple[ua.Variant, ...]:
+def _empty_list_outputs() -> tuple[ua.Variant, ...]:
     return _boolean(True), _number(0), _number(0), _list([])

@@ -1,4 +1,4 @@
-"""The nodes of a camera, which clients browse, read and get events from."""
+"""Define the nodes of a camera, which clients browse and read, and which raise events."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from asyncua.common.instantiate_util import instantiate
 
 from smartcam.outlets._opcua.book import KeptResult
 from smartcam.outlets._opcua.nodeset import AUTOMATIC, VISION, Transition, node_ids, state_ids
-from smartcam.outlets._opcua.values import MAX_FIELDS, TYPES, plain, type_of
+from smartcam.outlets._opcua.values import MAX_FIELDS, TYPES, check_value, variant_type
 from smartcam.outlets._records import records_of
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 STATE_MACHINE = "VisionStateMachine"
 AUTOMATIC_MACHINE = f"{STATE_MACHINE}.AutomaticModeStateMachine"
 
-_PARTS: Sequence[tuple[str, str]] = (
+_OPTIONAL_PARTS: Sequence[tuple[str, str]] = (
     (AUTOMATIC_MACHINE, AUTOMATIC),
     ("RecipeManagement", "RecipeManagementType"),
     ("ResultManagement", "ResultManagementType"),
@@ -40,7 +40,7 @@ _OPTIONAL_METHODS = (
     ("ResultManagement", "ResultManagementType", ("ReleaseResultHandle",)),
 )
 
-_PLAIN: Mapping[str, tuple[ua.VariantType, Any]] = {
+_PLAIN_VARIABLES: Mapping[str, tuple[ua.VariantType, Any]] = {
     "State": (ua.VariantType.String, ""),
     "Error": (ua.VariantType.String, ""),
     "ResultId": (ua.VariantType.String, ""),
@@ -55,7 +55,8 @@ _PLAIN: Mapping[str, tuple[ua.VariantType, Any]] = {
     "Value": (ua.VariantType.String, ""),
     "Count": (ua.VariantType.UInt32, 0),
 }
-"""Plain variables of a camera, with their first values; ``Count`` changes last."""
+"""Plain variables of a camera, with their initial values; of each result ``Count`` is written
+last."""
 
 
 _TEXT = ua.VariantType.String
@@ -70,17 +71,17 @@ _PLAIN_METHODS: Mapping[str, tuple[Sequence[tuple[str, ua.VariantType]], ...]] =
         (("ResultState", ua.VariantType.Int32), ("Value", _TEXT), ("ErrorText", _TEXT)),
     ),
 }
-"""Methods for clients without structures: arguments and outputs, without the error."""
+"""Methods for clients that do not support structures: arguments and outputs, without the error."""
 
 
 class CameraNodes:
-    """The nodes of one camera; calls return at once, and changes are published in order.
+    """The nodes of one camera; methods return at once, and changes are published in order.
 
     Args:
         server: server of asyncua, with the nodeset.
         spaces: indexes of the namespaces of the nodeset and of cameras.
         name: name of the camera.
-        parts: events, values and the queue for publishing.
+        parts: events, values and the queue that publishes.
     """
 
     def __init__(
@@ -92,10 +93,10 @@ class CameraNodes:
     ) -> None:
         self._server, self.name = server, name
         self._vision, self._own_index = spaces
-        self._events, self._values, self._outbox = parts
+        self._events, self._values, self._publish_queue = parts
         self.root = self.id("")
         self._count = 0
-        self._trouble, self._confirmed = "", True
+        self._trouble, self._is_confirmed = "", True
         self.prepared: tuple[str, int] = ("", 0)
         self._columns: dict[str, tuple[Column, ...]] = {}
 
@@ -103,14 +104,14 @@ class CameraNodes:
         """Return the id of a node by its path of names below the camera's node."""
         return ua.NodeId(f"{self.name}.{path}" if path else self.name, self._own_index)
 
-    async def make(self, states: VisionStates) -> None:
-        """Make the nodes."""
-        await self._instance(
+    async def make_nodes(self, states: VisionStates) -> None:
+        """Make the nodes, and show the states."""
+        await self._make_instance(
             self._server.nodes.objects, self.root, "VisionSystemType", self._own_index
         )
-        for path, kind in _PARTS:
+        for path, kind in _OPTIONAL_PARTS:
             parent = self._node(path.rpartition(".")[0])
-            await self._instance(parent, self.id(path), kind, self._vision)
+            await self._make_instance(parent, self.id(path), kind, self._vision)
         for path, kind, methods in _OPTIONAL_METHODS:
             for method in methods:
                 await self._copy_method(path, kind, method)
@@ -119,7 +120,7 @@ class CameraNodes:
         )
         await self._server.nodes.server.add_reference(self.root, ua.ObjectIds.HasNotifier)
         plain_node = await self._node("").add_object(self.id("Plain"), f"{self._own_index}:Plain")
-        for name, (kind, first) in _PLAIN.items():
+        for name, (kind, first) in _PLAIN_VARIABLES.items():
             await plain_node.add_variable(
                 self.id(f"Plain.{name}"), f"{self._own_index}:{name}", first, varianttype=kind
             )
@@ -127,7 +128,7 @@ class CameraNodes:
             await plain_node.add_method(
                 self.id(f"Plain.{name}"),
                 ua.QualifiedName(name, self._own_index),
-                _nothing,
+                _not_implemented,
                 [_argument(argument_name, kind) for argument_name, kind in inputs],
                 [
                     _argument(argument_name, kind)
@@ -139,13 +140,13 @@ class CameraNodes:
     def _node(self, path: str) -> Any:
         return self._server.get_node(self.id(path))
 
-    async def _instance(self, parent: Any, node: ua.NodeId, kind: str, space: int) -> None:
-        of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
+    async def _make_instance(self, parent: Any, node: ua.NodeId, kind: str, space: int) -> None:
+        type_node = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
         text = str(node.Identifier)
         name = text if space == self._own_index else text.rpartition(".")[2]
         await instantiate(
             parent,
-            of,
+            type_node,
             nodeid=node,
             bname=ua.QualifiedName(name, space),
             dname=ua.LocalizedText(name),
@@ -154,20 +155,20 @@ class CameraNodes:
 
     async def _copy_method(self, path: str, kind: str, method: str) -> None:
         """Add an optional method to an instance, as a copy of its type's node."""
-        of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
-        pattern = await of.get_child(f"{self._vision}:{method}")
+        type_node = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
+        pattern = await type_node.get_child(f"{self._vision}:{method}")
         arguments: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
         for property_ in await pattern.get_properties():
             arguments[(await property_.read_browse_name()).Name] = await property_.read_value()
         inputs, outputs = arguments["InputArguments"], arguments["OutputArguments"]
         name = ua.QualifiedName(method, self._vision)
         await self._node(path).add_method(
-            self.id(f"{path}.{method}"), name, _nothing, inputs, outputs
+            self.id(f"{path}.{method}"), name, _not_implemented, inputs, outputs
         )
 
-    # ------------------------------------------------------------------ what happens
+    # ------------------------------------------------------------------ changes
 
-    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+    def show_transition(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
         prepared = self.prepared
         vision = transition.target if transition.machine == VISION else "Operational"
@@ -183,19 +184,19 @@ class CameraNodes:
             if transition.target == "Error" and "ErrorEventType" not in kinds:
                 kinds.append("ErrorEventType")  # according to the text of OPC 40100-1
             for kind in kinds:
-                changes = kind in _CHANGES
-                event_fields = fields if changes else self._job_fields(kind, job, prepared)
+                is_state_event = kind in _STATE_EVENTS
+                event_fields = fields if is_state_event else self._job_fields(kind, job, prepared)
                 await self._emit(kind, message, event_fields)
 
-        self._outbox.put(publish)
+        self._publish_queue.put(publish)
 
-    def acquired(self, job: VisionJob) -> None:
-        """Raise the event that a job has its picture."""
+    def show_acquisition(self, job: VisionJob) -> None:
+        """Raise the event that a job's picture is taken."""
         kind = "AcquisitionDoneEventType"
         fields = self._job_fields(kind, job, self.prepared)
-        self._outbox.put(lambda: self._emit(kind, f"job {job.id} has its picture", fields))
+        self._publish_queue.put(lambda: self._emit(kind, f"job {job.id} has its picture", fields))
 
-    def result(
+    def show_result(
         self,
         result: VisionResult,
         recipe: str,
@@ -206,16 +207,16 @@ class CameraNodes:
 
         Args:
             result: the result.
-            recipe: name of its recipe.
-            columns: names, types and units of its values.
-            keep: function that stores the result for later requests; called before the event.
+            recipe: name of the result's recipe.
+            columns: names, types and units of the result's values.
+            keep: function that keeps the result for requests of clients; called before the event.
         """
 
         async def publish() -> None:
             content = await self._values.content(result, columns)
             value = self._values.result(result, recipe, content)
-            plain = result.fields.get("value")
-            text = "" if plain is None else json.dumps(plain, separators=(",", ":"))
+            json_value = result.fields.get("value")
+            text = "" if json_value is None else json.dumps(json_value, separators=(",", ":"))
             keep(KeptResult(result, value, recipe, text))
             await self._show_plain(result, recipe, columns, text)
             names = value.__dataclass_fields__
@@ -226,9 +227,9 @@ class CameraNodes:
             }
             await self._emit("ResultReadyEventType", result.error or result.id, fields)
 
-        self._outbox.put(publish)
+        self._publish_queue.put(publish)
 
-    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
+    def show_message(self, text: str, kind: str, job: VisionJob | None) -> None:
         """Raise an event with a text."""
         fields: dict[str, Any] = {"CausePath": kind}
         if job is not None:
@@ -239,26 +240,26 @@ class CameraNodes:
             await self._write("Plain.Error", ua.Variant(text, ua.VariantType.String))
             await self._emit("VisionDiagnosticInfoEventType", text, fields)
 
-        self._outbox.put(publish)
+        self._publish_queue.put(publish)
 
-    def trouble(self, why: str) -> None:
-        """Show why the camera cannot be used, as a condition; "" when it can."""
-        self._trouble, self._confirmed = why, not why
-        self._outbox.put(lambda: self._show_trouble(why, confirmed=not why))
+    def show_trouble(self, why: str) -> None:
+        """Show as a condition why the camera cannot be used; "" if it can be used."""
+        self._trouble, self._is_confirmed = why, not why
+        self._publish_queue.put(lambda: self._publish_trouble(why, confirmed=not why))
 
-    def confirmed(self) -> None:
+    def confirm_trouble(self) -> None:
         """Show that a client has confirmed the condition, if there is one."""
-        if not self._confirmed:
-            self._confirmed, why = True, self._trouble
-            self._outbox.put(lambda: self._show_trouble(why, confirmed=True))
+        if not self._is_confirmed:
+            self._is_confirmed, why = True, self._trouble
+            self._publish_queue.put(lambda: self._publish_trouble(why, confirmed=True))
 
-    async def _show_trouble(self, why: str, *, confirmed: bool) -> None:
+    async def _publish_trouble(self, why: str, *, confirmed: bool) -> None:
         await self._write("Plain.Error", ua.Variant(why, ua.VariantType.String))
         fields = _condition(self.id("Condition"), bool(why), confirmed) | {"ErrorString": why}
         text = why or "the camera is there"
         await self._emit("VisionPersistentErrorConditionType", text, fields)
 
-    # ------------------------------------------------------------------ how it is shown
+    # ------------------------------------------------------------------ values and events
 
     async def _emit(self, kind: str, message: str, fields: Mapping[str, Any]) -> None:
         await self._events.emit(kind, self.root, self.name, message, fields)
@@ -285,7 +286,7 @@ class CameraNodes:
         await self._write("Plain.State", ua.Variant(automatic or vision, ua.VariantType.String))
 
     def _state(self, machine: str, state: str) -> ua.NodeId:
-        """Return the node of a state, which stands in the machine's type."""
+        """Return the node of a state, which belongs to the type of the state machine."""
         return ua.NodeId(state_ids()[machine, state], self._vision) if state else ua.NodeId()
 
     def _transition_fields(self, transition: Transition) -> dict[str, Any]:
@@ -315,11 +316,11 @@ class CameraNodes:
     async def _show_plain(
         self, result: VisionResult, recipe: str, columns: Sequence[Column], text: str
     ) -> None:
-        """Write the plain variables, the counter last."""
+        """Write the plain variables; the counter is written last."""
         self._count = (self._count + 1) % (1 << 32)
         records = records_of(result.fields.get("value")) or []
         job = result.job
-        shown = {
+        values = {
             "Error": result.error,
             "ResultId": result.id,
             "JobId": result.job_id,
@@ -332,8 +333,8 @@ class CameraNodes:
             "Records": len(records),
             "Value": text,
         }
-        for name, value in shown.items():
-            await self._write(f"Plain.{name}", ua.Variant(value, _PLAIN[name][0]))
+        for name, value in values.items():
+            await self._write(f"Plain.{name}", ua.Variant(value, _PLAIN_VARIABLES[name][0]))
         if columns and result.application is not None:
             first = records[0] if records and not result.error else {}
             await self._show_columns(f"App{result.application}", columns[:MAX_FIELDS], first)
@@ -342,42 +343,42 @@ class CameraNodes:
     async def _show_columns(
         self, folder: str, columns: Sequence[Column], record: Mapping[str, Any]
     ) -> None:
-        """Write the values of the first record; missing ones get a bad status."""
+        """Write the values of the first record; missing values get a bad status."""
         if self._columns.get(folder) != tuple(columns):
             await self._make_columns(folder, columns)
         for name, kind, _ in columns:
             path = f"Plain.{folder}.{name}"
             try:
-                value = ua.Variant(plain(record[name], kind), type_of(kind))
+                value = ua.Variant(check_value(record[name], kind), variant_type(kind))
             except (KeyError, TypeError, ValueError):
                 await self._write(path, ua.Variant(), ua.StatusCodes.BadNoData)
             else:
                 await self._write(path, value)
 
     async def _make_columns(self, folder: str, columns: Sequence[Column]) -> None:
-        """Make a variable for each value, in place of the variables of an earlier layout."""
+        """Make a variable for each value; they replace the variables of an earlier layout."""
         node = self._node(f"Plain.{folder}")
         if folder in self._columns:
             await self._server.delete_nodes([node], recursive=True)
         parent = self._node("Plain")
         node = await parent.add_object(self.id(f"Plain.{folder}"), f"{self._own_index}:{folder}")
         for name, kind, unit in columns:
-            made = await node.add_variable(
+            variable = await node.add_variable(
                 self.id(f"Plain.{folder}.{name}"),
                 ua.QualifiedName(name, self._own_index),
-                plain(_ZEROS.get(kind, 0 if kind in TYPES else ""), kind),
-                varianttype=type_of(kind),
-                datatype=ua.NodeId(type_of(kind).value),
+                check_value(_ZEROS.get(kind, 0 if kind in TYPES else ""), kind),
+                varianttype=variant_type(kind),
+                datatype=ua.NodeId(variant_type(kind).value),
             )
             if unit:
-                await made.write_attribute(
+                await variable.write_attribute(
                     ua.AttributeIds.Description, ua.DataValue(ua.LocalizedText(unit))
                 )
         self._columns[folder] = tuple(columns)
 
 
 _ZEROS: Mapping[str, Any] = {"bool": False, "real32": 0.0, "real64": 0.0}
-_CHANGES = ("StateChangedEventType", "ErrorEventType", "ErrorResolvedEventType")
+_STATE_EVENTS = ("StateChangedEventType", "ErrorEventType", "ErrorResolvedEventType")
 
 
 def _condition(node: ua.NodeId, active: bool, confirmed: bool) -> dict[str, Any]:
@@ -404,7 +405,7 @@ def _argument(name: str, kind: ua.VariantType) -> ua.Argument:
     return ua.Argument(Name=name, DataType=ua.NodeId(kind.value), ValueRank=-1)
 
 
-async def _nothing(_parent: ua.NodeId, *_arguments: ua.Variant) -> ua.StatusCode:
+async def _not_implemented(_parent: ua.NodeId, *_arguments: ua.Variant) -> ua.StatusCode:
     return ua.StatusCode(ua.StatusCodes.BadNotImplemented)
 
 

@@ -1,4 +1,4 @@
-"""The nodeset of OPC 40100-1: its text, and the transitions of its state machines."""
+"""Read the nodeset of OPC 40100-1: its types, and the transitions of its state machines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ VISION = "VisionStateMachineType"
 """Name of the type of the state machine of a whole vision system."""
 
 AUTOMATIC = "VisionAutomaticModeStateMachineType"
-"""Name of the type of the state machine of jobs."""
+"""Name of the type of the state machine for jobs."""
 
 _NODE = "{http://opcfoundation.org/UA/2011/03/UANodeSet.xsd}"
 
@@ -29,11 +29,11 @@ class Transition(NamedTuple):
     Attributes:
         machine: name of the machine's type.
         name: name of the transition.
-        node: numeric id of its node.
-        source: name of the state before it.
-        target: name of the state after it.
+        node: numeric id of the transition's node.
+        source: name of the state before the transition.
+        target: name of the state after the transition.
         cause: name of the method that causes the transition; "" without a method.
-        effects: names of the types of the events that it raises.
+        effects: names of the types of the events that the transition raises.
     """
 
     machine: str
@@ -72,38 +72,42 @@ def node_ids() -> Mapping[str, int]:
 
 @functools.cache
 def state_ids() -> Mapping[tuple[str, str], int]:
-    """Return the numeric ids of states, by the names of their machine's type and their own."""
+    """Return the numeric ids of states, by the name of the machine's type and the state's name."""
     ids: dict[tuple[str, str], int] = {}
     for transition in transitions():
-        for name, key in _ends(_nodes()[f"ns=1;i={transition.node}"]):
+        for name, key in _end_states(_nodes()[f"ns=1;i={transition.node}"]):
             ids[_machine(_nodes()[key]), name] = _number(key)
     return ids
 
 
 @functools.cache
 def transitions() -> tuple[Transition, ...]:
-    """Return the transitions of both machines, from the XML."""
+    """Return the transitions of both state machines."""
     parsed: list[Transition] = []
     for key, node in _nodes().items():
-        ends = [name for name, _ in _ends(node)]
+        states = [name for name, _ in _end_states(node)]
         machine = _machine(node)
-        if len(ends) == 2 and machine in (VISION, AUTOMATIC):
-            causes = [_name(_nodes()[reference]) for reference in _refers(node, "HasCause")]
-            effects = tuple(_name(_nodes()[reference]) for reference in _refers(node, "HasEffect"))
-            source, target = ends
+        if len(states) == 2 and machine in (VISION, AUTOMATIC):
+            causes = [_name(_nodes()[reference]) for reference in _references(node, "HasCause")]
+            effects = tuple(
+                _name(_nodes()[reference]) for reference in _references(node, "HasEffect")
+            )
+            source, target = states
             cause = causes[0] if causes else ""
-            made = Transition(machine, _name(node), _number(key), source, target, cause, effects)
-            parsed.append(made)
+            transition = Transition(
+                machine, _name(node), _number(key), source, target, cause, effects
+            )
+            parsed.append(transition)
     return tuple(parsed)
 
 
-def _ends(node: ET.Element) -> list[tuple[str, str]]:
-    """Return names and ids of a transition's states; empty for other nodes."""
-    keys = [*_refers(node, "FromState"), *_refers(node, "ToState")]
+def _end_states(node: ET.Element) -> list[tuple[str, str]]:
+    """Return names and ids of a transition's two states; empty for other nodes."""
+    keys = [*_references(node, "FromState"), *_references(node, "ToState")]
     return [(_name(_nodes()[key]), key) for key in keys]
 
 
-def _refers(node: ET.Element, kind: str) -> list[str]:
+def _references(node: ET.Element, kind: str) -> list[str]:
     references = node.iterfind(f"{_NODE}References/{_NODE}Reference")
     return [
         reference.text or ""

@@ -1,4 +1,4 @@
-"""The outlet: a server of OPC UA in a thread of its own."""
+"""Define the outlet that runs a server of OPC UA in an own thread."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_STATES = 1_000
 
 
 class OpcUaOutlet(Outlet[OpcUaSettings]):
-    """Serves cameras as vision systems; a result counts as delivered once the server has it.
+    """Serves cameras as vision systems; a result counts as delivered when the server has it.
 
     The server has a thread, so that neither its nodeset nor its clients block the cameras.
     """
@@ -42,7 +42,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         self._open = False
 
     async def open(self) -> None:
-        """Listen.
+        """Start the server's thread, and listen.
 
         Raises:
             MissingExtraError: asyncua is not installed.
@@ -79,7 +79,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
     async def watch(self) -> None:
         """Wait until the server fails."""
         if self._server is not None:
-            await self._in_server_thread(self._server.failed())
+            await self._in_server_thread(self._server.wait_failed())
 
     async def close(self) -> None:
         """Stop listening."""
@@ -97,12 +97,14 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         """Run a coroutine in the server's thread."""
         await asyncio.wrap_future(self._thread.submit(work))
 
-    async def _command(self, camera: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    async def _command(
+        self, camera: str, verb: str, arguments: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """Carry out a command in the cameras' thread; called in the server's thread."""
         if self.context.command is None or self._loop is None:
             raise ConfigurationError("commands are not allowed here")
-        work: Any = self.context.command(camera, verb, given)
-        done: dict[str, Any] = await asyncio.wrap_future(
+        work: Any = self.context.command(camera, verb, arguments)
+        outcome: dict[str, Any] = await asyncio.wrap_future(
             asyncio.run_coroutine_threadsafe(work, self._loop)
         )
-        return done
+        return outcome

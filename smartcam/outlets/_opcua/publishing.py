@@ -1,4 +1,4 @@
-"""A queue of values and events that one task publishes in order."""
+"""Publish values and events in order, from one queue."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_FAILURES = 100
-"""Consecutive failures to publish after which the server is opened again."""
+"""Number of consecutive failures to publish after which the server is opened again."""
 
 
 class PublishQueue:
-    """A queue of calls that publish something; a cancelled user does not interrupt a call.
+    """A queue of calls that publish something, in an own task.
 
-    Its users bound it: methods and batches wait in :meth:`settled` for their own calls.
+    The queue has no bound of its own: methods and batches wait in :meth:`wait_published`.
     """
 
     def __init__(self) -> None:
@@ -43,14 +43,14 @@ class PublishQueue:
         self._calls.append(call)
         self._wake.set()
 
-    async def settled(self) -> None:
-        """Return when all earlier calls are done."""
+    async def wait_published(self) -> None:
+        """Wait until all earlier calls are done, or publishing has failed for good."""
         done = asyncio.Event()
 
-        async def tell() -> None:
+        async def set_done() -> None:
             done.set()
 
-        self.put(tell)
+        self.put(set_done)
         waiting = asyncio.get_running_loop().create_task(done.wait())
         try:
             ends = {waiting} if self._task is None else {waiting, self._task}
@@ -60,7 +60,7 @@ class PublishQueue:
             with contextlib.suppress(asyncio.CancelledError):
                 await waiting
 
-    async def failed(self) -> None:
+    async def wait_failed(self) -> None:
         """Wait until publishing has failed for good, and raise the reason."""
         if self._task is not None:
             await asyncio.shield(self._task)

@@ -1,4 +1,4 @@
-"""Access to the server: users, certificates, and rights of anonymous clients."""
+"""Control access to the server: users, certificates, and rights of anonymous clients."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.settings import OpcUaSettings
 
 CERTIFICATE_DAYS = 3650
-"""Days for which the server's own certificate is valid."""
+"""Number of days for which a certificate that the server makes is valid."""
 
 MAX_FAILED_LOGINS = 10
-"""Failed logins from one address within LOGIN_SECONDS after which further ones are refused."""
+"""Number of failed logins of an address within FAILED_LOGIN_TIME from which on it is refused."""
 
-LOGIN_SECONDS = 60.0
-"""Seconds in which failed logins are counted."""
+FAILED_LOGIN_TIME = 60.0
+"""Seconds for which a failed login counts."""
 
 MAX_ADDRESSES = 1000
-"""Largest number of addresses whose failed logins are counted; the oldest is dropped first."""
+"""Largest number of addresses whose failed logins are counted; the oldest are dropped."""
 
 _SHA1 = "http://www.w3.org/2000/09/xmldsig#rsa-sha1"
 
-_READING = (
+_READ_SERVICES = (
     ua.ObjectIds.CreateSessionRequest_Encoding_DefaultBinary,
     ua.ObjectIds.CloseSessionRequest_Encoding_DefaultBinary,
     ua.ObjectIds.ActivateSessionRequest_Encoding_DefaultBinary,
@@ -72,7 +72,7 @@ _READING = (
 
 
 class Users:
-    """The users of a server, with asyncua's interface.
+    """The users of a server, in the form of asyncua's user managers.
 
     Args:
         settings: settings of the server.
@@ -89,7 +89,7 @@ class Users:
             if not password:
                 raise ConfigurationError(f"users.{name}: the password is empty")
         self._certificates = {
-            _certificate(folder / path, name): name
+            _load_certificate(folder / path, name): name
             for name, path in settings.user_certificates.items()
         }
         if len(self._certificates) < len(settings.user_certificates):
@@ -102,32 +102,34 @@ class Users:
         password: str | None = None,
         certificate: Any = None,
     ) -> User | None:
-        """Return a user with rights, or None if access is refused."""
+        """Return the user with the user's rights; None if access is refused."""
         del iserver
         if isinstance(certificate, ProvenCertificate):
-            made = x509.load_der_x509_certificate(certificate)
-            good = made.not_valid_before_utc <= datetime.now(UTC) <= made.not_valid_after_utc
+            parsed = x509.load_der_x509_certificate(certificate)
+            is_valid = (
+                parsed.not_valid_before_utc <= datetime.now(UTC) <= parsed.not_valid_after_utc
+            )
             name = self._certificates.get(bytes(certificate))
-            return User(UserRole.User, name) if name and good else None
+            return User(UserRole.User, name) if name and is_valid else None
         if username is not None:
             known = self._passwords.get(username)
-            given = (password or "").encode()
-            fits = hmac.compare_digest((known or "").encode(), given)
-            return User(UserRole.User, username) if known and fits else None
+            sent = (password or "").encode()
+            is_right = hmac.compare_digest((known or "").encode(), sent)
+            return User(UserRole.User, username) if known and is_right else None
         roles = {"read": UserRole.Anonymous, "control": UserRole.User}
         role = roles.get(self._anonymous)
         return None if role is None else User(role, "anonymous")
 
 
 class ProvenCertificate(bytes):
-    """The certificate of a user who has proved to have its key, not only the channel's."""
+    """A certificate whose user has proved to have the key; not only that of the channel."""
 
 
 class FailedLogins:
-    """Counts failed logins by address, against guessing of passwords.
+    """Counts failed logins by address, and refuses an address that guesses passwords.
 
     Args:
-        clock: seconds from any origin.
+        clock: function that returns a time in seconds, from any origin.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -135,14 +137,14 @@ class FailedLogins:
         self._failed: collections.OrderedDict[str, list[float]] = collections.OrderedDict()
 
     @contextlib.contextmanager
-    def attempt(self, address: str) -> Iterator[None]:
-        """Run an attempt to log in; an exception counts as a failure.
+    def counting_attempt(self, address: str) -> Iterator[None]:
+        """Count the block as a failed login if it raises.
 
         Raises:
             ServiceError: too many logins from this address have failed.
         """
         now = self._clock()
-        failed = [at for at in self._failed.get(address, ()) if now - at < LOGIN_SECONDS]
+        failed = [at for at in self._failed.get(address, ()) if now - at < FAILED_LOGIN_TIME]
         if len(failed) >= MAX_FAILED_LOGINS:
             raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
         try:
@@ -168,7 +170,7 @@ class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are
 
     def decrypt_user_token(self, isession: Any, token: Any) -> tuple[str, str]:
         """Return name and password, if they are right."""
-        with self.failed_logins.attempt(_address(isession)):
+        with self.failed_logins.counting_attempt(_address(isession)):
             name, password = super().decrypt_user_token(isession, token)
             if self.user_manager.get_user(self, name, password) is None:
                 raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
@@ -176,7 +178,7 @@ class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are
 
     def verify_x509_token(self, isession: Any, token: Any, signature: Any) -> ProvenCertificate:
         """Return a user's certificate, if it is known and its key has signed."""
-        with self.failed_logins.attempt(_address(isession)):
+        with self.failed_logins.counting_attempt(_address(isession)):
             if signature.Algorithm == _SHA1:
                 raise ServiceError(ua.StatusCodes.BadSecurityPolicyRejected)
             proven = ProvenCertificate(super().verify_x509_token(isession, token, signature))
@@ -191,27 +193,28 @@ def _address(isession: Any) -> str:
     return str(name[0] if isinstance(name, tuple) else name)
 
 
-def _certificate(path: Path, name: str) -> bytes:
+def _load_certificate(path: Path, name: str) -> bytes:
     """Return a user's certificate as DER."""
     try:
         data = path.read_bytes()
-        pem = data.lstrip().startswith(b"-----BEGIN")
-        made = (x509.load_pem_x509_certificate if pem else x509.load_der_x509_certificate)(data)
+        is_pem = data.lstrip().startswith(b"-----BEGIN")
+        load = x509.load_pem_x509_certificate if is_pem else x509.load_der_x509_certificate
+        certificate = load(data)
     except (OSError, ValueError) as exc:
         raise ConfigurationError(f"user_certificates.{name}: {path}: {exc}") from exc
-    return made.public_bytes(Encoding.DER)
+    return certificate.public_bytes(Encoding.DER)
 
 
 class Rights(SimpleRoleRuleset):  # type: ignore[misc] # asyncua's types are not followed
-    """The rights of users: anonymous ones may read."""
+    """The rights of users; anonymous users may only read."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._permission_dict[UserRole.Anonymous] = {*map(ua.NodeId, _READING)}
+        self._permission_dict[UserRole.Anonymous] = {*map(ua.NodeId, _READ_SERVICES)}
 
 
-def tokens(settings: OpcUaSettings) -> list[type]:
-    """Return the ways to log in."""
+def login_tokens(settings: OpcUaSettings) -> list[type]:
+    """Return the types of tokens by which clients may log in."""
     return [
         *([] if settings.anonymous == "no" else [ua.AnonymousIdentityToken]),
         *([ua.UserNameIdentityToken] if settings.users else []),
@@ -219,18 +222,18 @@ def tokens(settings: OpcUaSettings) -> list[type]:
     ]
 
 
-def policies(settings: OpcUaSettings) -> list[ua.SecurityPolicyType]:
+def security_policies(settings: OpcUaSettings) -> list[ua.SecurityPolicyType]:
     """Return the security policies that are offered."""
-    of = ua.SecurityPolicyType
+    policy = ua.SecurityPolicyType
     return [
-        of.Basic256Sha256_SignAndEncrypt,
-        of.Aes128Sha256RsaOaep_SignAndEncrypt,
-        of.Aes256Sha256RsaPss_SignAndEncrypt,
-        *((of.NoSecurity,) if settings.unencrypted else ()),
+        policy.Basic256Sha256_SignAndEncrypt,
+        policy.Aes128Sha256RsaOaep_SignAndEncrypt,
+        policy.Aes256Sha256RsaPss_SignAndEncrypt,
+        *((policy.NoSecurity,) if settings.unencrypted else ()),
     ]
 
 
-async def secure(server: Any, name: str, settings: OpcUaSettings, folder: Path) -> None:
+async def configure_security(server: Any, name: str, settings: OpcUaSettings, folder: Path) -> None:
     """Configure a server's certificate, its policies and its trusted clients.
 
     Raises:
@@ -238,10 +241,11 @@ async def secure(server: Any, name: str, settings: OpcUaSettings, folder: Path) 
     """
     try:
         if settings.certificate is None or settings.key is None:
-            beside = folder / settings.spool
-            certificate, key = beside / f"{name}.opcua.der", beside / f"{name}.opcua.pem"
+            own_folder = folder / settings.spool
+            certificate = own_folder / f"{name}.opcua.der"
+            key = own_folder / f"{name}.opcua.pem"
             if not (certificate.is_file() and key.is_file()):
-                _make(certificate, key, f"urn:{socket.gethostname()}:smartcam:{name}")
+                _make_certificate(certificate, key, f"urn:{socket.gethostname()}:smartcam:{name}")
         else:
             certificate, key = folder / settings.certificate, folder / settings.key
         await server.load_certificate(certificate)
@@ -253,8 +257,8 @@ async def secure(server: Any, name: str, settings: OpcUaSettings, folder: Path) 
             server.set_certificate_validator(await _validator(folder / settings.clients))
     except (OSError, ValueError, x509.ExtensionNotFound) as exc:
         raise ConfigurationError(f"outlet {name}: certificate: {exc}") from exc
-    server.set_security_policy(policies(settings), Rights())
-    server.set_identity_tokens(tokens(settings))
+    server.set_security_policy(security_policies(settings), Rights())
+    server.set_identity_tokens(login_tokens(settings))
 
 
 def _application_uri(certificate: x509.Certificate) -> str:
@@ -265,12 +269,12 @@ def _application_uri(certificate: x509.Certificate) -> str:
     return str(uris[0])
 
 
-def _make(certificate: Path, key: Path, uri: str) -> None:
+def _make_certificate(certificate: Path, key: Path, uri: str) -> None:
     """Make a self-signed certificate, and its key, which only this user may read."""
-    made = cert_gen.generate_private_key()
+    private_key = cert_gen.generate_private_key()
     host = socket.gethostname()
     signed = cert_gen.generate_self_signed_app_certificate(
-        made,
+        private_key,
         uri.rpartition(":")[2],
         {"organizationName": "smartcam"},
         [x509.UniformResourceIdentifier(uri), x509.DNSName(host)],
@@ -280,12 +284,13 @@ def _make(certificate: Path, key: Path, uri: str) -> None:
     certificate.parent.mkdir(parents=True, exist_ok=True)
     handle = os.open(key, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with open(handle, "wb") as stream:  # noqa: PTH123 - of a handle
-        stream.write(cert_gen.dump_private_key_as_pem(made))
+        stream.write(cert_gen.dump_private_key_as_pem(private_key))
     certificate.write_bytes(signed.public_bytes(Encoding.DER))
 
 
 async def _validator(folder: Path) -> CertificateValidator:
     store = TrustStore([folder], [])
     await store.load()
-    of = CertificateValidatorOptions
-    return CertificateValidator(of.TIME_RANGE | of.URI | of.TRUSTED | of.PEER_CLIENT, store)
+    option = CertificateValidatorOptions
+    checks = option.TIME_RANGE | option.URI | option.TRUSTED | option.PEER_CLIENT
+    return CertificateValidator(checks, store)

@@ -1,4 +1,4 @@
-"""The server: cameras as vision systems, their results, and the calls of clients."""
+"""Run the server, which shows cameras as vision systems to clients."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.outlets._opcua.book import ResultBook
 from smartcam.outlets._opcua.events import Events
 from smartcam.outlets._opcua.files import TransferFiles
-from smartcam.outlets._opcua.methods import Method, Methods, kind_of
+from smartcam.outlets._opcua.methods import Method, Methods, type_number
 from smartcam.outlets._opcua.nodes import CameraNodes
 from smartcam.outlets._opcua.nodeset import AUTOMATIC, URI, VISION, node_ids, nodeset_text
 from smartcam.outlets._opcua.publishing import PublishQueue
-from smartcam.outlets._opcua.security import GuardedServer, Users, secure
+from smartcam.outlets._opcua.security import GuardedServer, Users, configure_security
 from smartcam.outlets._opcua.system import VisionSystem
 from smartcam.outlets._opcua.values import VisionValues
 from smartcam.outlets._records import picture_of
@@ -42,13 +42,13 @@ MAX_CAMERAS = 1_000
 """Largest number of cameras of one server."""
 
 MAX_CONNECTIONS = 100
-"""Largest number of clients of one server at a time."""
+"""Largest number of clients that are connected to a server at the same time."""
 
 METHOD_TYPES = (VISION, AUTOMATIC, "RecipeManagementType", "ResultManagementType")
-"""Types whose methods a camera has."""
+"""Types of the nodeset whose methods a camera has."""
 
 OWN_URI = "urn:smartcam:outlets:opcua"
-"""Namespace of cameras and of the structures made from their layouts."""
+"""Namespace of the nodes of cameras, and of the structures for their layouts."""
 
 
 class VisionServer:
@@ -65,11 +65,11 @@ class VisionServer:
         self, name: str, settings: OpcUaSettings, folder: Path, context: OutletContext
     ) -> None:
         self.name, self.settings, self.folder, self.context = name, settings, folder, context
-        self.outbox = PublishQueue()
+        self.publish_queue = PublishQueue()
         self.book = ResultBook(settings.kept_results)
-        self.cameras: dict[str, CameraFace] = {}
+        self.cameras: dict[str, CameraView] = {}
         self._states: dict[str, Mapping[str, Any]] = {}
-        self._making: dict[str, asyncio.Task[None]] = {}
+        self._making_tasks: dict[str, asyncio.Task[None]] = {}
         self.calls: dict[tuple[ua.NodeId, str], Callable[..., Awaitable[Any]]] = {}
         self._run_id, self._jobs = secrets.token_hex(4), itertools.count(1)
         self.server: Any = None
@@ -89,7 +89,7 @@ class VisionServer:
         server.product_uri = "urn:smartcam"
         server.set_endpoint(self.settings.listen)
         server.iserver.max_connections = MAX_CONNECTIONS
-        await secure(server, self.name, self.settings, self.folder)
+        await configure_security(server, self.name, self.settings, self.folder)
         await server.import_xml(xmlstring=nodeset_text())
         vision = await server.get_namespace_index(URI)
         own_index = await server.register_namespace(OWN_URI)
@@ -98,17 +98,17 @@ class VisionServer:
         self.events = Events(server, vision)
         self.files = TransferFiles(server, own_index)
         await self._link_types()
-        self.outbox.start()
-        chosen = filter(self.settings.chooses, self.context.cameras())
-        for name in itertools.islice(chosen, MAX_CAMERAS):
-            await self._make(name)
+        self.publish_queue.start()
+        names = filter(self.settings.chooses, self.context.cameras())
+        for name in itertools.islice(names, MAX_CAMERAS):
+            await self._make_camera(name)
         await server.start()
 
     async def _link_types(self) -> None:
-        """Let clients call a camera's methods by the nodes of their types, too."""
+        """Let clients call a camera's methods also by the methods' nodes in the types."""
         for kind in METHOD_TYPES:
-            of = self.server.get_node(ua.NodeId(node_ids()[kind], self.spaces[0]))
-            for method in await of.get_methods():
+            type_node = self.server.get_node(ua.NodeId(node_ids()[kind], self.spaces[0]))
+            for method in await type_node.get_methods():
                 name = (await method.read_browse_name()).Name
                 self.server.link_method(method, functools.partial(self._call, name))
 
@@ -119,8 +119,8 @@ class VisionServer:
         return await call(parent, *arguments)
 
     async def stop(self) -> None:
-        """End jobs, and stop listening; whatever fails, the port is free afterwards."""
-        for task in [*self._making.values()]:
+        """End jobs, and stop listening; the port is free afterwards even if something fails."""
+        for task in [*self._making_tasks.values()]:
             task.cancel()
         server, self.server = self.server, None
         async with contextlib.AsyncExitStack() as stack:
@@ -128,34 +128,34 @@ class VisionServer:
                 stack.push_async_callback(server.stop)
             if self.files is not None:
                 stack.callback(self.files.close)
-            stack.push_async_callback(self.outbox.stop)
+            stack.push_async_callback(self.publish_queue.stop)
             for camera in self.cameras.values():
                 stack.push_async_callback(camera.system.close)
 
-    async def failed(self) -> None:
+    async def wait_failed(self) -> None:
         """Wait until publishing has failed for good, and raise the reason."""
-        await self.outbox.failed()
+        await self.publish_queue.wait_failed()
 
-    def new_job(self) -> str:
-        """Return a new id for a job, different from all earlier ones, also of earlier runs."""
+    def new_job_id(self) -> str:
+        """Return a new id for a job, which differs from all ids of this run and of earlier runs."""
         return f"{self._run_id}-{next(self._jobs)}"
 
-    # ------------------------------------------------------------------ what cameras bring
+    # ------------------------------------------------------------------ from cameras
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
-        """Follow a camera's state; make the nodes of a new one."""
-        face = self.cameras.get(camera)
-        if face is not None:
-            face.system.camera_changed(state)
+        """Pass on a camera's state; first make the nodes of a new camera."""
+        view = self.cameras.get(camera)
+        if view is not None:
+            view.system.camera_changed(state)
             return
         self._states[camera] = state
-        if camera not in self._making and len(self.cameras) < MAX_CAMERAS:
-            task = asyncio.get_running_loop().create_task(self._make(camera))
-            self._making[camera] = task
-            task.add_done_callback(lambda done: self._made(camera, done))
+        if camera not in self._making_tasks and len(self.cameras) < MAX_CAMERAS:
+            task = asyncio.get_running_loop().create_task(self._make_camera(camera))
+            self._making_tasks[camera] = task
+            task.add_done_callback(lambda done: self._on_made(camera, done))
 
-    def _made(self, camera: str, done: asyncio.Task[None]) -> None:
-        self._making.pop(camera, None)
+    def _on_made(self, camera: str, done: asyncio.Task[None]) -> None:
+        self._making_tasks.pop(camera, None)
         if not done.cancelled() and (error := done.exception()) is not None:
             logger.error("outlet %s: camera %s: %s", self.name, camera, text_of(error))
 
@@ -163,31 +163,31 @@ class VisionServer:
         """Publish entries, and return when clients can see them."""
         for entry in entries:
             if entry.camera and entry.camera not in self.cameras:
-                await self._make(entry.camera)
-            faces = [self.cameras[entry.camera]] if entry.camera else [*self.cameras.values()]
-            for face in faces:  # a gap may concern all cameras
-                face.system.take(entry)
-        await self.outbox.settled()
+                await self._make_camera(entry.camera)
+            views = [self.cameras[entry.camera]] if entry.camera else [*self.cameras.values()]
+            for view in views:  # a gap may concern all cameras
+                view.system.accept_entry(entry)
+        await self.publish_queue.wait_published()
 
-    async def _make(self, name: str) -> None:
-        """Make the nodes of a camera, once."""
-        making = self._making.get(name)
+    async def _make_camera(self, name: str) -> None:
+        """Make the nodes of a camera, unless there are nodes already."""
+        making = self._making_tasks.get(name)
         if making is not None and making is not asyncio.current_task():
             await asyncio.shield(making)
         if name in self.cameras:
             return
         if len(self.cameras) >= MAX_CAMERAS:
             raise ConfigurationError(f"expected {MAX_CAMERAS} cameras at most")
-        face = CameraFace(self, name)
-        await face.make()
-        self.cameras[name] = face
+        view = CameraView(self, name)
+        await view.make_nodes()
+        self.cameras[name] = view
         state = self._states.pop(name, None)
         if state is not None:
-            face.system.camera_changed(state)
+            view.system.camera_changed(state)
 
 
-class CameraFace:
-    """One camera: its states and jobs, and the nodes that show them.
+class CameraView:
+    """Connects a camera's states and jobs with the nodes that show them.
 
     Args:
         server: server of the camera.
@@ -196,7 +196,7 @@ class CameraFace:
 
     def __init__(self, server: VisionServer, name: str) -> None:
         self._server, self._settings = server, server.settings
-        parts = server.events, server.values, server.outbox
+        parts = server.events, server.values, server.publish_queue
         self.nodes = CameraNodes(server.server, server.spaces, name, parts)
         self.system = VisionSystem(
             name,
@@ -205,27 +205,27 @@ class CameraFace:
             self,
             picture=self._picture,
             names=lambda: server.context.names(name),
-            new_job=server.new_job,
+            new_job=server.new_job_id,
             simulated=dict(server.context.cameras()).get(name),
         )
         self._methods = Methods(
-            self.system, self.nodes, server.values, server.book, server.outbox.settled
+            self.system, self.nodes, server.values, server.book, server.publish_queue.wait_published
         )
 
-    async def make(self) -> None:
+    async def make_nodes(self) -> None:
         """Make the nodes, and link the methods."""
-        await self.nodes.make(self.system.states)
+        await self.nodes.make_nodes(self.system.states)
         for path, method in self._methods.table().items():
-            await self._link(path, method)
+            await self._link_method(path, method)
         if self._server.files is not None:
             await self._server.files.link(self.nodes, self._server.book)
 
-    async def _link(self, path: str, method: Method) -> None:
+    async def _link_method(self, path: str, method: Method) -> None:
         node = self._server.server.get_node(self.nodes.id(path))
         types: list[int] = []
         with contextlib.suppress(ua.UaStatusCodeError):  # a method without arguments
             inputs = await (await node.get_child("0:InputArguments")).read_value()
-            types = [kind_of(argument.DataType, argument.ValueRank) for argument in inputs]
+            types = [type_number(argument.DataType, argument.ValueRank) for argument in inputs]
 
         async def call(_parent: ua.NodeId, *arguments: ua.Variant) -> Any:
             return await self._methods.call(method, types, arguments)
@@ -234,46 +234,46 @@ class CameraFace:
         parent, _, name = path.rpartition(".")
         self._server.calls[self.nodes.id(parent), name] = call
 
-    async def _command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    async def _command(self, name: str, verb: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         if self._server.context.command is None:
             raise ConfigurationError("commands are not allowed here")
-        return await self._server.context.command(name, verb, given)
+        return await self._server.context.command(name, verb, arguments)
 
     def _picture(self, fields: Mapping[str, Any]) -> Path | None:
         pattern = self._settings.pictures
         return None if pattern is None else picture_of(pattern, self._server.folder, fields)
 
-    # ------------------------------------------------------------------ what clients see
+    # ------------------------------------------------------------------ to clients
 
-    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+    def show_transition(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
-        application = self.system.prepared or 0
+        application = self.system.prepared_application or 0
         self.nodes.prepared = self.system.recipe_name(application), application
-        self.nodes.moved(transition, job, why)
+        self.nodes.show_transition(transition, job, why)
 
-    def acquired(self, job: VisionJob) -> None:
-        """Raise the event that a job's part may move."""
-        self.nodes.acquired(job)
+    def show_acquisition(self, job: VisionJob) -> None:
+        """Raise the event that a job's picture is taken, so that the part may move."""
+        self.nodes.show_acquisition(job)
 
-    def result(self, result: VisionResult) -> None:
+    def show_result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""
         recipe = self.system.recipe_name(result.application)
-        self.nodes.result(result, recipe, self._columns(result), self._server.book.add)
+        self.nodes.show_result(result, recipe, self._columns(result), self._server.book.add)
 
     def _columns(self, result: VisionResult) -> Sequence[Column]:
-        """Return the columns of a result's layout; none if it cannot be determined."""
+        """Return the columns of a result's layout; empty if the layout is not known."""
         if result.application is None:
             return ()
         try:
             return self._server.context.columns(result.camera, result.application)
         except SmartCamError as exc:
-            self.message(f"application {result.application}: {exc}", type(exc).__name__, None)
+            self.show_message(f"application {result.application}: {exc}", type(exc).__name__, None)
             return ()
 
-    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
+    def show_message(self, text: str, kind: str, job: VisionJob | None) -> None:
         """Raise an event with a text."""
-        self.nodes.message(text, kind, job)
+        self.nodes.show_message(text, kind, job)
 
-    def trouble(self, why: str) -> None:
-        """Show why the camera cannot be used; "" when it can."""
-        self.nodes.trouble(why)
+    def show_trouble(self, why: str) -> None:
+        """Show the reason why the camera cannot be used; "" if it can be used."""
+        self.nodes.show_trouble(why)

@@ -1,4 +1,4 @@
-"""Settings of a server of OPC UA."""
+"""Define the settings of a server of OPC UA."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_RECIPES = 1000
 """Largest number of names for applications."""
 
 
-def _endpoint(text: str) -> str:
+def _check_endpoint(text: str) -> str:
     try:
         parts = urlsplit(text)
         fits = parts.scheme == "opc.tcp" and parts.hostname and parts.port
@@ -34,7 +34,7 @@ class OpcUaSettings(OutletSettings):
     timeout: float = Field(
         120.0, gt=0, le=3600, description="seconds of the timeout for the server's start"
     )
-    listen: Annotated[str, AfterValidator(_endpoint)] = Field(
+    listen: Annotated[str, AfterValidator(_check_endpoint)] = Field(
         description="opc.tcp://HOST:PORT; 0.0.0.0 for all of this computer's addresses"
     )
     users: dict[str, Secret] = Field(
@@ -91,7 +91,7 @@ class OpcUaSettings(OutletSettings):
     )
 
     @model_validator(mode="after")
-    def _fits(self) -> Any:
+    def _check_combination(self) -> Any:
         if not (self.users or self.user_certificates) and self.anonymous == "no":
             raise ValueError(
                 "nobody could log in: expected users:, user_certificates:, or anonymous: read or "

@@ -1,4 +1,4 @@
-"""A camera as OPC UA's vision system: its states change by methods, results and the camera."""
+"""Represent a camera as a vision system of OPC UA, with states, jobs and results."""
 
 from __future__ import annotations
 
@@ -36,42 +36,42 @@ logger: logging.Logger = logging.getLogger("smartcam.outlets")
 MAX_REMEMBERED_JOBS = 1000
 """Largest number of ended jobs that are remembered for late results from the spool."""
 
-MAX_PENDING = 1000
-"""Largest number of results that wait until it is known whether they belong to the running job."""
+MAX_UNDECIDED_ENTRIES = 1000
+"""Largest number of entries that wait until it is known whether they belong to the running job."""
 
 RESULT_WAIT = 5.0
 """Seconds to wait after a trigger for its result from the spool."""
 
 COMMAND_GRACE = 30.0
-"""Additional seconds, beyond a command's own timeout, for its way to the camera."""
+"""Seconds that a command may take beyond its own timeout, for the way to the camera."""
 
 PREPARE_WAIT = 0.3
-"""Seconds that PrepareRecipe waits before it returns that it is not completed yet."""
+"""Seconds that PrepareRecipe waits for the camera; after that, it returns "not completed"."""
 
-CONTINUOUS_GRACE = 5.0
+CONTINUOUS_RESULT_WAIT = 5.0
 """Seconds after continuous execution in which its last results may arrive from the spool."""
 
-LATE_RESULT_SECONDS = 60.0
-"""Seconds in which a result of an aborted job may still arrive."""
+LATE_RESULT_WAIT = 60.0
+"""Seconds after an aborted job in which its result may still arrive."""
 
 
-class Face(Protocol):
-    """The nodes and events that clients see of a vision system; each call returns at once."""
+class VisionView(Protocol):
+    """Shows a vision system to clients, by nodes and events; each call returns at once."""
 
-    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+    def show_transition(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
 
-    def acquired(self, job: VisionJob) -> None:
-        """Raise the event for a taken picture, after which the part may move."""
+    def show_acquisition(self, job: VisionJob) -> None:
+        """Raise the event that a job's picture is taken, so that the part may move."""
 
-    def result(self, result: VisionResult) -> None:
+    def show_result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""
 
-    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
+    def show_message(self, text: str, kind: str, job: VisionJob | None) -> None:
         """Raise an event with a text."""
 
-    def trouble(self, why: str) -> None:
-        """Show the reason why the camera is unusable; "" if it can be used."""
+    def show_trouble(self, why: str) -> None:
+        """Show the reason why the camera cannot be used; "" if it can be used."""
 
 
 class VisionSystem:
@@ -81,11 +81,11 @@ class VisionSystem:
         name: name of the camera.
         settings: settings of the server.
         command: function that carries out a command, by the camera's name, a verb and its fields.
-        face: nodes and events that clients see.
+        view: view that shows the system to clients.
         picture: function that returns the file of a result's picture.
         new_job: function that returns an id for a job.
         names: function that returns the names of the camera's own applications, with their numbers.
-        simulated: True for an emulated camera, False for a real one, None if that is not known.
+        simulated: True for an emulated camera, False for a real one, None if this is not known.
     """
 
     def __init__(
@@ -93,14 +93,14 @@ class VisionSystem:
         name: str,
         settings: OpcUaSettings,
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]],
-        face: Face,
+        view: VisionView,
         *,
         picture: Callable[[Mapping[str, Any]], Path | None],
         new_job: Callable[[], str],
         names: Callable[[], Mapping[str, int]] = dict,
         simulated: bool | None = None,
     ) -> None:
-        self.name, self.settings, self.face = name, settings, face
+        self.name, self.settings, self.view = name, settings, view
         self.states = VisionStates()
         self.application: int | None = None
         self.job: VisionJob | None = None
@@ -109,17 +109,19 @@ class VisionSystem:
         self._simulated = simulated
         # whether the camera is connected; None: unknown
         self._connected: bool | None = None
-        # whether clients prepare recipes: then none becomes ready by itself
-        self._by_client = False
-        self._wanted: int | None = None  # the application that a client has prepared
+        # whether clients prepare recipes; if they do, no recipe becomes ready by itself
+        self._clients_prepare = False
+        self._client_application: int | None = None  # the application that a client has prepared
         self._ready_application: int | None = None
-        self._preparing = False
-        # whether this server stopped the camera: start it before the next trigger
-        self._stopped = False
+        self._is_preparing = False
+        # whether this server has stopped the camera, which must then be started before a trigger
+        self._was_stopped = False
         self._late_until = -1.0  # loop time until which a result may belong to an aborted job
-        self._by_trigger: collections.OrderedDict[datetime, VisionJob] = collections.OrderedDict()
+        self._jobs_by_trigger: collections.OrderedDict[datetime, VisionJob] = (
+            collections.OrderedDict()
+        )
         self._last_continuous: VisionJob | None = None
-        self._pending: collections.deque[OutletEntry] = collections.deque()
+        self._undecided_entries: collections.deque[OutletEntry] = collections.deque()
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def close(self) -> None:
@@ -134,22 +136,22 @@ class VisionSystem:
 
     def camera_changed(self, state: Mapping[str, Any]) -> None:
         """Update the states after a change of the camera's connection or active application."""
-        connected, before = bool(state.get("connected")), self._connected
+        connected, was_connected = bool(state.get("connected")), self._connected
         self._connected, self.application = connected, state.get("application")
         if connected:
-            if not before:
+            if not was_connected:
                 self._late_until = -1.0
-                self.face.trouble("")
-            self._follow()
-        elif before is not False:
+                self.view.show_trouble("")
+            self._update_states()
+        elif was_connected is not False:
             why = str(state.get("reason") or "the camera is not connected")
-            self._end_job(FAILED, why, owed=False)
-            self.face.trouble(why)
+            self._end_job(FAILED, why, may_come_late=False)
+            self.view.show_trouble(why)
             if self.states.vision in ("Preoperational", "Operational"):
                 self._move("Error", why=why)
 
-    def _follow(self) -> None:
-        """Make the transitions that the camera's state causes."""
+    def _update_states(self) -> None:
+        """Make the transitions that follow from the camera's state."""
         states = self.states
         if not self._connected:
             if self._connected is False and states.vision == "Preoperational":
@@ -157,15 +159,19 @@ class VisionSystem:
             return
         if states.vision == "Error":
             self._move("Operational" if self.settings.automatic else "Preoperational")
-        if states.vision == "Preoperational" and self.settings.automatic and not self._by_client:
+        if (
+            states.vision == "Preoperational"
+            and self.settings.automatic
+            and not self._clients_prepare
+        ):
             self._move("Operational")
-        if self._preparing:
+        if self._is_preparing:
             return
         if states.automatic == "Ready" and self._ready_application != self.application:
             self._move("Initialized", why="the camera has another application")
-        wanted = not self._by_client or self.application == self._wanted
-        ready = self.settings.automatic and self.application and wanted
-        if states.automatic == "Initialized" and ready:
+        is_wanted = not self._clients_prepare or self.application == self._client_application
+        may_become_ready = self.settings.automatic and self.application and is_wanted
+        if states.automatic == "Initialized" and may_become_ready:
             self._become_ready("")
 
     def _become_ready(self, cause: str) -> None:
@@ -175,17 +181,17 @@ class VisionSystem:
     def _move(
         self, target: str, cause: str = "", *, job: VisionJob | None = None, why: str = ""
     ) -> None:
-        self.face.moved(self.states.move(target, cause), job, why)
+        self.view.show_transition(self.states.move(target, cause), job, why)
 
     # ------------------------------------------------------------------ methods
 
     @property
-    def prepared(self) -> int | None:
-        """The application that is ready for jobs; None without."""
-        ready = self.states.automatic not in ("", "Initialized")
-        return self._ready_application if ready else None
+    def prepared_application(self) -> int | None:
+        """The application that is ready for jobs; None if none is."""
+        is_ready = self.states.automatic not in ("", "Initialized")
+        return self._ready_application if is_ready else None
 
-    def change(self, method: str, target: str, why: str = "") -> None:
+    def change_state(self, method: str, target: str, why: str = "") -> None:
         """Carry out a method that only changes the state of the vision system.
 
         Args:
@@ -196,15 +202,15 @@ class VisionSystem:
         Raises:
             WrongStateError: the method is not allowed in this state.
         """
-        self._check(method)
-        self._by_client, self._wanted = True, None
+        self._check_allowed(method)
+        self._clients_prepare, self._client_application = True, None
         self._end_job(ABORTED, f"{method} {why}".rstrip())
         self._move(target, method, why=why)
-        self._follow()
+        self._update_states()
 
-    def _check(self, method: str) -> None:
+    def _check_allowed(self, method: str) -> None:
         if not self.states.allows(method):
-            raise WrongStateError(f"{method} is not allowed in {self.states.both}")
+            raise WrongStateError(f"{method} is not allowed in {self.states.text}")
 
     @property
     def recipes(self) -> Mapping[str, int]:
@@ -221,7 +227,7 @@ class VisionSystem:
             internal: number as a text; "" if only the name is given.
 
         Raises:
-            UnknownRecipeError: there is no such recipe, or the two ids name different ones.
+            UnknownRecipeError: there is no such recipe, or the two ids name different recipes.
         """
         applications: set[int] = set()
         recipes = self.recipes
@@ -243,9 +249,9 @@ class VisionSystem:
         return next(names, "" if application is None else str(application))
 
     async def prepare(self, application: int) -> bool:
-        """Begin to prepare an application; return True if it is ready after a moment.
+        """Begin to prepare an application; return True if it is ready after :data:`PREPARE_WAIT`.
 
-        A camera may take seconds, and the client's other requests wait for the return.
+        A camera may take seconds, but the client's other requests wait until this method returns.
 
         Raises:
             WrongStateError: the method is not allowed in this state, or the state changed
@@ -253,11 +259,11 @@ class VisionSystem:
             BusyError: another recipe is being prepared.
             SmartCamError: the camera failed or refused.
         """
-        if self._preparing:
+        if self._is_preparing:
             raise BusyError("another recipe is being prepared")
         if self.states.automatic not in ("Initialized", "Ready"):
-            raise WrongStateError(f"PrepareRecipe is not allowed in {self.states.both}")
-        self._by_client, self._wanted, self._preparing = True, None, True
+            raise WrongStateError(f"PrepareRecipe is not allowed in {self.states.text}")
+        self._clients_prepare, self._client_application, self._is_preparing = True, None, True
         prepared: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._spawn(lambda: self._prepare(application, prepared))
         try:
@@ -265,17 +271,19 @@ class VisionSystem:
                 await asyncio.shield(prepared)
         except TimeoutError:
             if not prepared.done():
-                prepared.add_done_callback(lambda done: self._prepared_later(application, done))
+                prepared.add_done_callback(
+                    lambda done: self._report_late_failure(application, done)
+                )
                 return False
             prepared.result()
         return True
 
-    def _prepared_later(self, application: int, done: asyncio.Future[None]) -> None:
-        """Report the failure of a preparation after the method's return."""
+    def _report_late_failure(self, application: int, done: asyncio.Future[None]) -> None:
+        """Report a preparation that failed after the method had returned."""
         error = None if done.cancelled() else done.exception()
         if error is not None:
             text = f"recipe {application} is not prepared: {str(error) or type(error).__name__}"
-            self.face.message(text, type(error).__name__, None)
+            self.view.show_message(text, type(error).__name__, None)
 
     async def _prepare(self, application: int, prepared: asyncio.Future[None]) -> None:
         """Prepare an application, and set the outcome."""
@@ -284,12 +292,12 @@ class VisionSystem:
                 self._move("Initialized", why="another recipe is prepared")
             if application != self.application:
                 timeout = self.settings.switch_timeout
-                await self._do("switch", application=application, timeout=timeout)
-            await self._start()
+                await self._carry_out("switch", application=application, timeout=timeout)
+            await self._start_camera()
             self.application = application
             if self.states.automatic != "Initialized":
-                raise WrongStateError(f"the state became {self.states.both} meanwhile")
-            self._wanted = application
+                raise WrongStateError(f"the state became {self.states.text} meanwhile")
+            self._client_application = application
             self._become_ready("PrepareRecipe")
         except (SmartCamError, TimeoutError) as exc:
             prepared.set_exception(exc)
@@ -297,7 +305,7 @@ class VisionSystem:
         else:
             prepared.set_result(None)
         finally:
-            self._preparing = False
+            self._is_preparing = False
             if not prepared.done():
                 prepared.cancel()
 
@@ -307,8 +315,8 @@ class VisionSystem:
         Raises:
             WrongStateError: the method is not allowed in this state.
         """
-        self._check("UnprepareRecipe")
-        self._by_client, self._wanted = True, None
+        self._check_allowed("UnprepareRecipe")
+        self._clients_prepare, self._client_application = True, None
         self._move("Initialized", "UnprepareRecipe")
 
     def start_job(self, ids: tuple[Any, Any, Any], recipe: str, *, single: bool) -> VisionJob:
@@ -324,12 +332,14 @@ class VisionSystem:
             UnknownRecipeError: another recipe is ready.
         """
         method = "StartSingleJob" if single else "StartContinuous"
-        self._check(method)
-        if recipe and self.application_of(recipe) != self.prepared:
+        self._check_allowed(method)
+        if recipe and self.application_of(recipe) != self.prepared_application:
             raise UnknownRecipeError(f"{recipe!r:.80} is not ready: prepare it first")
-        self.job = job = VisionJob(self._new_job(), single, *ids, self.prepared)
+        self.job = job = VisionJob(self._new_job(), single, *ids, self.prepared_application)
         self._move("SingleExecution" if single else "ContinuousExecution", method, job=job)
-        job.task = self._spawn(lambda: self._single(job) if single else self._continuous(job))
+        job.task = self._spawn(
+            lambda: self._run_single(job) if single else self._start_continuous(job)
+        )
         return job
 
     def end_job(self, method: str, why: str = "") -> None:
@@ -342,20 +352,20 @@ class VisionSystem:
         Raises:
             WrongStateError: no job is running.
         """
-        self._check(method)
+        self._check_allowed(method)
         job = self._end_job(ABORTED, f"{method} {why}".rstrip())
         self._move("Ready", method, job=job, why=why)
-        self._follow()
+        self._update_states()
 
     # ------------------------------------------------------------------ jobs
 
     def _spawn(self, work: Callable[[], Awaitable[None]]) -> asyncio.Task[None]:
-        task = asyncio.get_running_loop().create_task(self._guarded(work))
+        task = asyncio.get_running_loop().create_task(self._report_errors(work))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
 
-    async def _guarded(self, work: Callable[[], Awaitable[None]]) -> None:
+    async def _report_errors(self, work: Callable[[], Awaitable[None]]) -> None:
         try:
             await work()
         except asyncio.CancelledError:
@@ -366,49 +376,49 @@ class VisionSystem:
             logger.exception("outlet: camera %s", self.name)
             self._job_failed(self.job, text_of(exc))
 
-    async def _do(self, verb: str, **given: Any) -> dict[str, Any]:
-        limit = float(given.get("timeout", self.settings.switch_timeout)) + COMMAND_GRACE
+    async def _carry_out(self, verb: str, **arguments: Any) -> dict[str, Any]:
+        limit = float(arguments.get("timeout", self.settings.switch_timeout)) + COMMAND_GRACE
         async with asyncio.timeout(limit):
-            return await self._command(self.name, verb, given)
+            return await self._command(self.name, verb, arguments)
 
-    async def _start(self) -> None:
-        """Start the camera, unless it always runs."""
+    async def _start_camera(self) -> None:
+        """Start the camera; do nothing if it has no such command, since it always runs."""
         with contextlib.suppress(UnsupportedError):
-            await self._do("start", timeout=self.settings.switch_timeout)
-        self._stopped = False
+            await self._carry_out("start", timeout=self.settings.switch_timeout)
+        self._was_stopped = False
 
-    async def _single(self, job: VisionJob) -> None:
+    async def _run_single(self, job: VisionJob) -> None:
         try:
-            if self._stopped:
-                await self._start()
-            done = await self._do("trigger", timeout=self.settings.trigger_timeout)
+            if self._was_stopped:
+                await self._start_camera()
+            outcome = await self._carry_out("trigger", timeout=self.settings.trigger_timeout)
         except (SmartCamError, TimeoutError) as exc:
             self._job_failed(job, str(exc) or type(exc).__name__, type(exc).__name__)
             return
         if self.job is not job:
             return
-        self.face.acquired(job)
-        at = done["result"].get("triggered_at")
-        job.trigger = datetime.fromisoformat(at) if isinstance(at, str) else at
-        if job.trigger is not None:
-            self._by_trigger[job.trigger] = job
-            while len(self._by_trigger) > MAX_REMEMBERED_JOBS:
-                self._by_trigger.popitem(last=False)
-        self._take_pending()
+        self.view.show_acquisition(job)
+        at = outcome["result"].get("triggered_at")
+        job.triggered_at = datetime.fromisoformat(at) if isinstance(at, str) else at
+        if job.triggered_at is not None:
+            self._jobs_by_trigger[job.triggered_at] = job
+            while len(self._jobs_by_trigger) > MAX_REMEMBERED_JOBS:
+                self._jobs_by_trigger.popitem(last=False)
+        self._publish_undecided()
         try:
             async with asyncio.timeout(RESULT_WAIT):
-                await job.seen.wait()
+                await job.result_published.wait()
         except TimeoutError:
             text = f"the result of job {job.id} is not there yet: it comes later, under its id"
-            self.face.message(text, "ResultDelayed", job)
+            self.view.show_message(text, "ResultDelayed", job)
         if self.job is job:
             self.job = None
             self._move("Ready", job=job)
-            self._follow()
+            self._update_states()
 
-    async def _continuous(self, job: VisionJob) -> None:
+    async def _start_continuous(self, job: VisionJob) -> None:
         try:
-            await self._start()
+            await self._start_camera()
         except (SmartCamError, TimeoutError) as exc:
             self._job_failed(job, str(exc) or type(exc).__name__, type(exc).__name__)
 
@@ -418,108 +428,119 @@ class VisionSystem:
         self._end_job(FAILED, why, kind=kind)
         if self.states.automatic in ("SingleExecution", "ContinuousExecution"):
             self._move("Ready", job=job, why=why)
-        self._follow()
+        self._update_states()
 
     def _end_job(
-        self, state: int, why: str, *, kind: str = "Aborted", owed: bool = True
+        self, state: int, why: str, *, kind: str = "Aborted", may_come_late: bool = True
     ) -> VisionJob | None:
         """End the running job, if there is one, and publish its end."""
         job, self.job = self.job, None
         if job is None:
             return None
         loop = asyncio.get_running_loop()
-        job.ended_clock = loop.time()
+        job.ended_at = loop.time()
         if job.task is not None and job.task is not asyncio.current_task():
             job.task.cancel()
-        if job.single and job.trigger is None and owed:
-            self._late_until = loop.time() + LATE_RESULT_SECONDS
-        if job.trigger is not None:
-            self._by_trigger.pop(job.trigger, None)  # the end of the job counts as its only result
-        if not job.single:
+        if job.is_single and job.triggered_at is None and may_come_late:
+            self._late_until = loop.time() + LATE_RESULT_WAIT
+        if job.triggered_at is not None:
+            self._jobs_by_trigger.pop(
+                job.triggered_at, None
+            )  # the end of the job counts as its only result
+        if not job.is_single:
             self._last_continuous = job
-            self._stopped = True
+            self._was_stopped = True
             self._spawn(self._stop_camera)
-        if not job.seen.is_set() and (job.single or state == FAILED):
-            job.seen.set()
+        if not job.result_published.is_set() and (job.is_single or state == FAILED):
+            job.result_published.set()
             at = datetime.now(UTC)
             fields = {"error": why, "kind": kind}
-            made = f"{self.name}/job/{job.id}"
+            result_id = f"{self.name}/job/{job.id}"
             ended = VisionResult(
-                *(made, self.name, state, job.application, job, at, fields, why, None),
+                *(result_id, self.name, state, job.application, job, at, fields, why, None),
                 self._simulated,
             )
-            self.face.result(ended)
-        self._take_pending()
+            self.view.show_result(ended)
+        self._publish_undecided()
         return job
 
     async def _stop_camera(self) -> None:
         try:
-            await self._do("stop", timeout=self.settings.switch_timeout)
+            await self._carry_out("stop", timeout=self.settings.switch_timeout)
         except (SmartCamError, TimeoutError) as exc:
-            self.face.message(f"the camera did not stop: {exc}", type(exc).__name__, None)
+            self.view.show_message(f"the camera did not stop: {exc}", type(exc).__name__, None)
 
     # ------------------------------------------------------------------ results
 
-    def take(self, entry: OutletEntry) -> None:
+    def accept_entry(self, entry: OutletEntry) -> None:
         """Publish an entry, or keep it until it is known whether it belongs to the running job."""
         job = self.job
-        if self._pending or (job is not None and job.single and job.trigger is None):
+        if self._undecided_entries or (
+            job is not None and job.is_single and job.triggered_at is None
+        ):
             fields = json.loads(entry.body) if entry.body else {}
-            maybe = self._pending or fields.get("triggered_at") is not None
-            if maybe and len(self._pending) < MAX_PENDING:
-                self._pending.append(entry)
+            may_belong = self._undecided_entries or fields.get("triggered_at") is not None
+            if may_belong and len(self._undecided_entries) < MAX_UNDECIDED_ENTRIES:
+                self._undecided_entries.append(entry)
                 return
         self._publish(entry)
 
-    def _take_pending(self) -> None:
-        while self._pending:
-            self._publish(self._pending.popleft())
+    def _publish_undecided(self) -> None:
+        while self._undecided_entries:
+            self._publish(self._undecided_entries.popleft())
 
     def _publish(self, entry: OutletEntry) -> None:
         fields: dict[str, Any] = json.loads(entry.body) if entry.body else {}
         if entry.kind == "gap":
             lost = fields.get("lost", "some")
-            self.face.message(f"{lost} results are lost: {fields.get('error', '')}", "Gap", None)
+            self.view.show_message(
+                f"{lost} results are lost: {fields.get('error', '')}", "Gap", None
+            )
             return
         error = str(fields.get("error") or "")
         if fields.get("application") is None:
-            self.face.message(error, str(fields.get("kind") or "Error"), None)
+            self.view.show_message(error, str(fields.get("kind") or "Error"), None)
             return
-        at = _time(fields.get("received_at")) or datetime.fromtimestamp(entry.at, UTC)
+        at = _parse_time(fields.get("received_at")) or datetime.fromtimestamp(entry.at, UTC)
         job = self._job_of(fields, at)
         application = fields["application"]
         if job is not None and application != job.application:
             error = error or f"it is of application {application}, not {job.application}"
-        if job is not None and not job.single:
-            self.face.acquired(job)
+        if job is not None and not job.is_single:
+            self.view.show_acquisition(job)
         state = FAILED if error else COMPLETED
         picture = self._picture({**fields, "camera": entry.camera})
-        made = VisionResult(
+        result = VisionResult(
             *(entry.id, self.name, state, application, job, at, fields, error, picture),
             self._simulated,
         )
-        self.face.result(made)
+        self.view.show_result(result)
         if job is not None:
-            job.seen.set()
+            job.result_published.set()
 
     def _job_of(self, fields: Mapping[str, Any], at: datetime) -> VisionJob | None:
-        """Return the job of a result; None if it is uncertain."""
-        trigger = _time(fields.get("triggered_at"))
+        """Return the job of a result; None if there is none, or it is uncertain."""
+        trigger = _parse_time(fields.get("triggered_at"))
         if trigger is not None:
-            job_of_trigger = self._by_trigger.pop(trigger, None)
+            job_of_trigger = self._jobs_by_trigger.pop(trigger, None)
             if job_of_trigger is not None:
                 return job_of_trigger
         clock = asyncio.get_running_loop().time()
         job = self.job or self._last_continuous
-        if job is None or job.single or at < job.started or (trigger and trigger < job.started):
+        if (
+            job is None
+            or job.is_single
+            or at < job.started_at
+            or (trigger and trigger < job.started_at)
+        ):
             return None
         if clock < self._late_until:
-            self._late_until = -1.0  # the result may be one of a job that was given up
+            self._late_until = -1.0  # the result may belong to an aborted job
             return None
-        if job.ended_clock is not None and clock > job.ended_clock + CONTINUOUS_GRACE:
+        if job.ended_at is not None and clock > job.ended_at + CONTINUOUS_RESULT_WAIT:
             return None
         return job
 
 
-def _time(text: Any) -> datetime | None:
+def _parse_time(text: Any) -> datetime | None:
     return datetime.fromisoformat(text) if isinstance(text, str) else None

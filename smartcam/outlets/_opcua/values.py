@@ -1,4 +1,4 @@
-"""Values of OPC UA: ids, results, and the structures made from layouts."""
+"""Make values of OPC UA: ids, results, and structures for records of a layout."""
 
 from __future__ import annotations
 
@@ -24,15 +24,13 @@ if TYPE_CHECKING:
     from smartcam.outlets._outlet import Column
 
 MAX_FIELDS = 500
-"""Largest number of fields of a structure made from a layout; further ones are only in the
-JSON."""
+"""Largest number of fields of a layout's structure; further fields are only in the JSON."""
 
 MAX_RECORDS = 1000
-"""Largest number of records of a result that become structures; further ones are only in the
-JSON."""
+"""Largest number of records of a result that become structures; further ones are only in JSON."""
 
 MAX_STRUCTURES = 2000
-"""Structures of one server: one for each layout of a camera's application."""
+"""Largest number of structures of one server, which has one for each layout of an application."""
 
 TYPES: Mapping[str, tuple[ua.VariantType, str]] = {
     "bool": (ua.VariantType.Boolean, "<?"),
@@ -47,34 +45,35 @@ TYPES: Mapping[str, tuple[ua.VariantType, str]] = {
     "real32": (ua.VariantType.Float, "<f"),
     "real64": (ua.VariantType.Double, "<d"),
 }
-"""The types of layouts in OPC UA, and how they are packed; all others are strings."""
+"""OPC UA's type, and the format of ``struct``, for each type of layouts; other types are
+strings."""
 
 _BINARY_IDS = {
     "RecipeIdExternalDataType": 5002,
     "RecipeIdInternalDataType": 5268,
     "ConfigurationIdDataType": 5090,
 }
-"""Types of ids without fields of their own, and the ids of their encodings: asyncua would send the
-abstract type in their place if they had no classes."""
+"""Types of ids that add no fields to their base type, and the ids of their encodings. They need
+classes, or asyncua would send the abstract base type instead."""
 
 
-def type_of(kind: str) -> ua.VariantType:
-    """Return the type in OPC UA of a layout's type."""
+def variant_type(kind: str) -> ua.VariantType:
+    """Return OPC UA's type for a layout's type."""
     return TYPES[kind][0] if kind in TYPES else ua.VariantType.String
 
 
-def plain(value: Any, kind: str) -> Any:
-    """Return a value as its type in OPC UA requires it.
+def check_value(value: Any, kind: str) -> Any:
+    """Return a value for OPC UA; None becomes "" or NaN.
 
     Raises:
         TypeError: the value does not have the type.
     """
-    of = type_of(kind)
-    if of is ua.VariantType.String and (value is None or isinstance(value, str)):
+    value_type = variant_type(kind)
+    if value_type is ua.VariantType.String and (value is None or isinstance(value, str)):
         return value or ""
-    if of is ua.VariantType.Boolean and isinstance(value, bool):
+    if value_type is ua.VariantType.Boolean and isinstance(value, bool):
         return value
-    if of in (ua.VariantType.Float, ua.VariantType.Double):
+    if value_type in (ua.VariantType.Float, ua.VariantType.Double):
         return float("nan") if value is None else float(value)
     if isinstance(value, int) and not isinstance(value, bool) and kind in TYPES:
         return value
@@ -82,18 +81,18 @@ def plain(value: Any, kind: str) -> Any:
 
 
 class Structure(NamedTuple):
-    """A structure made from a layout.
+    """A structure type that was made for a layout.
 
     Attributes:
-        encoding: node of its binary encoding.
-        columns: names, types and units of its fields.
+        encoding: node of the binary encoding.
+        columns: names, types and units of the fields.
     """
 
     encoding: ua.NodeId
     columns: tuple[Column, ...]
 
     def pack_all(self, records: Sequence[Mapping[str, Any]]) -> list[ua.Variant] | None:
-        """Return records as structures; None if one has an earlier layout's fields."""
+        """Return records as structures; None if a record does not have the fields of the layout."""
         try:
             packed = [self._pack(record) for record in records]
         except (KeyError, TypeError, ValueError, OverflowError, struct.error):
@@ -104,7 +103,7 @@ class Structure(NamedTuple):
     def _pack(self, record: Mapping[str, Any]) -> bytes:
         parts: list[bytes] = []
         for name, kind, _ in self.columns:
-            value = plain(record[name], kind)
+            value = check_value(record[name], kind)
             if isinstance(value, str):
                 parts.append(Primitives.String.pack(value))
             else:
@@ -113,7 +112,7 @@ class Structure(NamedTuple):
 
 
 class VisionValues:
-    """The values of one server.
+    """Makes the values of one server.
 
     Args:
         server: server of asyncua, with the nodeset.
@@ -129,11 +128,11 @@ class VisionValues:
             name: getattr(ua, name) for name in node_ids() if hasattr(ua, name)
         }
         for name, encoding in _BINARY_IDS.items():
-            made = dataclasses.make_dataclass(name, [], bases=(base,))
-            of = ua.NodeId(encoding, machine_vision)
-            ua.extension_objects_by_typeid[of] = made
-            ua.typeid_by_extension_objects[made] = of
-            self._classes[name] = made
+            class_ = dataclasses.make_dataclass(name, [], bases=(base,))
+            type_id = ua.NodeId(encoding, machine_vision)
+            ua.extension_objects_by_typeid[type_id] = class_
+            ua.typeid_by_extension_objects[class_] = type_id
+            self._classes[name] = class_
 
     def identity(self, kind: str, text: str) -> Any:
         """Return an id of a type such as ``JobIdDataType``."""
@@ -164,11 +163,11 @@ class VisionValues:
             InternalConfigurationId=self.identity("ConfigurationIdDataType", ""),
             JobId=self.identity("JobIdDataType", result.job_id),
             CreationTime=result.created,
-            ProcessingTimes=self._times(result),
+            ProcessingTimes=self._processing_times(result),
             ResultContent=content,
         )
 
-    def _times(self, result: VisionResult) -> Any:
+    def _processing_times(self, result: VisionResult) -> Any:
         text = result.fields.get("triggered_at")
         if not isinstance(text, str):
             return None
@@ -179,7 +178,7 @@ class VisionValues:
     async def content(
         self, result: VisionResult, columns: Sequence[Column]
     ) -> list[ua.Variant] | None:
-        """Return a result's values: a structure for each record; JSON without a layout."""
+        """Return a result's values: a structure for each record, otherwise JSON."""
         value = result.fields.get("value")
         if value is None:
             return None
@@ -193,7 +192,7 @@ class VisionValues:
         return [ua.Variant(text, ua.VariantType.String)]
 
     async def _structure(self, result: VisionResult, columns: Sequence[Column]) -> Structure | None:
-        """Return the structure of an application's layout, made if it is new."""
+        """Return the structure of an application's layout; make it if it is new."""
         if not columns or result.application is None:
             return None
         key = result.camera, result.application, tuple(columns[:MAX_FIELDS])
@@ -205,9 +204,9 @@ class VisionValues:
     async def _make_structure(
         self, camera: str, application: int, columns: tuple[Column, ...]
     ) -> Structure:
-        """Make the nodes of a structure, with ids that follow from its fields.
+        """Make the nodes of a structure; their ids depend on its fields.
 
-        So a client never decodes a new structure by an earlier one.
+        So a client never decodes values of a new layout by the structure of an earlier layout.
         """
         versions = sum(known[:2] == (camera, application) for known in self._structures)
         name = f"{camera}.App{application}" + f"v{versions + 1}" * bool(versions)
@@ -226,7 +225,7 @@ class VisionValues:
         definition.StructureType = ua.StructureType.Structure
         definition.DefaultEncodingId = encoding.nodeid
         definition.Fields = [
-            new_struct_field(field, type_of(kind), description=unit)
+            new_struct_field(field, variant_type(kind), description=unit)
             for field, kind, unit in columns
         ]
         await node.write_data_type_definition(definition)

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from smartcam.exceptions import ReservationLostError
-from tests.fleet.inside import Caller, CallNumbers, Gate, InLine, Lease, Met
+from tests.fleet.inside import Caller, CallNumbers, Gate, GateRequest, Lease, MetAgent
 
 Move = tuple[Any, ...]
 Wrong = Literal["between", "behind", "twice"]
@@ -80,7 +80,7 @@ class Task:
     """A call under way at an agent."""
 
     reservation: int | None
-    line: InLine
+    line: GateRequest
 
 
 @dataclass(slots=True)
@@ -117,7 +117,7 @@ _CALLER = Caller("cam", "cam", None, None, lambda _: None, lambda _: None)  # ty
 def caller(program: Program) -> Caller:
     """Return the library's side of a program."""
     _CALLER.leases = program.leases
-    _CALLER.met = None if program.met is None else Met("agent", program.met, {})
+    _CALLER.agent = None if program.met is None else MetAgent("agent", program.met, {})
     return _CALLER
 
 
@@ -219,7 +219,7 @@ class World:
         one = self.programs[name]
         one.commands += 1
         try:
-            fence = caller(one)._fence("trigger")
+            fence = caller(one)._reservation_of("trigger")
         except ReservationLostError:
             return
         self._expect(one, self._say(one, "command", fence), "commanding")
@@ -237,7 +237,7 @@ class World:
     def _stands(self, one: Program) -> bool:
         (reservation,) = one.leases
         try:
-            caller(one).lease(reservation)
+            caller(one).require_lease(reservation)
         except ReservationLostError:
             return False
         return True
@@ -325,14 +325,14 @@ class World:
         guest = agent.guests.get(name)
         if do == "cancel":
             if guest is not None and about is not None:
-                guest.is_new(about)
+                guest.add_if_new(about)
                 task = agent.tasks.pop((name, about), None)
                 if task is not None:
-                    agent.gate.give_up(task.line)
+                    agent.gate.withdraw_request(task.line)
                 agent.gate.release((name, about))
         elif guest is None or epoch != agent.epoch:
             self._reply(agent, name, call, "stranger")
-        elif not guest.is_new(call) and self.variant.once:
+        elif not guest.add_if_new(call) and self.variant.once:
             return
         elif do == "reserved":
             sure = agent.epoch == self.camera or not self.variant.asks
@@ -344,7 +344,7 @@ class World:
             self._reply(agent, name, call, "lost")
         else:
             key = (name, call) if do == "reserve" else None
-            agent.tasks[name, call] = Task(about, agent.gate.line_up(name, key))
+            agent.tasks[name, call] = Task(about, agent.gate.add_request(name, key))
         self._settle(agent)
 
     def _settle(self, agent: Agent) -> None:
@@ -386,7 +386,7 @@ class World:
     def _refuse(self, epoch: int, key: tuple[str, int]) -> None:
         """Have somebody wait no longer."""
         agent = self.agents[epoch]
-        agent.gate.give_up(agent.tasks.pop(key).line)
+        agent.gate.withdraw_request(agent.tasks.pop(key).line)
         self._reply(agent, *key, "no")
         self._settle(agent)
 
@@ -394,10 +394,10 @@ class World:
         """Take a program for gone."""
         agent = self.agents[epoch]
         self.forgotten += 1
-        agent.gone[name] = agent.guests.pop(name).last
+        agent.gone[name] = agent.guests.pop(name).last_call
         for key in [key for key in agent.tasks if key[0] == name]:
-            agent.gate.give_up(agent.tasks.pop(key).line)
-        agent.gate.forget(name)
+            agent.gate.withdraw_request(agent.tasks.pop(key).line)
+        agent.gate.lose_program(name)
         self._settle(agent)
 
     def _notice(self, epoch: int) -> None:
@@ -407,7 +407,7 @@ class World:
         for key in [key for key, task in agent.tasks.items() if task.line.granted]:
             self._refuse(epoch, key)
         if agent.gate.holder is not None:
-            agent.gate.forget(agent.gate.holder)
+            agent.gate.lose_program(agent.gate.holder)
         self._settle(agent)
 
     def _take(self, epoch: int) -> None:
@@ -438,7 +438,7 @@ class World:
         agents = tuple(
             (
                 *(epoch, agent.has, agent.gate.holder, frozenset(agent.gate._reservations)),
-                tuple((line.program, line.reservation) for line in agent.gate._line),
+                tuple((line.program, line.reservation) for line in agent.gate._queue),
                 tuple(
                     (n, g.floor, frozenset(g._known_calls)) for n, g in sorted(agent.guests.items())
                 ),
