@@ -12,7 +12,7 @@ from tests.web.test_operations import ask, parser, watched, words_of
 async def test_page_lists_every_number_and_no_other() -> None:
     said = {
         word.partition("{")[0]
-        for title in ("of each camera", "of the agent")
+        for title in ("metric of each camera", "metric of the agent")
         for word in words_of(title)
     }
     async with watched("one", latency="camera") as (_, site, fleet, _boxes):
@@ -29,7 +29,7 @@ async def test_page_lists_every_number_and_no_other() -> None:
 
 
 def test_page_has_the_words_of_outcomes() -> None:
-    assert words_of("of each camera", 1) >= set(OUTCOMES)
+    assert words_of("metric of each camera", 1) >= set(OUTCOMES)
 
 
 def test_each_error_has_an_outcome() -> None:
