@@ -258,11 +258,11 @@ def test_a_wrong_file_is_told(text: str, file: str, tmp_path: Path) -> None:
 
 
 def rows(page: str) -> dict[str, str]:
-    """Return what the page's tables say: a type by each name."""
+    """Return what the page's tables of topics and services say: a type by each name."""
     found: dict[str, str] = {}
     for line in page.splitlines():
         cells = [cell.strip() for cell in line.split("|")]
-        if len(cells) == 5 and "`" in cells[1] and "`" in cells[2]:
+        if len(cells) == 5 and "`" in cells[1] and ("/msg/" in cells[2] or "/srv/" in cells[2]):
             names = cells[1].replace("`", "").split(", ")
             types = cells[2].replace("`", "").split(", ")
             for n, name in enumerate(names):
