@@ -51,7 +51,7 @@ def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
         The colours; None if a Y is below limited range, or OpenCV is not installed.
     """
     cv2 = opencv()
-    if cv2 is None or cv2.extractChannel(pairs, y).min() < MIN_LIMITED_Y:
+    if cv2 is None or pairs.min(axis=0)[:, y].min() < MIN_LIMITED_Y:
         return None
     result: NDArray[np.uint8]
     result = cv2.cvtColor(pairs, cv2.COLOR_YUV2RGB_UYVY if y else cv2.COLOR_YUV2RGB_YUY2)
@@ -90,9 +90,8 @@ def planes_to_rgb(
     for top in range(0, rows, step):
         chroma_band = [plane[top : top + step] for plane in chroma]
         if across * down > 1:
-            size = (columns * across, len(chroma_band[0]) * down)
             interleaved = cv2.merge(chroma_band)
-            chroma_band = [cv2.resize(interleaved, size, interpolation=cv2.INTER_NEAREST)]
+            chroma_band = [_repeat_pixels(interleaved, across, down)]
         band = slice(top * down, (top + step) * down)
         merged = cv2.merge(
             [y[band], *(plane[: height - band.start, :width] for plane in chroma_band)]
@@ -104,3 +103,19 @@ def planes_to_rgb(
             cv2.threshold(rgb, max_value, 0, cv2.THRESH_TRUNC)[1] if has_spare_bits else rgb
         )
     return colours
+
+
+def _repeat_pixels(chroma: NDArray[Any], across: int, down: int) -> NDArray[Any]:
+    """Return U and V (h * down, w * across, 2) for the pixels that share them.
+
+    ``chroma``: (h, w, 2), contiguous; ``across`` and ``down`` are 1 or 2.
+    """
+    cv2, (height, width, _) = opencv(), chroma.shape
+    repeated: NDArray[Any]
+    if (across, down) == (2, 1):  # merging is five times as fast as resizing
+        both = chroma.view(f"i{2 * chroma.itemsize}")
+        repeated = cv2.merge([both, both]).view(chroma.dtype).reshape(height, 2 * width, 2)
+        return repeated
+    size = (width * across, height * down)
+    repeated = cv2.resize(chroma, size, interpolation=cv2.INTER_NEAREST)
+    return repeated
