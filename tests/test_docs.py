@@ -310,7 +310,7 @@ def test_reference_tells_the_methods_of_a_returned_class_that_no_module_exports(
 def test_reference_tells_a_field_s_class_that_no_module_exports() -> None:
     lines = ["The account."]
     module_of("conf")._tell_returned(None, "class", "", Statistics, None, lines)
-    assert "``Histogram``: The number of times in each of a row of bins." in lines
+    assert "``Histogram``: A histogram of durations." in lines
 
 
 # ---------------------------------------------------------------------- promises, troubleshooting

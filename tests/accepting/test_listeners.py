@@ -16,6 +16,7 @@ CALLS = {
     "create_unix_server",
     "create_datagram_endpoint",
     "listening",
+    "open_listening",
     "bind",
     "TCPSite",
     "SockSite",
@@ -38,8 +39,8 @@ KNOWN = {
     "testing/proxy/_relay.py": {"bind"},
     # datagrams, for which there are tests in test_datagrams
     "emulator/_links.py": {"create_datagram_endpoint"},
-    "frames/_streaming/rtp/driver.py": {"listening"},
-    "frames/_streaming/rtp/sockets.py": {"bind", "listening"},
+    "frames/_streaming/rtp/driver.py": {"open_listening"},
+    "frames/_streaming/rtp/sockets.py": {"bind", "open_listening"},
     "frames/_streaming/rtsp/delivery.py": {"bind", "create_datagram_endpoint"},
     "frames/_gige/stream.py": {"bind"},
     "frames/_gige/discovery.py": {"create_datagram_endpoint"},

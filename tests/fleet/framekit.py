@@ -19,7 +19,7 @@ from tests.timed_loop import TimedLoop
 
 def give_source(monkeypatch: pytest.MonkeyPatch, driver: FrameDriver) -> None:
     """Have the sources of a fleet file be a driver's."""
-    monkeypatch.setattr(FramesEntry, "source", lambda *_: FrameSource(driver, stall=None))
+    monkeypatch.setattr(FramesEntry, "make_source", lambda *_: FrameSource(driver, stall=None))
 
 
 class FramePlant(Plant):

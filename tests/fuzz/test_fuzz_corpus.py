@@ -152,7 +152,7 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "layout_file": (Layout, "to_yaml", lambda _: "x: bool"),
     "address": (Address, "url", property(lambda address: f"bvs://{address.host}")),
     "cell_file": (Teaching, "_check_written", lambda *_: 1 / 0),
-    "gs1": (fuzz_cells, "elements", fuzz_cells.first_element),
+    "gs1": (fuzz_cells, "split_elements", fuzz_cells.first_element),
     "program_result": (fuzz_cells.INSPECTOR, "MAX_REASON_BYTES", 90),
     "spec": CUTS_TEXTS,
 }

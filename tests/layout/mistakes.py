@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def cannot_tell_lines(mistake: Callable[..., Any]) -> tuple[object, str, Any]:
     """Return a document with a mistake in place of a line, and the line's number."""
-    return _yaml_files, "_line", mistake
+    return _yaml_files, "_find_line", mistake
 
 
 CUTS_TEXTS = (_compiled, "parse_text", lambda text, start: parse_text(text[start:]))

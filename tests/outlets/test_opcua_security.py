@@ -177,15 +177,15 @@ async def test_passwords_are_not_tried_without_end(
         assert error == ""
         await client.disconnect()
         for number in range(2000):  # addresses, of which a bounded number is kept
-            with pytest.raises(KeyError), logins.attempt(str(number)):
+            with pytest.raises(KeyError), logins.counting_attempt(str(number)):
                 raise KeyError
         assert len(logins._failed) == 1000
         for _ in range(9):
-            with pytest.raises(KeyError), logins.attempt("1999"):
+            with pytest.raises(KeyError), logins.counting_attempt("1999"):
                 raise KeyError
-        with logins.attempt("1998"):
+        with logins.counting_attempt("1998"):
             pass
-        with pytest.raises(ServiceError), logins.attempt("1999"):
+        with pytest.raises(ServiceError), logins.counting_attempt("1999"):
             pass
 
 

@@ -121,3 +121,15 @@ def test_views_that_number_a_board_from_its_other_end_are_numbered_as_the_rest()
     assert found.camera.matrix[0, 0] == pytest.approx(LEFT.matrix[0, 0], rel=2e-3)
     assert found.rms < 2 * calibrate_intrinsics(views).rms
     assert "v1, v3, v4, v8, v9 numbered it from its other end" in found.warnings[-1].text
+
+
+def test_views_that_all_differ_a_little_are_not_called_views_of_two_settings() -> None:
+    random, middle = np.random.default_rng(2), LEFT.matrix[:2, 2]
+    views = [
+        dataclasses.replace(
+            view, points=middle + (1 + random.normal(0, 0.003)) * (view.points - middle)
+        )
+        for view in seen(LEFT, spread_poses(LEFT, 12), seed=2)
+    ]
+    remarks = calibrate_intrinsics(views).warnings
+    assert not [remark.text for remark in remarks if "two settings" in remark.text]
