@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def cannot_tell_lines(mistake: Callable[..., Any]) -> tuple[object, str, Any]:
-    """Return a document with a mistake in place of a line, and the line's number."""
+    """Return the arguments of ``setattr`` that put a mistake for what finds an error's line."""
     return _yaml_files, "_find_line", mistake
 
 
