@@ -148,10 +148,10 @@ async def find(
         async with show_progress_line(search):
             await search.run()
     finally:
-        if search.begun:
+        if search.has_begun:
             left_alone = {
                 host: fleet_cameras[text]
-                for host, text in search.left.items()
+                for host, text in search.left_out.items()
                 if text in fleet_cameras
             }
             if as_yaml:

@@ -71,7 +71,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         self._pairs = JudgedResults(
             self._device.last_sent, lambda: self.statistics().received, self._report_picture
         )
-        self._device.inspector.viewers.add(self._pairs.take)
+        self._device.inspector.viewers.add(self._pairs.record_picture)
         settings = CameraSettings.of(address, given)
         super().__init__(settings, observers=[self._pairs, *observers])
 

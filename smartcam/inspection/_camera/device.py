@@ -116,7 +116,7 @@ class SoftwareDevice(Server):
                 quirks=quirks,
                 seed=seed or 0,
             )
-            self.emulator.device.sight = self._last_picture
+            self.emulator.device.get_last_image = self._last_picture
         else:
             self.emulator = EmulatedCamera(
                 [self._application(program) for program in camera.programs.values()],

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from smartcam.backoff import Backoff
 from smartcam.emulator._inside import Inspector
 from smartcam.exceptions import FrameSourceError, SmartCamError
-from smartcam.frames._inside import changed
+from smartcam.frames._inside import copy_with
 from smartcam.inspection._camera.tool_thread import ToolThread
 from smartcam.inspection._program import MAX_REASON_BYTES
 
@@ -69,7 +69,7 @@ class Judged(NamedTuple):
         """The frame, with the marks of the tools as its drawings."""
         if self.inspection is None:
             return self.frame
-        return changed(self.frame, drawings=self.inspection.drawings)
+        return copy_with(self.frame, drawings=self.inspection.drawings)
 
 
 @dataclass(eq=False, slots=True)
