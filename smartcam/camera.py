@@ -1127,7 +1127,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         return Listeners(self.settings.name, self._observers)
 
     @property
-    def _place(self) -> Address:
+    def _camera_address(self) -> Address:
         """Address of the camera itself, as far as it is known."""
         return self.settings.address
 

@@ -134,7 +134,7 @@ class CameraSearch:
         opened: number of ports that were tried.
         total: number of ports to try, once names are looked up.
         counts: number of tried ports by outcome.
-        why: reason of the first failure of this machine.
+        failure: reason of the first failure of this machine.
         left_out: addresses that were left out, each with the text that named it.
         has_begun: whether the first port was tried.
     """
@@ -185,7 +185,7 @@ class CameraSearch:
         self.opened = 0
         self.total = 0
         self.counts: collections.Counter[str] = collections.Counter()
-        self.why = ""
+        self.failure = ""
         self.left_out: dict[str, str] = {}
         self.has_begun = False
 
@@ -263,7 +263,7 @@ class CameraSearch:
             self._open_count -= 1
         self.opened += 1
         self.counts[opened.outcome] += 1
-        self.why = self.why or opened.failure
+        self.failure = self.failure or opened.failure
         if opened.outcome == "open":
             self._ports_found[address, port] = describe_port(str(address), port, opened, protocols)
 

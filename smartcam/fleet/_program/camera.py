@@ -571,7 +571,7 @@ class FleetCamera(Camera[ValueT]):
         return self.settings.address.url
 
     @property
-    def _place(self) -> Address:
+    def _camera_address(self) -> Address:
         url = self._agent_facts.get("url")
         return self.settings.address if url is None else parse_address(url)
 

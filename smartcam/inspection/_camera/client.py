@@ -164,7 +164,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         return await self._encode_png(judged, limit, drawn=drawn)
 
     def _report_picture(self, result: Result[Any], judged: Judged) -> None:
-        if self._observers.see_pictures:
+        if self._observers.handles_pictures:
             self._observers.picture(result, judged.marked_frame)
 
     async def _read_last_picture(self, timeout: float, *, drawn: bool) -> bytes:

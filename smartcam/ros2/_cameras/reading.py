@@ -26,7 +26,7 @@ def interpretation_of(camera: Camera[Any]) -> Interpretation:
 
 def address_of(camera: Camera[Any]) -> Address:
     """Return the address of the camera itself, also of one that an agent of a fleet has."""
-    return camera._place  # noqa: SLF001 - smartcam's own
+    return camera._camera_address  # noqa: SLF001 - smartcam's own
 
 
 def calibrations_by_application(argument: Any) -> dict[int | None, Any]:
