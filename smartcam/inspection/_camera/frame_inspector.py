@@ -180,14 +180,14 @@ class FrameInspector(Inspector):
     def begin(
         self,
         order: InspectionOrder,
-        seen: Callable[[], None],
-        done: Callable[[Values | None], None],
+        on_exposed: Callable[[], None],
+        on_done: Callable[[Values | None], None],
     ) -> None:
         """Start a run, which inspects the first frame exposed from now on."""
         self.cancel()
         loop = asyncio.get_running_loop()
         deadline = loop.call_later(FRAME_WAIT, self._end_without_frame)
-        self._run = _OrderedRun(order, seen, done, time.monotonic(), deadline)
+        self._run = _OrderedRun(order, on_exposed, on_done, time.monotonic(), deadline)
         self._frame_wanted.set()
         if self.trouble:  # a restart of the device has cleared the condition there
             loop.call_soon(self._set_trouble, self.trouble)
