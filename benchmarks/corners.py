@@ -136,7 +136,7 @@ def _draw(noise: float, blur: float, count: int, random: np.random.Generator) ->
 def _sub_pix(half: int, image: GreyImage, start: Array, _ways: Array) -> Array:
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
     found: Any = start.astype(np.float32).reshape(-1, 1, 2)
-    found = cv2.cornerSubPix(image.bytes, found, (half, half), (-1, -1), stop)
+    found = cv2.cornerSubPix(image.uint8_levels, found, (half, half), (-1, -1), stop)
     refined: Array = np.asarray(found, dtype=np.float64).reshape(-1, 2)
     return refined
 

@@ -112,7 +112,7 @@ def _side(data: bytes, decode: Decode, count: int) -> Callable[[], Cost]:
 
 def _as_the_client(interpreter: Interpreter) -> Decode:
     """Return what decodes a container as the client does."""
-    simple = base.plain(interpreter)
+    simple = base.as_plain_interpreter(interpreter)
     context = Context(CAMERA, wire.APPLICATION, NUMBER, AT)
     if simple is not None:
 

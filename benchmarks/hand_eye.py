@@ -246,8 +246,8 @@ def _closed_forms(
     scene: HandEyeScene, poses: Sequence[Transform], views: Sequence[TargetView]
 ) -> dict[str, tuple[float, float]]:
     """Return by how much each of OpenCV's methods is off, rad and m; infinite where it fails."""
-    robot = RobotPoses(Rigid.stacked(one.rigid for one in poses), scene.setup == "eye-in-hand")
-    seen = Rigid.stacked(locate(view, CAMERA).transform.rigid for view in views)
+    robot = RobotPoses(Rigid.stack(one.rigid for one in poses), scene.setup == "eye-in-hand")
+    seen = Rigid.stack(locate(view, CAMERA).transform.rigid for view in views)
     result = {}
     for name in LINEAR:
         found = solve_linear(name, robot, seen, use_all_views=True)

@@ -108,7 +108,7 @@ class Kind:
             )
             size = np.repeat([math.radians(self.degrees), 1e-3 * self.millimetres], 3)
             heavy = math.sqrt(self.tails / random.chisquare(self.tails)) if self.tails < 99 else 1.0
-            real.append((moved @ place).turned_before(heavy * size * random.normal(size=6)))
+            real.append((moved @ place).turned_in_source(heavy * size * random.normal(size=6)))
         return real
 
     def _bent(self, joints: Array, phases: Array) -> Array:

@@ -73,8 +73,8 @@ def judged(
         )
     shown = [seen[i] for i in fresh]
     found = {OURS: _squares(ours, other, shown)}
-    robot = RobotPoses(Rigid.stacked(one.rigid for one in some), setup == "eye-in-hand")
-    placed = Rigid.stacked(one.rigid for one in ours.target_poses)
+    robot = RobotPoses(Rigid.stack(one.rigid for one in some), setup == "eye-in-hand")
+    placed = Rigid.stack(one.rigid for one in ours.target_poses)
     for name in LINEAR:
         pair = solve_linear(name, robot, placed, use_all_views=True)
         found[name] = np.full(1, math.inf)

@@ -117,11 +117,11 @@ class Rig:
     def bounds(self, points: Array, poses: Sequence[Transform]) -> tuple[float, float]:
         """Return the least rms errors that noise allows: of one lens, px, and of the pair, mm."""
         views = self.seen(points, poses, None)
-        motions = Rigid.stacked(one.rigid for one in poses)
+        motions = Rigid.stack(one.rigid for one in poses)
         columns = np.eye(4 + len(self.left.distortion))
         one = Bundle(
             (self.left,),
-            Rigid.stacked([]),
+            Rigid.stack([]),
             motions,
             (columns,),
             points=points,
@@ -134,7 +134,7 @@ class Rig:
         )
         both = Bundle(
             (self.left, self.right),
-            Rigid.stacked([self.rig.rigid]),
+            Rigid.stack([self.rig.rigid]),
             motions,
             (columns, columns),
             points=points,

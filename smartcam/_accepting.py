@@ -81,11 +81,11 @@ class Occupant(Protocol):
     """A connection, with the part of it that the policy uses."""
 
     @property
-    def settled(self) -> bool:
+    def keeps_place(self) -> bool:
         """True if it has a session or is being served, so that it is never closed for another."""
         ...
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         """Close the connection at once, since it has lost its place. Harmless when called twice."""
         ...
 
@@ -110,8 +110,8 @@ class Places(Generic[G]):
     Args:
         most: largest number of connections at a time.
         within: seconds that a new connection may stay without a session.
-        missing: what such a connection lacks, for the log: "no session".
-        own: name of a session, for the log: "a session".
+        timeout_reason: what such a connection lacks, for the log: "no session".
+        session_name: name of a session, for the log: "a session".
 
     Attributes:
         most: largest number of connections at a time; may be changed.
@@ -123,12 +123,16 @@ class Places(Generic[G]):
         most: int,
         *,
         within: float = HANDSHAKE_TIMEOUT,
-        missing: str = "no session",
-        own: str = "a session",
+        timeout_reason: str = "no session",
+        session_name: str = "a session",
     ) -> None:
         self.most = most
         self.crowded_out = 0
-        self._timeout, self._missing, self._session_name = within, missing, own
+        self._timeout, self._timeout_reason, self._session_name = (
+            within,
+            timeout_reason,
+            session_name,
+        )
         self._places: dict[G, _TakenPlace] = {}  # the first has been idle for longest
 
     def __len__(self) -> int:
@@ -140,7 +144,7 @@ class Places(Generic[G]):
     def __contains__(self, occupant: object) -> bool:
         return occupant in self._places
 
-    def enter(self, occupant: G, peer: str, now: float) -> str:
+    def refusal_on_entry(self, occupant: G, peer: str, now: float) -> str:
         """Give a new connection a place; another connection may be closed for it.
 
         Returns:
@@ -155,12 +159,12 @@ class Places(Generic[G]):
                     rivals, reason = of_peer, f"{len(of_peer)} others of {peer} are open"
         if rivals:
             self.crowded_out += 1
-            evicted = next((other for other in rivals if not other.settled), None)
+            evicted = next((other for other in rivals if not other.keeps_place), None)
             if evicted is None:
                 return f"{reason}, and each has {self._session_name}"
             self._evict(evicted, f"{reason}, it was without {self._session_name} for longest")
         self._places[occupant] = _TakenPlace(
-            peer, now, self._timeout, self._missing, now + self._timeout
+            peer, now, self._timeout, self._timeout_reason, now + self._timeout
         )
         return ""
 
@@ -168,7 +172,7 @@ class Places(Generic[G]):
         """Forget a connection that has ended; harmless when called twice."""
         self._places.pop(occupant, None)
 
-    def move_back(self, occupant: G, now: float) -> None:
+    def restart_idle_time(self, occupant: G, now: float) -> None:
         """Note that a connection was served or its session ended: it is idle only since now.
 
         Connections that have been idle for longer are closed for new ones before it.
@@ -178,7 +182,7 @@ class Places(Generic[G]):
             place.idle_since = now
             self._places[occupant] = place
 
-    def expect(self, occupant: G, within: float | None, missing: str, now: float) -> None:
+    def set_time_limit(self, occupant: G, within: float | None, missing: str, now: float) -> None:
         """Set a new time limit within which a connection must have a session; None: no limit.
 
         Args:
@@ -192,20 +196,20 @@ class Places(Generic[G]):
             place.timeout, place.missing = math.inf if within is None else within, missing
             place.deadline = now + place.timeout
 
-    def waits_longest(self) -> tuple[float, G] | None:
+    def find_longest_idle(self) -> tuple[float, G] | None:
         """Find the connection that has been without a session for longest.
 
         Returns:
             The time since which it has had none, and the connection; None if each has a session.
         """
         for occupant, place in self._places.items():
-            if not occupant.settled:
+            if not occupant.keeps_place:
                 return place.idle_since, occupant
         return None
 
     def make_room(self, why: str) -> None:
         """Close the connection that has been without a session for longest, if there is one."""
-        longest_idle = self.waits_longest()
+        longest_idle = self.find_longest_idle()
         if longest_idle is not None:
             self.crowded_out += 1
             self._evict(longest_idle[1], why)
@@ -215,7 +219,7 @@ class Places(Generic[G]):
         for occupant, place in list(self._places.items()):
             if place.deadline > now or occupant not in self._places:
                 continue
-            if occupant.settled:
+            if occupant.keeps_place:
                 place.deadline = now + place.timeout
             else:
                 self._evict(occupant, f"{place.missing} within {place.timeout:g} s")
@@ -226,7 +230,7 @@ class Places(Generic[G]):
 
     def _evict(self, occupant: G, why: str) -> None:
         self._places.pop(occupant, None)
-        occupant.turn_away(why)
+        occupant.close_for(why)
 
 
 class _ThreadState(threading.local):
@@ -242,8 +246,8 @@ _thread_state = _ThreadState()
 class Acceptor(Generic[G]):
     """Accepts connections on a listening socket; gives each a protocol, which takes a place.
 
-    The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when it
-    is lost.
+    The protocol calls :meth:`refusal_on_entry` when its connection is made, and :meth:`leave` when
+    it is lost.
 
     Args:
         make: function that returns a new protocol. It may also be called after :meth:`close`, for a
@@ -306,7 +310,7 @@ class Acceptor(Generic[G]):
 
     # ------------------------------------------------------------------ its connections
 
-    def enter(self, occupant: G, address: Any) -> str:
+    def refusal_on_entry(self, occupant: G, address: Any) -> str:
         """Give a new connection a place; return the reason if it is refused, "" if it has a place.
 
         Args:
@@ -314,7 +318,7 @@ class Acceptor(Generic[G]):
             address: address of its peer, in a socket's form.
         """
         now = asyncio.get_running_loop().time()
-        why = self.places.enter(occupant, str(address[0]) if address else "", now)
+        why = self.places.refusal_on_entry(occupant, str(address[0]) if address else "", now)
         self._set_timer()
         return why
 
@@ -325,11 +329,11 @@ class Acceptor(Generic[G]):
             self._timer.cancel()
             self._timer = None
 
-    def move_back(self, occupant: G) -> None:
-        """Note that a connection was served or its session ended: :meth:`Places.move_back`."""
-        self.places.move_back(occupant, asyncio.get_running_loop().time())
+    def restart_idle_time(self, occupant: G) -> None:
+        """Note that a connection is idle only since now; see :meth:`Places.restart_idle_time`."""
+        self.places.restart_idle_time(occupant, asyncio.get_running_loop().time())
 
-    def expect(self, occupant: G, within: float | None, missing: str) -> None:
+    def set_time_limit(self, occupant: G, within: float | None, missing: str) -> None:
         """Set a new time limit within which a connection must have a session; None: no limit.
 
         Args:
@@ -337,7 +341,7 @@ class Acceptor(Generic[G]):
             within: seconds from now on.
             missing: what a connection that is too late lacks, for the log: "no request".
         """
-        self.places.expect(occupant, within, missing, asyncio.get_running_loop().time())
+        self.places.set_time_limit(occupant, within, missing, asyncio.get_running_loop().time())
         self._set_timer()
 
     def _set_timer(self) -> None:
@@ -467,7 +471,7 @@ def _make_room() -> bool:
     """
     loop = asyncio.get_running_loop()
     of_loop = [acceptor.places for acceptor in _thread_state.acceptors if acceptor.loop is loop]
-    idle = [(longest[0], places) for places in of_loop if (longest := places.waits_longest())]
+    idle = [(longest[0], places) for places in of_loop if (longest := places.find_longest_idle())]
     if not idle:
         return False
     _, places = min(idle, key=lambda pair: pair[0])
@@ -475,7 +479,7 @@ def _make_room() -> bool:
     return True
 
 
-async def listening(host: str, port: int, *, local: bool = False) -> socket.socket:
+async def listening_socket(host: str, port: int, *, local: bool = False) -> socket.socket:
     """Return a socket that listens and does not block.
 
     Args:

@@ -12,7 +12,7 @@ import inspect
 import math
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
-from smartcam._arguments import check_all, plain, wrong_argument
+from smartcam._arguments import as_plain_value, check_all, wrong_argument
 from smartcam.exceptions import SmartCamError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def check_arguments(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Return a decorator for a function whose errors name the argument that is of a wrong kind.
 
     The function is called first, and an error of the library is raised unchanged. After any other
@@ -59,7 +59,7 @@ def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 def a_number(value: Any, name: str, owner: str) -> Any:
     """Return a plain number that a float can hold; ``bool`` is not a number here."""
-    number = plain(value)
+    number = as_plain_value(value)
     if isinstance(number, (int, float)) and not isinstance(number, bool):
         try:
             float(number)
@@ -80,7 +80,7 @@ def a_finite_number(value: Any, name: str, owner: str) -> Any:
 
 def an_integer(value: Any, name: str, owner: str) -> Any:
     """Return a plain integer of at most 64 bits; ``bool`` is not an integer here."""
-    number = plain(value)
+    number = as_plain_value(value)
     if type(number) is int and -(1 << 63) <= number < 1 << 63:
         return number
     raise wrong_argument(name, "a whole number", value, owner)

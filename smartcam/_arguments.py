@@ -56,7 +56,7 @@ MAX_APPLICATION_ID = 0xFFFFFFFF
 """Largest application id that any dialect has a field for, 32 bits."""
 
 
-def shown(value: object) -> str:
+def excerpt(value: object) -> str:
     """Return a value as an error's text shows it, whatever its ``repr`` does."""
     try:
         return f"{value!r:.{MAX_SHOWN_LENGTH}}"
@@ -80,7 +80,7 @@ def shown_time(seconds: float, *, coarse: bool = False) -> str:
 def wrong_argument(name: str, expected: str, value: object, owner: str = "") -> ConfigurationError:
     """Return the error for an argument that cannot work."""
     return ConfigurationError(
-        f"{owner}{': ' if owner else ''}{name}: expected {expected}, got {shown(value)}"
+        f"{owner}{': ' if owner else ''}{name}: expected {expected}, got {excerpt(value)}"
     )
 
 
@@ -107,7 +107,7 @@ def _as_integer(value: Any) -> int | None:
         return None
 
 
-def plain(value: object) -> object:
+def as_plain_value(value: object) -> object:
     """Return a number, truth value or text of any class as its plain value; others unchanged.
 
     Pydantic's strict types get the plain value, since they refuse numpy's numbers.
@@ -133,17 +133,17 @@ def check_number(
     most: float,
     owner: str = "",
     *,
-    above: bool = False,
+    exclusive: bool = False,
     unit: str = "a number",
 ) -> float:
-    """Return a finite number from ``least`` to ``most``; with ``above`` not ``least`` itself.
+    """Return a finite number from ``least`` to ``most``; with ``exclusive`` not ``least`` itself.
 
     Numbers of numpy and fractions are accepted; ``bool``, texts and arrays are not.
     """
     number = value if type(value) is float else _as_float(value)
-    if number is None or not least <= number <= most or (above and number == least):
+    if number is None or not least <= number <= most or (exclusive and number == least):
         raise wrong_argument(
-            name, f"{unit}, {'above ' if above else ''}{least:g} to {most:g}", value, owner
+            name, f"{unit}, {'above ' if exclusive else ''}{least:g} to {most:g}", value, owner
         )
     return number
 
@@ -157,18 +157,18 @@ def _as_float(value: Any) -> float | None:
         return None
 
 
-def check_seconds(value: object, name: str, owner: str = "", *, above: bool = False) -> float:
-    """Return a time in seconds, 0 or more; with ``above``, more than 0."""
+def check_seconds(value: object, name: str, owner: str = "", *, exclusive: bool = False) -> float:
+    """Return a time in seconds, 0 or more; with ``exclusive``, more than 0."""
     if type(value) is float and 0.0 < value <= MAX_SECONDS:
         return value
-    return check_number(value, name, 0.0, MAX_SECONDS, owner, above=above, unit="seconds")
+    return check_number(value, name, 0.0, MAX_SECONDS, owner, exclusive=exclusive, unit="seconds")
 
 
 def check_seconds_or_none(
-    value: object, name: str, owner: str = "", *, above: bool = False
+    value: object, name: str, owner: str = "", *, exclusive: bool = False
 ) -> float | None:
     """Return a time in seconds as :func:`check_seconds` does, or None."""
-    return None if value is None else check_seconds(value, name, owner, above=above)
+    return None if value is None else check_seconds(value, name, owner, exclusive=exclusive)
 
 
 def check_moment(value: object, name: str, owner: str = "") -> float:

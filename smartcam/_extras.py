@@ -71,15 +71,17 @@ def load(name: str, use: str = "") -> Any:
     try:
         module = importlib.import_module(name)
     except ImportError as exc:
-        raise missing(name, use) from exc
+        raise missing_extra_error(name, use) from exc
     version = str(getattr(module, "__version__", ""))
     if name == "cv2" and version.startswith(BROKEN_OPENCV):
-        raise missing(name, use, f"other than {version}, which lacks hand-eye calibration")
+        raise missing_extra_error(
+            name, use, f"other than {version}, which lacks hand-eye calibration"
+        )
     _LOADED[name] = module
     return module
 
 
-def missing(name: str, use: str = "", which: str = "") -> MissingExtraError:
+def missing_extra_error(name: str, use: str = "", which: str = "") -> MissingExtraError:
     """Return the error that names the extra to install for a module.
 
     Args:

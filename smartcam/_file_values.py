@@ -92,7 +92,7 @@ Patterns = Annotated[
 ]
 
 
-def chosen(patterns: Sequence[str], camera: str) -> bool:
+def matches_any(patterns: Sequence[str], camera: str) -> bool:
     """Return True if one of the patterns matches the camera's name."""
     return any(
         _matches(pattern.split("/"), camera.split("/"), "**", _part_fits) for pattern in patterns

@@ -17,11 +17,11 @@ from smartcam._arguments import (
     MAX_NAME_CHARACTERS,
     MAX_OPTION_SECONDS,
     MIN_PAYLOAD_LIMIT_BYTES,
-    plain,
+    as_plain_value,
 )
 from smartcam.backoff import Backoff
 
-PLAIN = BeforeValidator(plain)
+PLAIN = BeforeValidator(as_plain_value)
 """Lets a strict type accept numbers and texts of any class, such as numpy's."""
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, P
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from smartcam._client._inside import in_pixels, localizations_of, without_poses
+from smartcam._client._inside import has_pixel_positions, localizations_of, name_without_poses
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConfigurationError, InterpretationError, LocalProtocolError
 from smartcam.settings import FLEET_SCHEMES, parse_address
@@ -190,19 +190,19 @@ class ThesisService(NamedTuple):
         request: class of its requests.
         do: function that carries the service out, and returns the answer's fields except ``error``.
         timeout: seconds, if the request gives none.
-        settles: True if the service changes publishing; such services run one after the other.
+        changes_publishing: True for a service that changes publishing; these run one at a time.
         after_stop: True if the service works after SmartcameraStop, before the next
             SmartcameraSetup.
-        nothing: name of the answer's field that is an empty list after an error; None if the answer
-            has no such field.
+        empty_field: name of the answer's field that is an empty list after an error; None if the
+            answer has no such field.
     """
 
     request: type[ThesisRequest]
     do: Callable[[ThesisCall], Awaitable[dict[str, Any]]]
     timeout: float = DEFAULT_TIMEOUT
-    settles: bool = False
+    changes_publishing: bool = False
     after_stop: bool = False
-    nothing: str | None = None
+    empty_field: str | None = None
 
     async def answer(self, call: ThesisCall) -> dict[str, Any]:
         """Carry the service out; return the answer's fields except ``error``.
@@ -294,7 +294,7 @@ async def _trigger_localizations(call: ThesisCall) -> dict[str, Any]:
     application, value = await camera.trigger(requested, spec, call.timeout)
     localizations = localizations_of(value)
     interpreter = _interpreter_of(spec, application)
-    are_pixels = in_pixels(interpreter) and not camera.is_calibrated(application)
+    are_pixels = has_pixel_positions(interpreter) and not camera.is_calibrated(application)
     if localizations is None or are_pixels:
         raise InterpretationError(
             f"{camera.name}: expected localizations in metres, got {value!r:.80}; "
@@ -318,7 +318,7 @@ def _spec_of_localizations(camera: ThesisCamera, application: int | None) -> Any
 def _with_poses(reading: Interpretation, application: int | None) -> Any:
     """Return an application's own interpreter if it makes localizations, else "localizations"."""
     own = reading.interpreter(application)
-    return "localizations" if own is None or without_poses(own) is not None else own
+    return "localizations" if own is None or name_without_poses(own) is not None else own
 
 
 def _interpreter_of(spec: Any, application: int) -> Any:
@@ -328,18 +328,24 @@ def _interpreter_of(spec: Any, application: int) -> Any:
 
 
 THESIS: Final[dict[str, ThesisService]] = {
-    "SmartcameraSetup": ThesisService(SetupRequest, _setup, settles=True, after_stop=True),
-    "EnablePublishing": ThesisService(PublishingRequest, _enable_publishing, settles=True),
-    "SmartcameraStop": ThesisService(ThesisRequest, _stop, settles=True, after_stop=True),
+    "SmartcameraSetup": ThesisService(
+        SetupRequest, _setup, changes_publishing=True, after_stop=True
+    ),
+    "EnablePublishing": ThesisService(
+        PublishingRequest, _enable_publishing, changes_publishing=True
+    ),
+    "SmartcameraStop": ThesisService(
+        ThesisRequest, _stop, changes_publishing=True, after_stop=True
+    ),
     "ChangeApplication": ThesisService(ApplicationRequest, _change_application),
     "Trigger50ByteString": ThesisService(
-        ThesisTriggerRequest, _trigger_strings, DEFAULT_TRIGGER_TIMEOUT, nothing="strings"
+        ThesisTriggerRequest, _trigger_strings, DEFAULT_TRIGGER_TIMEOUT, empty_field="strings"
     ),
     "TriggerLocalization": ThesisService(
         ThesisTriggerRequest,
         _trigger_localizations,
         DEFAULT_TRIGGER_TIMEOUT,
-        nothing="localizations",
+        empty_field="localizations",
     ),
 }
 """The six services by name."""

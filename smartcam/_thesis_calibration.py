@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Name
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from smartcam._client._inside import in_pixels, localizations_of, without_poses
+from smartcam._client._inside import has_pixel_positions, localizations_of, name_without_poses
 from smartcam._extras import from_part
 from smartcam._thesis import DEFAULT_TIMEOUT, ThesisRequest
 from smartcam.exceptions import ConfigurationError, InterpretationError
@@ -221,7 +221,7 @@ async def _transform(call: CalibrationCall) -> dict[str, Any]:
     return {"pose": await call.calibrations.transform(pixel_pose)}
 
 
-def own_localizations(reading: Interpretation | None, application: int | None) -> tuple[Any, str]:
+def localization_spec(reading: Interpretation | None, application: int | None) -> tuple[Any, str]:
     """Return the specification for localizations in the camera's own frame, and their unit.
 
     Args:
@@ -229,9 +229,9 @@ def own_localizations(reading: Interpretation | None, application: int | None) -
         application: the active application; None if that is not known.
     """
     interpreter = None if reading is None else reading.interpreter(application)
-    if interpreter is None or without_poses(interpreter) is not None:
+    if interpreter is None or name_without_poses(interpreter) is not None:
         return "localizations", "m"
-    return interpreter, "px" if in_pixels(interpreter) else "m"
+    return interpreter, "px" if has_pixel_positions(interpreter) else "m"
 
 
 def checked_localizations(value: object, camera: str) -> list[Localization]:

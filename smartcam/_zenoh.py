@@ -383,7 +383,7 @@ class ZenohSession:
         session, self._session = self._session, None
         if session is not None:
             self._reopening = True
-            lost = [declared.lose() for declared in tuple(self._declared)]
+            lost = [declared.detach() for declared in tuple(self._declared)]
             closing = self._loop.run_in_executor(
                 None, _end_and_release, session, lost, self._link.mode != "client"
             )
@@ -396,7 +396,7 @@ class ZenohSession:
         for index, declared in enumerate(tuple(self._declared)):
             if index % MAX_DECLARED_AT_ONCE == 0:
                 await asyncio.sleep(0)
-            declared.again()
+            declared.redeclare()
         self._reopening = False
 
     def _end_lingering(self) -> None:
@@ -458,7 +458,7 @@ class ZenohSession:
             self._queued_patient_bytes,
         )
 
-    def in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
+    def call_in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
         """Schedule a call in the event loop, in order; from any thread."""
         with self._lock:
             self._waiting.append((call, arguments, size))
@@ -468,8 +468,8 @@ class ZenohSession:
             self._wake_pending = True
         self._wake()
 
-    def in_loop_patiently(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
-        """Schedule a call as :meth:`in_loop` does, but after all calls that are not patient."""
+    def call_in_loop_patiently(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
+        """Schedule a call like :meth:`call_in_loop`, but after all calls that are not patient."""
         with self._lock:
             self._patient.append((call, arguments, size))
             self._queued_patient_bytes += size
@@ -606,9 +606,9 @@ class ZenohSession:
         """Zenoh's module."""
         return self._zenoh
 
-    def later(self, call: Callable[..., None], *arguments: Any) -> None:
+    def call_in_loop_uncounted(self, call: Callable[..., None], *arguments: Any) -> None:
         """Schedule a call in the event loop, without counted bytes; from any thread."""
-        self.in_loop(call, 0, *arguments)
+        self.call_in_loop(call, 0, *arguments)
 
 
 class _LoopBell:
@@ -671,7 +671,7 @@ class ZenohDeclared:
         self._how: Callable[[Any], Any] = _declare_nothing
         self._on_lost: Callable[[], None] | None = None
 
-    def of(self, how: Callable[[Any], Any]) -> Self:
+    def declare(self, how: Callable[[Any], Any]) -> Self:
         """Make the declaration: ``how`` gets the engine's session, and returns the declaration."""
         self._how = how
         self._declaration = self._end.declare(self, how)
@@ -682,14 +682,14 @@ class ZenohDeclared:
         self._on_lost = call
         return self
 
-    def lose(self) -> Any:
+    def detach(self) -> Any:
         """Prepare for the end of the session; return the declaration to keep until that end."""
         declaration, self._declaration = self._declaration, None
         if self._on_lost is not None:
-            self._end.later(self.call, self._on_lost)
+            self._end.call_in_loop_uncounted(self.call, self._on_lost)
         return None if self._by_dropping else declaration
 
-    def again(self) -> None:
+    def redeclare(self) -> None:
         """Make the declaration again with the new session."""
         if not self._closed and self._declaration is None:
             self._declaration = self._how(self._end.session)

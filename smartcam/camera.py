@@ -847,7 +847,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         form = self._check_form(encoding, quality, STREAM_ENCODINGS)
         rate = self._check_rate(bitrate, latency)
         decode = check_flag(decode, "decode", self.name)
-        timeout = check_seconds_or_none(timeout, "timeout", self.name, above=True)
+        timeout = check_seconds_or_none(timeout, "timeout", self.name, exclusive=True)
         return self._frames(StreamRequest(*form, *rate, decode, timeout))
 
     async def newest_frame(
@@ -1127,7 +1127,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         return Listeners(self.settings.name, self._observers)
 
     @property
-    def _place(self) -> Address:
+    def _camera_address(self) -> Address:
         """Address of the camera itself, as far as it is known."""
         return self.settings.address
 
@@ -1161,7 +1161,11 @@ class Camera(abc.ABC, Generic[ValueT]):
         lenient, y_down = self.settings.lenient, self.settings.y_down
         calibration = self.settings.calibration
         interpretation = Interpretation(
-            spec, lenient=lenient, y_down=y_down, calibration=calibration, own=of_camera
+            spec,
+            lenient=lenient,
+            y_down=y_down,
+            calibration=calibration,
+            strict_calibration=of_camera,
         )
         if isinstance(spec, str) and len(self._interpretations) < MAX_INTERPRETATIONS:
             self._interpretations[spec] = interpretation

@@ -164,10 +164,10 @@ class Observers:
         observers: observers in the order in which they are called.
 
     Attributes:
-        see_states: True if an observer handles events.
-        see_results: True if an observer handles results, single or together.
-        see_single_results: True if an observer handles single results.
-        see_pictures: True if an observer handles the pictures of results.
+        handles_states: True if an observer handles events.
+        handles_results: True if an observer handles results, single or together.
+        handles_single_results: True if an observer handles single results.
+        handles_pictures: True if an observer handles the pictures of results.
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
@@ -176,10 +176,10 @@ class Observers:
         # each hook for results, and whether it takes several at once
         self._on_result: list[tuple[Callable[..., None], bool]] = []
         self._on_picture: tuple[Callable[..., None], ...] = ()
-        self.see_pictures: bool = False
-        self.see_states: bool = False
-        self.see_results: bool = False
-        self.see_single_results: bool = False
+        self.handles_pictures: bool = False
+        self.handles_states: bool = False
+        self.handles_results: bool = False
+        self.handles_single_results: bool = False
         if type(observers) is not tuple or observers:
             self._add_observers(observers)
 
@@ -193,10 +193,10 @@ class Observers:
         result_hooks = self._overridden_hooks("on_results", "on_result")
         self._on_result = [(hook, name == "on_results") for hook, name in result_hooks]
         self._on_picture = self._overriding("on_picture")
-        self.see_pictures = bool(self._on_picture)
-        self.see_states = bool(self._on_state)
-        self.see_results = bool(self._on_result)
-        self.see_single_results = not all(takes_several for _, takes_several in self._on_result)
+        self.handles_pictures = bool(self._on_picture)
+        self.handles_states = bool(self._on_state)
+        self.handles_results = bool(self._on_result)
+        self.handles_single_results = not all(takes_several for _, takes_several in self._on_result)
 
     def __bool__(self) -> bool:
         return bool(self._all)
@@ -236,7 +236,7 @@ class Observers:
 
     def results(self, results: Sequence[Result]) -> None:
         """Report results that came together; one by one if an observer wants single results."""
-        if self.see_single_results:
+        if self.handles_single_results:
             for _ in self.each(results):
                 pass
             return

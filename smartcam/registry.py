@@ -11,7 +11,7 @@ import importlib
 import logging
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._arguments import shown
+from smartcam._arguments import excerpt
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import PluginError
 
@@ -85,7 +85,7 @@ class Registry:
         if self._registered.get(name) is plugin:
             return
         if name in self and self.load(name) is not plugin:
-            raise PluginError(f"{self.group}: {shown(name)} is there already", name=name)
+            raise PluginError(f"{self.group}: {excerpt(name)} is there already", name=name)
         self._registered[name] = plugin
         self.revision += 1
 
@@ -116,7 +116,7 @@ class Registry:
                 _log.warning(
                     "%s: the name %s is smartcam's own, that of %s is left out",
                     self.group,
-                    shown(name),
+                    excerpt(name),
                     " and ".join(_distribution(point) for point in self._points_found.pop(name)),
                 )
         return self._points_found
@@ -130,20 +130,21 @@ class Registry:
         if not points:
             known = [info.name for info in self.available()]
             raise PluginError(
-                f"{self.group}: {shown(name)} is unknown; known are {', '.join(known)}"
+                f"{self.group}: {excerpt(name)} is unknown; known are {', '.join(known)}"
                 f"{did_you_mean(name, known)}",
                 name=name,
             )
         if len(points) > 1:
             raise PluginError(
-                f"{self.group}: the name {shown(name)} is provided by {' and '.join(providers)}",
+                f"{self.group}: the name {excerpt(name)} is provided by {' and '.join(providers)}",
                 name=name,
             )
         try:
             loaded: object = points[0].load()
         except (Exception, SystemExit) as exc:  # an import must not end the program
             raise PluginError(
-                f"{self.group}: {shown(name)} of {providers[0]} failed to load: {exc!r}", name=name
+                f"{self.group}: {excerpt(name)} of {providers[0]} failed to load: {exc!r}",
+                name=name,
             ) from exc
         return loaded
 

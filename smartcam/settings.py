@@ -22,7 +22,7 @@ from smartcam._arguments import (
     MAX_OPTION_SECONDS,
     MIN_PAYLOAD_LIMIT_BYTES,
     check_text,
-    shown,
+    excerpt,
 )
 from smartcam._suggestions import did_you_mean, hint
 from smartcam.backoff import Backoff
@@ -473,7 +473,7 @@ def id_of(application: str, names: Mapping[str, int]) -> int:
     if application in names:
         return names[application]
     raise ConfigurationError(
-        f"application {shown(application)} is none of {', '.join(names)}"
+        f"application {excerpt(application)} is none of {', '.join(names)}"
         f"{did_you_mean(application, names)}"
     )
 
@@ -500,7 +500,7 @@ def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:
     """
     return "; ".join(
         f"{'.'.join(f'{part!s:.80}' for part in item['loc']) or 'value'}: {item['msg']}"
-        f"{_suggestion(item, known)} (got {shown(item['input'])})"
+        f"{_suggestion(item, known)} (got {excerpt(item['input'])})"
         for item in error.errors()
     )
 

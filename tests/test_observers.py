@@ -228,10 +228,10 @@ def test_results_and_events_are_asked_for_if_somebody_looks() -> None:
         def on_result(self, result: Result) -> None: ...
 
     one, other = Observers([Blind(), Looks()]), Observers([Blind(), Everything("one", [])])
-    assert (one.see_results, one.see_states) == (True, False)
-    assert (other.see_results, other.see_states) == (True, True)
+    assert (one.handles_results, one.handles_states) == (True, False)
+    assert (other.handles_results, other.handles_states) == (True, True)
     neither = Observers([Blind()])
-    assert (neither.see_results, neither.see_states) == (False, False)
+    assert (neither.handles_results, neither.handles_states) == (False, False)
 
 
 def test_observer_with_a_hook_of_its_own_object_is_called() -> None:
@@ -255,7 +255,7 @@ class Together(Everything):
 def test_results_come_together_if_nobody_wants_them_one_by_one() -> None:
     calls: list[tuple[Any, ...]] = []
     observers = Observers([Together("one", calls), Blind(), Together("two", calls)])
-    assert (observers.see_results, observers.see_single_results) == (True, False)
+    assert (observers.handles_results, observers.handles_single_results) == (True, False)
     observers.results(OTHERS)
     observers.result(RESULT)
     assert calls == [
@@ -267,7 +267,7 @@ def test_results_come_together_if_nobody_wants_them_one_by_one() -> None:
 def test_results_come_one_by_one_to_all_where_one_wants_that() -> None:
     calls: list[tuple[Any, ...]] = []
     observers = Observers([Together("one", calls), Everything("two", calls)])
-    assert observers.see_single_results
+    assert observers.handles_single_results
     observers.results(OTHERS)
     assert calls == [
         (name, what, one)

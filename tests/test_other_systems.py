@@ -17,7 +17,7 @@ import pytest
 import smartcam
 import smartcam.sync
 from smartcam import _loop_thread
-from smartcam._client._inside import Try
+from smartcam._client._inside import Attempt
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from tests.processes import PATIENCE, Process
 
@@ -107,6 +107,6 @@ def test_command_ends_by_ctrl_c_where_loops_take_no_signals() -> None:
 
 def test_error_of_winsock_keeps_its_own_words(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.strerror", lambda number: "Unknown error")
-    one = Try("handbook", "tcp")
+    one = Attempt("handbook", "tcp")
     one.end(OSError(10061, "Connect call failed ('127.0.0.1', 9)"), 0.0)
     assert "Connect call failed" in one.outcome

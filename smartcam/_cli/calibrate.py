@@ -251,11 +251,11 @@ calibrate = GroupWithDefault(
 
 def _list(path: str, options: Options) -> None:
     from smartcam.calibration import Folder
-    from smartcam.calibration._inside import listing
+    from smartcam.calibration._inside import list_calibrations
 
     if not Path(path).is_dir():
         raise ConfigurationError(f"--folder {path}: no such folder")
-    rows = listing(Folder(path))
+    rows = list_calibrations(Folder(path))
     if options.as_json:
         for row in rows:
             options.show(row, "")

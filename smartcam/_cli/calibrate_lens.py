@@ -226,12 +226,14 @@ def _view_of_file(path: Path, target: Target) -> TargetView:
 async def _collect_views(source: FrameSource, target: Target, options: Options) -> list[TargetView]:
     """Return the views collected from a source while the target is moved."""
     from smartcam.calibration import find_target
-    from smartcam.calibration._inside import LOOKS, suggestion
+    from smartcam.calibration._inside import STANDARD_VIEWS, suggest_view
 
     view_count = options.count or 15
     collector, reported = ViewCollector(), set[str]()
     if not options.as_json:
-        click.echo(f"view 1 of {view_count}: hold the target {LOOKS[0].text}; Ctrl-C gives up")
+        click.echo(
+            f"view 1 of {view_count}: hold the target {STANDARD_VIEWS[0].text}; Ctrl-C gives up"
+        )
     try:
         async with asyncio.timeout(options.seconds), source.reader() as reader:
             async for frame in reader:
@@ -247,7 +249,7 @@ async def _collect_views(source: FrameSource, target: Target, options: Options) 
                 _show_view(f"{name} of {view_count}", view, "", options)
                 if len(collector.views) == view_count:
                     break
-                next_look = await asyncio.to_thread(suggestion, collector.views, lens_known=False)
+                next_look = await asyncio.to_thread(suggest_view, collector.views, lens_known=False)
                 if not options.as_json:
                     click.echo(f"  next: {next_look.text}")
     except TimeoutError as exc:

@@ -148,10 +148,10 @@ async def find(
         async with show_progress_line(search):
             await search.run()
     finally:
-        if search.begun:
+        if search.has_begun:
             left_alone = {
                 host: fleet_cameras[text]
-                for host, text in search.left.items()
+                for host, text in search.left_out.items()
                 if text in fleet_cameras
             }
             if as_yaml:
@@ -226,8 +226,8 @@ def summary(search: CameraSearch) -> str:
     outcomes = ("open", "refused", "no answer", "unreachable", "failed")
     outcome_counts = [f"{search.counts[name]} {name}" for name in outcomes if search.counts[name]]
     text = f"{search.opened} of {search.total} ports tried: {', '.join(outcome_counts) or 'none'}"
-    if search.why:
-        text += f" (failed: {search.why})"
+    if search.failure:
+        text += f" (failed: {search.failure})"
     text += ". Cameras that are set to UDP do not show."
     if search.exclusive:
         text += f" {DISTURBANCE_WARNING.format(' or '.join(search.exclusive))}"

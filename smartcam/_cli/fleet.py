@@ -155,12 +155,12 @@ async def _show_results(fleet: Fleet, results: FleetResults[Any], options: Optio
 
 
 async def _show_events(events: Subscription[FleetEvent], pattern: str, options: Options) -> None:
-    from smartcam.fleet._inside import meets
+    from smartcam.fleet._inside import patterns_overlap
     from smartcam.models import jsonable
 
     async for event in events:
         fields: dict[str, Any] = jsonable(event)
-        if meets(pattern, fields.get("camera", pattern)):
+        if patterns_overlap(pattern, fields.get("camera", pattern)):
             kind = type(event).__name__
             options.show({"event": kind, **fields}, _EVENT_TEXTS[kind].format(**fields))
 

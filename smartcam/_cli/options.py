@@ -297,12 +297,12 @@ class Options:
         """Return the calibration, and the reason to doubt it; "" if there is none."""
         with from_part("calibration", "--calibration needs"):
             from smartcam.calibration import load_calibration
-            from smartcam.calibration._inside import doubt_of
+            from smartcam.calibration._inside import doubt_text
         with naming_file_errors(option):
             calibration = load_calibration(self.calibration or "")
         if check_y_down:
             self.check_y_down(calibration, option)
-        return calibration, doubt_of(calibration)
+        return calibration, doubt_text(calibration)
 
     @contextmanager
     def open_trace(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
@@ -367,13 +367,13 @@ class Options:
         Raises ConfigurationError: --units has an unknown unit.
         """
         from smartcam._cli.texts import result_text
-        from smartcam._client._inside import own_interpreter
+        from smartcam._client._inside import camera_interpreter
         from smartcam.layout._inside import ShownUnits
 
         units = ShownUnits(self.unit_names or ())
 
         def make_text(camera: Camera, result: Result) -> str:
-            interpreter = own_interpreter(camera, result.application)
+            interpreter = camera_interpreter(camera, result.application)
             layout = None if interpreter is None else interpreter.layout
             return result_text(result, units, layout)
 
@@ -393,9 +393,9 @@ class Options:
 
     def show_remarks(self, camera: Camera) -> None:
         """Print on stderr what users of results should know about the camera's dialect, if any."""
-        from smartcam._client._inside import remarks
+        from smartcam._client._inside import dialect_remarks
 
-        for text in remarks(camera.settings.address):
+        for text in dialect_remarks(camera.settings.address):
             click.echo(f"note: {text}", err=True)
 
     def show(self, value: object, text: str | Callable[[Any], str]) -> None:

@@ -41,7 +41,13 @@ async def probe(host_or_url: str, try_all: bool, options: Options) -> None:
     failed_trials: list[Trial] = []
     with options.open_trace(host_or_url) as trace:
         timeout = options.step_timeout(10.0)
-        tries = trials(address, timeout=timeout, trace=trace, go_on=try_all, every_protocol=True)
+        tries = trials(
+            address,
+            timeout=timeout,
+            trace=trace,
+            continue_after_answer=try_all,
+            every_protocol=True,
+        )
         async with aclosing(tries):
             async for trial in tries:
                 _show_trial(trial, options)
@@ -70,7 +76,11 @@ def _show_trial(trial: Trial, options: Options) -> None:
     address = {"protocol": trial.address.protocol, "port": trial.address.port}
     value = {**address, **{name: getattr(trial, name) for name in names}}
     outcome = f"{trial.step}: {trial.outcome}" if trial.answer is None else "a camera answers"
-    of = f"{trial.address.protocol} at port {trial.address.port}: " if trial.other else ""
+    of = (
+        f"{trial.address.protocol} at port {trial.address.port}: "
+        if trial.is_other_protocol
+        else ""
+    )
     lines = [f"{of}{trial.transport} {trial.dialect}: {outcome}"]
     lines += [f"  {frame_text(entry)}" for entry in trial.frames]
     if trial.omitted:

@@ -272,12 +272,12 @@ def _recording_jobs(
 
 def _describe_fleet_camera(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
     """Record the agent's settings, which a recording without frames would not contain."""
-    from smartcam._client._inside import in_pixels, own_interpreter
+    from smartcam._client._inside import camera_interpreter, has_pixel_positions
 
     dialect = camera.capabilities.dialect
     _describe(recorders, camera.name, dialect=dialect, endian=camera.endian)
     reading = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
-    if in_pixels(own_interpreter(camera, camera.active_application)):
+    if has_pixel_positions(camera_interpreter(camera, camera.active_application)):
         reading["pixels"] = True
     _describe(recorders, camera.name, **{name: value for name, value in reading.items() if value})
 

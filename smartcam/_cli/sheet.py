@@ -199,9 +199,9 @@ async def _write_sheet(
         if _lower_suffix(path) not in {".svg", ".pdf"}:
             raise click.UsageError(f"-o {path}: expected a name that ends with .svg or .pdf")
     from smartcam.calibration import make_sheet, scaled
-    from smartcam.calibration._inside import on_paper
+    from smartcam.calibration._inside import target_from_description
 
-    new_sheet = make_sheet(on_paper({"kind": kind, **target_settings}), page=page)
+    new_sheet = make_sheet(target_from_description({"kind": kind, **target_settings}), page=page)
     target = new_sheet.target
     if measured_rulers is not None:
         target = scaled(target, measured_rulers)

@@ -8,31 +8,32 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam._client.attempts import (
+        Attempt,
         Reason,
         SessionRefusedError,
-        Try,
         explain,
         reason_for,
-        words,
+        reason_values,
     )
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
     from smartcam._client.deadline import DeadlineTimer
     from smartcam._client.doorbell import Outcome, make_doorbell
-    from smartcam._client.handshake import Session, attempt, names_of, remarks
+    from smartcam._client.handshake import Session, attempt, dialect_names, dialect_remarks
     from smartcam._client.interpretation import (
         Interpretation,
         Interpreted,
-        in_pixels,
+        camera_interpreter,
+        has_pixel_positions,
         localizations_of,
+        name_without_poses,
         new_tuple,
-        own_interpreter,
-        without_poses,
     )
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
 
 __all__ = [
+    "Attempt",
     "CameraState",
     "ClientCounters",
     "DeadlineTimer",
@@ -44,33 +45,32 @@ __all__ = [
     "Session",
     "SessionRefusedError",
     "TriggerRequest",
-    "Try",
     "attempt",
+    "camera_interpreter",
+    "dialect_names",
+    "dialect_remarks",
     "explain",
-    "in_pixels",
+    "has_pixel_positions",
     "localizations_of",
     "make_doorbell",
-    "names_of",
+    "name_without_poses",
     "new_tuple",
-    "own_interpreter",
     "reason_for",
-    "remarks",
-    "without_poses",
-    "words",
+    "reason_values",
 ]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "attempts": "Reason SessionRefusedError Try explain reason_for words",
+            "attempts": "Reason SessionRefusedError Attempt explain reason_for reason_values",
             "camera_state": "CameraState",
             "counters": "ClientCounters",
             "deadline": "DeadlineTimer",
             "doorbell": "Outcome make_doorbell",
-            "handshake": "Session attempt names_of remarks",
-            "interpretation": "Interpretation Interpreted in_pixels localizations_of "
-            "new_tuple own_interpreter without_poses",
+            "handshake": "Session attempt dialect_names dialect_remarks",
+            "interpretation": "Interpretation Interpreted has_pixel_positions localizations_of "
+            "new_tuple camera_interpreter name_without_poses",
             "listeners": "Listeners",
             "triggering": "TriggerRequest",
         },

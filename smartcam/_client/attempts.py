@@ -36,7 +36,7 @@ class SessionRefusedError(RemoteProtocolError):
 
 
 @dataclass(slots=True)
-class Try:
+class Attempt:
     """One attempt, and the step that it reached.
 
     Attributes:
@@ -105,10 +105,10 @@ class Try:
 
 
 class Reason(NamedTuple):
-    """A possible reason for a missing session; :func:`words` fills in its texts."""
+    """A possible reason for a missing session; :func:`reason_values` fills in its texts."""
 
     # function that returns, by an attempt's observations, whether this is the cause
-    fits: Callable[[Try], bool]
+    fits: Callable[[Attempt], bool]
     text: str  # text of the problem
     cure: str  # text of the cure
 
@@ -186,14 +186,14 @@ REASONS: tuple[Reason, ...] = (
 silence."""
 
 
-def reason_for(tries: Sequence[Try]) -> tuple[Reason, Try]:
+def reason_for(tries: Sequence[Attempt]) -> tuple[Reason, Attempt]:
     """Return the reason why attempts failed, and the attempt that shows it."""
     return next(
         (reason, attempt) for reason in REASONS for attempt in tries if reason.fits(attempt)
     )
 
 
-def words(attempt: Try, address: Address, protocol: Protocol) -> dict[str, str]:
+def reason_values(attempt: Attempt, address: Address, protocol: Protocol) -> dict[str, str]:
     """Return the values for the placeholders in a reason's texts."""
     names = [transport.value for transport in protocol.schemes.values()]
     this, others = attempt.transport.upper(), [name for name in names if name != attempt.transport]
@@ -208,7 +208,7 @@ def words(attempt: Try, address: Address, protocol: Protocol) -> dict[str, str]:
     }
 
 
-def explain(tries: Sequence[Try], address: Address, protocol: Protocol) -> str:
+def explain(tries: Sequence[Attempt], address: Address, protocol: Protocol) -> str:
     """Return one cause and one cure for attempts that failed."""
     reason, attempt = reason_for(tries)
-    return f"{reason.text}. {reason.cure}".format(**words(attempt, address, protocol))
+    return f"{reason.text}. {reason.cure}".format(**reason_values(attempt, address, protocol))

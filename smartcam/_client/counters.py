@@ -90,7 +90,7 @@ class ClientCounters:
         self.fates[fate] += containers
         self.received += containers
 
-    def skip(self, empty_slots: int) -> None:
+    def add_empty_slots(self, empty_slots: int) -> None:
         """Count all-zero records that an interpreter skipped."""
         self.empty_slots += empty_slots
 
@@ -114,13 +114,13 @@ class ClientCounters:
         """Keep the text of a link's last error."""
         self.last_error = str(error)
 
-    def begin(self, wire: Counters) -> None:
+    def begin_session(self, wire: Counters) -> None:
         """Count a session, and the traffic of its link from now on."""
-        self.end()
+        self.end_session()
         self.sessions += 1
         self._open_wire = wire
 
-    def end(self) -> None:
+    def end_session(self) -> None:
         """Add the counters of a link that has ended."""
         if self._open_wire is not None:
             # copied, since the link may still change its object

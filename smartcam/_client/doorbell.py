@@ -97,11 +97,11 @@ class Doorbell:
         for outcome in to_wake or ():
             outcome.wake_soon()
 
-    def outcome(self) -> DirectFuture[Any]:
+    def make_outcome(self) -> DirectFuture[Any]:
         """Return an outcome that one task may wait for."""
         return DirectFuture(self, self._loop)
 
-    def give(self, outcome: Outcome, value: object) -> None:
+    def set_outcome(self, outcome: Outcome, value: object) -> None:
         """Set the result of an outcome: its task continues at once, unless another task runs."""
         if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
             outcome.set_result(value)
@@ -299,11 +299,11 @@ class PlainDoorbell:
     def wake_in_order(self) -> None:
         """Do nothing, since all callers continue through the loop anyway."""
 
-    def outcome(self) -> asyncio.Future[Any]:
+    def make_outcome(self) -> asyncio.Future[Any]:
         """Return an outcome that one task may wait for."""
         return self._loop.create_future()
 
-    def give(self, outcome: Outcome, value: object) -> None:
+    def set_outcome(self, outcome: Outcome, value: object) -> None:
         """Set the result of an outcome; its task continues through the loop."""
         outcome.set_result(value)
 
@@ -316,7 +316,7 @@ class PlainDoorbell:
 
 
 Outcome: TypeAlias = DirectFuture[Any] | asyncio.Future[Any]
-"""The value of :meth:`Doorbell.outcome` or :meth:`PlainDoorbell.outcome`."""
+"""The value of :meth:`Doorbell.make_outcome` or :meth:`PlainDoorbell.make_outcome`."""
 
 
 def make_doorbell(loop: asyncio.AbstractEventLoop) -> Doorbell | PlainDoorbell:

@@ -16,7 +16,7 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._client.attempts import CONNECTING, OPENING, SessionRefusedError, Try, explain
+from smartcam._client.attempts import CONNECTING, OPENING, Attempt, SessionRefusedError, explain
 from smartcam._client.link import Chunk, Link, open_link
 from smartcam.exceptions import (
     CommandRejectedError,
@@ -202,7 +202,7 @@ async def attempt(
     dialects: Sequence[Dialect],
     transport: Transport,
     *,
-    progress: Try,
+    progress: Attempt,
     name: str,
     max_length: int,
     trace: Callable[[Sequence[RawFrame]], None] | None = None,
@@ -303,7 +303,7 @@ def _groups_for_layout(
     return groups
 
 
-def remarks(address: Address) -> set[str]:
+def dialect_remarks(address: Address) -> set[str]:
     """Return the remarks of an address' dialects, for a user who asks for results.
 
     An address of a fleet has none: its agent logged them.
@@ -313,7 +313,7 @@ def remarks(address: Address) -> set[str]:
     return {dialect.remark for dialects in dialect_groups(address) for dialect in dialects} - {""}
 
 
-def names_of(dialects: Sequence[Dialect]) -> str:
+def dialect_names(dialects: Sequence[Dialect]) -> str:
     """Return the names of dialects that begin a session alike."""
     if len(dialects) == 1:
         return dialects[0].name
@@ -344,10 +344,10 @@ async def establish(
     groups = _groups_for_layout(_dialect_groups(protocol, address), layout)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + settings.connect_timeout
-    tries: list[Try] = []
+    tries: list[Attempt] = []
     cause: BaseException | None = None
     disconnect_first = True
-    round_tries: list[Try] = []
+    round_tries: list[Attempt] = []
     for rounds_left in range(settings.connect_attempts, 0, -1):
         if isinstance(cause, CommandRejectedError):
             break  # the camera refused, and would refuse again
@@ -356,7 +356,7 @@ async def establish(
         is_detecting = len(groups) > 1 and rounds_left == settings.connect_attempts > 1
         for position, dialects in enumerate(groups):
             begun_at, untried_count = loop.time(), len(groups) - position
-            progress = Try(names_of(dialects), transport.value)
+            progress = Attempt(dialect_names(dialects), transport.value)
             tries.append(progress)
             round_tries.append(progress)
             try:

@@ -12,7 +12,7 @@ import inspect
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
-from smartcam._arguments import check_application, shown
+from smartcam._arguments import check_application, excerpt
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.exceptions import (
     CalibrationError,
@@ -21,7 +21,7 @@ from smartcam.exceptions import (
     WrongApplicationError,
 )
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve, run
-from smartcam.interpreters._inside import plain, run_plain, run_sequence
+from smartcam.interpreters._inside import as_plain_interpreter, run_plain, run_sequence
 from smartcam.layout._inside import UNITS, pack_texts
 from smartcam.models import Localization
 from smartcam.registry import INTERPRETERS
@@ -87,8 +87,9 @@ class Interpretation:
         lenient: whether any non-zero byte is a true bool.
         y_down: whether the camera's y axis points down.
         calibration: a value of ``calibration``.
-        own: True if the calibration was given together with ``spec``. If False, it is not applied
-            to values that never are localizations; if True, such a specification is an error.
+        strict_calibration: True if the calibration was given together with ``spec``. If False, it
+            is not applied to values that never are localizations; if True, such a specification is
+            an error.
 
     Attributes:
         by_application: whether each application has its own interpreter.
@@ -106,7 +107,7 @@ class Interpretation:
         lenient: bool,
         y_down: bool,
         calibration: Any = None,
-        own: bool = True,
+        strict_calibration: bool = True,
     ) -> None:
         self._lenient = lenient
         self._y_down = y_down
@@ -119,19 +120,19 @@ class Interpretation:
                 if not isinstance(application, int):
                     raise ConfigurationError(
                         f"interpret_as: a mapping goes from application id to a specification; "
-                        f"{shown(application)} is no id"
+                        f"{excerpt(application)} is no id"
                     )
                 self._by_application[application] = _make_reader(
-                    resolve(application_spec, lenient=lenient), own
+                    resolve(application_spec, lenient=lenient), strict_calibration
                 )
         else:
             self._reader_of_all = (
-                _raw_reader(own)
+                _raw_reader(strict_calibration)
                 if spec is None
-                else _make_reader(resolve(spec, lenient=lenient), own)
+                else _make_reader(resolve(spec, lenient=lenient), strict_calibration)
             )
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
-        if self._calibrations is not None and own:
+        if self._calibrations is not None and strict_calibration:
             if self._reader_of_all is not None:
                 self._calibrations.check(None, self._reader_of_all.interpreter)
             for application, reader in self._by_application.items():
@@ -316,7 +317,7 @@ class _Calibrations:
                     f"the mapping has {sorted(known)}"
                 )
             given = [*known.values()] if application is None else [known[application]]
-        name = without_poses(interpreter)
+        name = name_without_poses(interpreter)
         if name is not None and None not in given:
             raise ConfigurationError(
                 f"calibration: expected results{of} to be localizations, as with "
@@ -388,7 +389,7 @@ def _checked_calibration(given: Any, y_down: bool) -> Calibration:
     if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):
         raise ConfigurationError(
             "calibration: expected an object with a method to_robot(localizations) that is not "
-            f"async, such as PlaneCalibration.load(FILE) gives, got {shown(given)}"
+            f"async, such as PlaneCalibration.load(FILE) gives, got {excerpt(given)}"
         )
     own_y_down: object = getattr(given, "y_down", None)
     if own_y_down is not None and own_y_down != y_down:
@@ -411,19 +412,19 @@ _WITHOUT_POSES = ("raw", "record", "strings50", "table")
 """Built-in interpreters whose values never are localizations."""
 
 
-def without_poses(interpreter: Interpreter) -> str | None:
+def name_without_poses(interpreter: Interpreter) -> str | None:
     """Return the interpreter's name if its values never are localizations, else None."""
     # exactly the built-in types, since a subclass may return any value
     names = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
     return next(names, None)
 
 
-def own_interpreter(camera: Camera[Any], application: int | None) -> Interpreter | None:
+def camera_interpreter(camera: Camera[Any], application: int | None) -> Interpreter | None:
     """Return the interpreter of a camera's results; None for an application that is not known."""
     return camera._default.interpreter(application)  # noqa: SLF001 - smartcam's own
 
 
-def in_pixels(interpreter: Interpreter | None) -> bool:
+def has_pixel_positions(interpreter: Interpreter | None) -> bool:
     """Return True if an interpreter's positions are in pixels, not in lengths."""
     layout = None if interpreter is None else interpreter.layout
     return layout is not None and any(
@@ -482,8 +483,8 @@ def _make_reader(interpreter: Interpreter, own: bool) -> _ApplicationReader:
         numbering = Numbering(min(field.wire.high, MAX_NUMBER), always)
     return _ApplicationReader(
         interpreter,
-        plain(interpreter),
+        as_plain_interpreter(interpreter),
         sequenced or field is not None,
         numbering,
-        own or without_poses(interpreter) is None,
+        own or name_without_poses(interpreter) is None,
     )

@@ -211,7 +211,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._busy_since: float | None = None
         self._busy_frames = 0
         self._doorbell = bell = make_doorbell(self.loop)  # doorbell of the receive task
-        self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.outcome
+        self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.make_outcome
         self.wake_in_order: Callable[[], None] = bell.wake_in_order
         self._closed = False
         self._close_waiters: list[

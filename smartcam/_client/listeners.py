@@ -44,8 +44,8 @@ class Listeners:
         self.results: Subscribers[Result] = Subscribers()
         self.statuses: Subscribers[Status] = Subscribers()
         self.events: Subscribers[CameraEvent] = Subscribers()
-        self.has_result_observer: bool = observers.see_results
-        self._observes_singly = observers.see_single_results
+        self.has_result_observer: bool = observers.handles_results
+        self._observes_singly = observers.handles_single_results
         self._name = name
         self._observers = observers
         # weak: a future that was made and never awaited must not count as a listener
@@ -110,7 +110,7 @@ class Listeners:
 
     def observers_want_events(self) -> bool:
         """Return True if an observer or the log needs events."""
-        return self._observers.see_states or logger.isEnabledFor(logging.DEBUG)
+        return self._observers.handles_states or logger.isEnabledFor(logging.DEBUG)
 
     # ------------------------------------------------------------------ delivery
 

@@ -322,7 +322,7 @@ class Results:
         if interpreted is None:
             return None
         values, empty_slots = interpreted
-        self._counters.skip(empty_slots)
+        self._counters.add_empty_slots(empty_slots)
         # rows of a Result's fields; a loop in Python would take twice as long
         numbers, none = itertools.count(first), itertools.repeat(None)
         names, applications, ats = map(itertools.repeat, (name, application, at))
@@ -410,7 +410,7 @@ class Results:
                 self._fail_uninterpretable(owner, error, number)
             return
         if empty_slots:
-            counters.skip(empty_slots)
+            counters.add_empty_slots(empty_slots)
         application, data = container.application, container.data
         fields = (name, application, sequence, own_number, began, at, latency, data, value)
         result: Result = new_tuple(Result, fields)

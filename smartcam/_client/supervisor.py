@@ -248,7 +248,7 @@ class Supervisor:
             self._end_error = error
         if self.session is not None:
             self.session.link.abort()
-        self._counters.end()
+        self._counters.end_session()
         self._dispatch.finish(error)
         self._commands.end_session()
         self._is_finished = True
@@ -347,7 +347,7 @@ class Supervisor:
         ordered = session.link.machine.transport is Transport.TCP
         self._dispatch.begin_session(session.dialect, ordered=ordered)
         self._commands.begin_session(session.link)
-        self._counters.begin(session.link.machine.counters)
+        self._counters.begin_session(session.link.machine.counters)
         event_class = Reconnected if is_reconnect else Connected
         if logger.isEnabledFor(logging.INFO):
             logger.info("%s = connected to %s", self._name, session.address.url)

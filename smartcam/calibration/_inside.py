@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     )
     from smartcam.calibration._lens.uncertainty import MapFigures
     from smartcam.calibration._plane.drawing import draw
-    from smartcam.calibration._printing.sheets import on_paper
+    from smartcam.calibration._printing.sheets import target_from_description
     from smartcam.calibration._stereo.rectification import Rectification, rectify
     from smartcam.calibration._targets import Target
     from smartcam.calibration._units import METRES_PER_UNIT, LengthUnit
-    from smartcam.calibration._verdict import doubt_of
+    from smartcam.calibration._verdict import doubt_text
     from smartcam.calibration.formats._cameras import MAX_FILE_BYTES, CameraInfo, parse_camera_info
     from smartcam.calibration.formats._lenses import StoredLenses, read_lenses
     from smartcam.calibration.formats._robots import ROBOTS
-    from smartcam.calibration.wizards._listing import listing
+    from smartcam.calibration.wizards._listing import list_calibrations
     from smartcam.calibration.wizards._pictures import (
         MAX_PICTURE_BYTES,
         SUFFIXES,
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
         ThesisCalibration,
     )
     from smartcam.calibration.wizards._verification import WIZARD
-    from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
+    from smartcam.calibration.wizards._view_suggestions import STANDARD_VIEWS, suggest_view
 
 __all__ = [
-    "LOOKS",
     "MAX_FILE_BYTES",
     "MAX_PICTURE_BYTES",
     "METRES_PER_UNIT",
     "ROBOTS",
+    "STANDARD_VIEWS",
     "SUFFIXES",
     "WIZARD",
     "AnyCalibration",
@@ -72,17 +72,17 @@ __all__ = [
     "ThesisCalibration",
     "compare_lenses",
     "decode_picture",
-    "doubt_of",
+    "doubt_text",
     "draw",
     "draw_file",
     "independent_parts",
-    "listing",
-    "on_paper",
+    "list_calibrations",
     "parse_camera_info",
     "read_lenses",
     "rectify",
     "rig_difference",
-    "suggestion",
+    "suggest_view",
+    "target_from_description",
 ]
 
 if not TYPE_CHECKING:
@@ -96,19 +96,19 @@ if not TYPE_CHECKING:
             "_lens.comparison": "LensComparison Lens compare_lenses rig_difference",
             "_lens.uncertainty": "MapFigures",
             "_plane.drawing": "draw",
-            "_printing.sheets": "on_paper",
+            "_printing.sheets": "target_from_description",
             "_stereo.rectification": "Rectification rectify",
             "_targets": "Target",
             "_units": "LengthUnit METRES_PER_UNIT",
-            "_verdict": "doubt_of",
+            "_verdict": "doubt_text",
             "formats._cameras": "CameraInfo MAX_FILE_BYTES parse_camera_info",
             "formats._lenses": "StoredLenses read_lenses",
-            "wizards._listing": "listing",
+            "wizards._listing": "list_calibrations",
             "wizards._pictures": "PictureFolder MAX_PICTURE_BYTES SUFFIXES decode_picture",
             "wizards._steps": "Input",
             "wizards._thesis": "CalibrationCamera CalibrationDesks CalibrationStart "
             "PixelPoseRequest StepRequest ThesisCalibration",
             "wizards._verification": "WIZARD",
-            "wizards._view_suggestions": "LOOKS suggestion",
+            "wizards._view_suggestions": "STANDARD_VIEWS suggest_view",
         },
     )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, overload, runtime_checka
 
 import numpy as np
 
-from smartcam._argument_checks import a_finite_number, a_list, numbers, of_class, takes
+from smartcam._argument_checks import a_finite_number, a_list, check_arguments, numbers, of_class
 from smartcam.calibration._homography import apply_homography, derivatives, tangent_frames
 from smartcam.calibration._plane.validation import check_positive
 from smartcam.geometry import Transform
@@ -353,7 +353,7 @@ class Chain:
             as :func:`smartcam.connect` does and compares; None: not known.
     """
 
-    @takes(solvers=a_list)
+    @check_arguments(solvers=a_list)
     def __init__(
         self,
         solvers: Sequence[Solver],
@@ -437,7 +437,7 @@ def check_frames(
         )
 
 
-@takes(calibration=of_class("PlaneCalibration"), origin=numbers, theta=a_finite_number)
+@check_arguments(calibration=of_class("PlaneCalibration"), origin=numbers, theta=a_finite_number)
 def chain_of(
     calibration: PlaneCalibration, *, origin: ArrayLike = (0.0, 0.0), theta: float = 0.0
 ) -> Chain:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 
-from smartcam._argument_checks import a_target, takes
-from smartcam._arguments import shown
+from smartcam._argument_checks import a_target, check_arguments
+from smartcam._arguments import excerpt
 from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class Charuco:
         _check_flags(self.kind, legacy_pattern=self.legacy_pattern)
         if not isinstance(self.dictionary, str):
             raise Code.SHAPE.refusal(
-                f"charuco: expected the name of a dictionary, got {shown(self.dictionary)}",
+                f"charuco: expected the name of a dictionary, got {excerpt(self.dictionary)}",
                 "DICT_5X5_250",
                 self.dictionary,
             )
@@ -253,7 +253,7 @@ class MarkerGrid:
         if not isinstance(self.dictionary, str) or self.columns * self.rows < 2:
             raise Code.SHAPE.refusal(
                 f"{self.kind}: expected the name of a dictionary and two markers or more, got "
-                f"{shown(self.dictionary)} and {self.columns} x {self.rows}",
+                f"{excerpt(self.dictionary)} and {self.columns} x {self.rows}",
                 got=(self.dictionary, self.columns, self.rows),
             )
 
@@ -313,7 +313,7 @@ _KINDS: Mapping[str, type[Target]] = {
 }
 
 
-@takes(target=a_target)
+@check_arguments(target=a_target)
 def target_to_data(target: Target) -> dict[str, Any]:
     """Return a target as JSON data, which :func:`target_from_data` reads."""
     return {"kind": target.kind, **dataclasses.asdict(target)}
@@ -330,7 +330,7 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
     target_class = _KINDS.get(kind_name) if isinstance(kind_name, str) else None
     if target_class is None:
         raise Code.SHAPE.refusal(
-            f"target: expected a kind of {sorted(_KINDS)}, got {shown(kind_name)}",
+            f"target: expected a kind of {sorted(_KINDS)}, got {excerpt(kind_name)}",
             sorted(_KINDS),
             kind_name,
         )
@@ -366,7 +366,8 @@ def _check_counts(kind: str, columns: Any, rows: Any, minimum: int = 3) -> None:
     _check_whole(kind, minimum, columns=columns, rows=rows)
     if columns * rows > MAX_POINTS:
         raise Code.SHAPE.refusal(
-            f"{kind}: expected at most {MAX_POINTS} points, got {shown(columns)} x {shown(rows)}",
+            f"{kind}: expected at most {MAX_POINTS} points, "
+            f"got {excerpt(columns)} x {excerpt(rows)}",
             MAX_POINTS,
             columns * rows,
         )
@@ -377,7 +378,7 @@ def _check_whole(kind: str, minimum: int, **numbers: Any) -> None:
         if not isinstance(number, int) or isinstance(number, bool) or number < minimum:
             raise Code.SHAPE.refusal(
                 f"{kind}: expected {name} to be a whole number of at least {minimum}, "
-                f"got {shown(number)}",
+                f"got {excerpt(number)}",
                 minimum,
                 number,
             )
@@ -387,7 +388,7 @@ def _check_flags(kind: str, **flags: Any) -> None:
     for name, flag in flags.items():
         if not isinstance(flag, bool):
             raise Code.SHAPE.refusal(
-                f"{kind}: expected {name} to be True or False, got {shown(flag)}",
+                f"{kind}: expected {name} to be True or False, got {excerpt(flag)}",
                 "True or False",
                 flag,
             )
@@ -399,13 +400,13 @@ def _check_lengths(kind: str, **lengths: Any) -> None:
         if is_number and MAX_LENGTH_M < length < math.inf:
             raise Code.UNIT_UNKNOWN.refusal(
                 f"{kind}: expected {name} to be a length of {MAX_LENGTH_M:g} m at most, got "
-                f"{shown(length)} m; is it in millimetres?",
+                f"{excerpt(length)} m; is it in millimetres?",
                 MAX_LENGTH_M,
                 length,
             )
         if not (is_number and math.isfinite(length) and length > 0):
             raise Code.SHAPE.refusal(
-                f"{kind}: expected {name} to be a length in metres, got {shown(length)}",
+                f"{kind}: expected {name} to be a length in metres, got {excerpt(length)}",
                 "metres",
                 length,
             )

@@ -100,7 +100,7 @@ class Judgement(NamedTuple):
     option: str = "accept"  # the option that is advised
     number: int | None = None  # number, from 1, of the point or view that the advice is about
 
-    def chosen(self, options: Iterable[str]) -> str:
+    def choose_option(self, options: Iterable[str]) -> str:
         """Return the advised one of ``options``, which is never "accept" for a poor result."""
         return next(choice for choice in (self.option, "redo", "more") if choice in options)
 
@@ -132,7 +132,7 @@ def judge(
     texts = dict(reversed(list(warnings)))
     for code in cures:
         if code in texts:
-            return refused(code, texts[code], worst=worst, cures=cures)
+            return poor_judgement(code, texts[code], worst=worst, cures=cures)
     if held_out is None:
         return Judgement(
             CalibrationVerdict("unknown", f"Not known how good: {advice}"), option="more"
@@ -149,7 +149,7 @@ def judge(
     return Judgement(CalibrationVerdict("good", text), good_for)
 
 
-def refused(
+def poor_judgement(
     code: str,
     text: str,
     *,
@@ -171,7 +171,7 @@ def _rounded_up(value: float) -> float:
     return max(math.ceil(round(value * factor, 6)), 1) / factor
 
 
-def doubt_of(calibration: Any) -> str:
+def doubt_text(calibration: Any) -> str:
     """Return a warning for users of a calibration that is not good, or an empty text.
 
     A ``calibration`` without a ``verdict`` gives an empty text.
@@ -184,5 +184,5 @@ def doubt_of(calibration: Any) -> str:
 
 def warn_unless_good(calibration: Any, name: str) -> None:
     """Log a warning if the calibration of a file is not known to be good."""
-    if doubt := doubt_of(calibration):
+    if doubt := doubt_text(calibration):
         _log.warning("%s: %s", name, doubt)

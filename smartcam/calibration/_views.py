@@ -51,9 +51,9 @@ class TargetView(storage.Stored):
             ``NO_COVARIANCE``.
     """
 
-    _called: ClassVar[str] = "view"
+    _label: ClassVar[str] = "view"
     _keys: ClassVar[storage.Keys] = {"target": ""}
-    _later: ClassVar[frozenset[str]] = frozenset({"margin", "name", "warnings"})
+    _optional_keys: ClassVar[frozenset[str]] = frozenset({"margin", "name", "warnings"})
 
     target: Target
     size: storage.Size

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, an_integer, as_array, takes
-from smartcam._arguments import check_text, shown
+from smartcam._argument_checks import a_number, an_integer, as_array, check_arguments
+from smartcam._arguments import check_text, excerpt
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ MIN_NEW_SCENE_SHARE: Final = 0.5
 """Share of the pixels that must jump before the whole average restarts."""
 
 
-@takes(scale=a_number)
+@check_arguments(scale=a_number)
 def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.float32]:
     """Return a depth map as float32 metres, 0 for pixels without depth.
 
@@ -48,7 +48,7 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
     """
     if not (scale > 0 and math.isfinite(scale)):
         raise ConfigurationError(
-            f"depth: scale: expected metres a step above 0, got {shown(scale)}"
+            f"depth: scale: expected metres a step above 0, got {excerpt(scale)}"
         )
     given: NDArray[Any] = as_array(depth, "depth")
     if (
@@ -83,12 +83,12 @@ class SpatialFilter:
         ConfigurationError: a number out of its range.
     """
 
-    @takes(alpha=a_number, delta=a_number, iterations=an_integer)
+    @check_arguments(alpha=a_number, delta=a_number, iterations=an_integer)
     def __init__(self, alpha: float = 0.5, delta: float = 0.02, iterations: int = 2) -> None:
         _check_average("SpatialFilter", alpha, delta)
         if not 1 <= iterations <= MAX_PASSES:
             raise ConfigurationError(
-                f"SpatialFilter: iterations: expected 1 to {MAX_PASSES}, got {shown(iterations)}"
+                f"SpatialFilter: iterations: expected 1 to {MAX_PASSES}, got {excerpt(iterations)}"
             )
         self.alpha: float = alpha
         self.delta: float = delta
@@ -156,12 +156,12 @@ class TemporalFilter:
         ConfigurationError: a number out of its range.
     """
 
-    @takes(alpha=a_number, delta=a_number, persistence=an_integer)
+    @check_arguments(alpha=a_number, delta=a_number, persistence=an_integer)
     def __init__(self, alpha: float = 0.4, delta: float = 0.02, persistence: int = 3) -> None:
         _check_average("TemporalFilter", alpha, delta)
         if not 0 <= persistence < 255:
             raise ConfigurationError(
-                f"TemporalFilter: persistence: expected 0 to 254 maps, got {shown(persistence)}"
+                f"TemporalFilter: persistence: expected 0 to 254 maps, got {excerpt(persistence)}"
             )
         self.alpha: float = alpha
         self.delta: float = delta
@@ -204,7 +204,7 @@ class TemporalFilter:
         return new
 
 
-@takes(how=check_text, reach=an_integer, scale=a_number)
+@check_arguments(how=check_text, reach=an_integer, scale=a_number)
 def fill_holes(
     depth: NDArray[Any],
     how: HoleFill = "farthest",
@@ -230,11 +230,11 @@ def fill_holes(
     """
     if how not in get_args(HoleFill):
         raise ConfigurationError(
-            f"fill_holes: how: expected one of {get_args(HoleFill)}, got {shown(how)}"
+            f"fill_holes: how: expected one of {get_args(HoleFill)}, got {excerpt(how)}"
         )
     if not 1 <= reach <= MAX_PASSES:
         raise ConfigurationError(
-            f"fill_holes: reach: expected 1 to {MAX_PASSES}, got {shown(reach)}"
+            f"fill_holes: reach: expected 1 to {MAX_PASSES}, got {excerpt(reach)}"
         )
     filled = as_metres(depth, scale)
     for _ in range(reach):
@@ -274,6 +274,8 @@ def _join_neighbours(values: NDArray[Any], join: np.ufunc) -> NDArray[Any]:
 
 def _check_average(caller: str, alpha: float, delta: float) -> None:
     if not 0 < alpha <= 1:
-        raise ConfigurationError(f"{caller}: alpha: expected above 0, up to 1, got {shown(alpha)}")
+        raise ConfigurationError(
+            f"{caller}: alpha: expected above 0, up to 1, got {excerpt(alpha)}"
+        )
     if not (delta > 0 and math.isfinite(delta)):
-        raise ConfigurationError(f"{caller}: delta: expected a step above 0, got {shown(delta)}")
+        raise ConfigurationError(f"{caller}: delta: expected a step above 0, got {excerpt(delta)}")

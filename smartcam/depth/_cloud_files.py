@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import of_class, or_none, takes
-from smartcam._arguments import check_flag, check_path, check_text, shown
+from smartcam._argument_checks import check_arguments, of_class, or_none
+from smartcam._arguments import check_flag, check_path, check_text, excerpt
 from smartcam._whole_files import replace_file
 from smartcam.calibration._inside import METRES_PER_UNIT
 from smartcam.depth import _pcd, _ply
@@ -62,7 +62,7 @@ FORMATS: Final = {
 """File formats by suffix, in lower case."""
 
 
-@takes(unit=or_none(check_text))
+@check_arguments(unit=or_none(check_text))
 def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) -> Cloud:
     """Return the cloud of a ``.ply`` or a ``.pcd`` file, up to 1 GiB.
 
@@ -87,7 +87,7 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
     cloud_format = _find_format(path)
     if unit is not None and unit not in METRES_PER_UNIT:
         raise ConfigurationError(
-            f"unit: expected one of {', '.join(METRES_PER_UNIT)}, got {shown(unit)}"
+            f"unit: expected one of {', '.join(METRES_PER_UNIT)}, got {excerpt(unit)}"
         )
     try:
         with path.open("rb") as stream:
@@ -118,7 +118,7 @@ def _read_unit(data: bytes) -> str:
     return match[1].decode()
 
 
-@takes(cloud=of_class("Cloud"), text=check_flag)
+@check_arguments(cloud=of_class("Cloud"), text=check_flag)
 def save_cloud(path: str | os.PathLike[str], cloud: Cloud, *, text: bool = False) -> None:
     """Write a cloud as ``.ply`` or ``.pcd``, in bytes (little endian) or as text.
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, an_integer, as_array, each, takes
-from smartcam._arguments import check_flag, shown
+from smartcam._argument_checks import a_number, an_integer, as_array, check_arguments, each
+from smartcam._arguments import check_flag, excerpt
 from smartcam._extras import load
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames import Frame
-from smartcam.frames._inside import converted
+from smartcam.frames._inside import convert_frame
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,7 +61,7 @@ class ColourRange:
             if not is_valid or (low > high and name != "hue"):
                 raise ConfigurationError(
                     f"ColourRange: {name}: expected (from, to) of whole numbers 0 to {most}, "
-                    f"got {shown(given)}"
+                    f"got {excerpt(given)}"
                 )
             object.__setattr__(self, name, (low, high))  # JSON gives a list
 
@@ -114,7 +114,7 @@ class ColourRange:
         if not (0 <= radius <= 1000 and 0 <= margin <= 255):
             raise ConfigurationError(
                 f"ColourRange: expected a radius of 0 to 1000 and a margin of 0 to 255, got "
-                f"{shown(radius)} and {shown(margin)}"
+                f"{excerpt(radius)} and {excerpt(margin)}"
             )
         return around_hsv(hsv(picture), x, y, radius, margin)
 
@@ -127,7 +127,7 @@ def hsv(picture: Frame | NDArray[Any]) -> NDArray[np.uint8]:
     """Return a picture as hue, saturation and value in OpenCV's units, (H, W, 3) of uint8."""
     source = ""
     if isinstance(picture, Frame):
-        source, picture = picture.source, converted(picture, "RGB8").array()
+        source, picture = picture.source, convert_frame(picture, "RGB8").array()
     given = np.asarray(picture)
     if given.dtype != np.uint8 or given.ndim != 3 or given.shape[2] != 3 or not given.size:
         raise FrameFormatError(
@@ -202,7 +202,7 @@ class ColourRegion:
         return self.area / (self.sides[0] * self.sides[1])
 
 
-@takes(
+@check_arguments(
     area=each(a_number, 2),
     ratio=each(a_number, 2),
     fullness=a_number,

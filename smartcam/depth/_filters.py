@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, numbers, of_class, takes
-from smartcam._arguments import check_text, shown
+from smartcam._argument_checks import a_number, check_arguments, numbers, of_class
+from smartcam._arguments import check_text, excerpt
 from smartcam._extras import load
 from smartcam.depth._cloud import Cloud
 from smartcam.exceptions import ConfigurationError
@@ -26,7 +26,7 @@ POINTS_AT_A_TIME: Final = 1 << 17
 MAX_NEIGHBOURS: Final = 1000
 
 
-@takes(cloud=of_class("Cloud"), axis=check_text, low=a_number, high=a_number)
+@check_arguments(cloud=of_class("Cloud"), axis=check_text, low=a_number, high=a_number)
 def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = math.inf) -> Cloud:
     """Return the points whose coordinate on an axis is from ``low`` to ``high``, metres.
 
@@ -34,17 +34,17 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
         ConfigurationError: the axis is none of x, y, z, or the range is not valid.
     """
     if axis not in AXES or len(axis) != 1:
-        raise ConfigurationError(f"pass_through: expected x, y or z, got {shown(axis)}")
+        raise ConfigurationError(f"pass_through: expected x, y or z, got {excerpt(axis)}")
     if not low <= high:
         raise ConfigurationError(
-            f"pass_through: expected low <= high, got {shown(low)} and {shown(high)}"
+            f"pass_through: expected low <= high, got {excerpt(low)} and {excerpt(high)}"
         )
     coordinates = cloud.points[:, AXES.index(axis)]
     bounds = _as_float32((low, high))
     return cloud.select((coordinates >= bounds[0]) & (coordinates <= bounds[1]))
 
 
-@takes(cloud=of_class("Cloud"), low=numbers, high=numbers)
+@check_arguments(cloud=of_class("Cloud"), low=numbers, high=numbers)
 def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud:
     """Return the points in a box with sides along the axes; points on a side are included.
 
@@ -67,7 +67,7 @@ def _as_float32(bounds: ArrayLike) -> NDArray[np.float32]:
         return np.asarray(bounds, np.float64).astype(np.float32)
 
 
-@takes(cloud=of_class("Cloud"), ratio=a_number)
+@check_arguments(cloud=of_class("Cloud"), ratio=a_number)
 def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
     """Return the cloud without the points that are unusually far from their neighbours.
 
@@ -82,7 +82,7 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
     _check_count(neighbours, "remove_statistical_outliers")
     if not ratio >= 0:
         raise ConfigurationError(
-            f"remove_statistical_outliers: ratio: expected 0 or more, got {shown(ratio)}"
+            f"remove_statistical_outliers: ratio: expected 0 or more, got {excerpt(ratio)}"
         )
     if not len(cloud):
         return cloud
@@ -103,7 +103,7 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
     )
 
 
-@takes(cloud=of_class("Cloud"), radius=a_number)
+@check_arguments(cloud=of_class("Cloud"), radius=a_number)
 def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> Cloud:
     """Return the points with at least ``neighbours`` other points within a radius in metres.
 
@@ -124,7 +124,7 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
     return cloud.select(mask)
 
 
-@takes(cloud=of_class("Cloud"), size=a_number)
+@check_arguments(cloud=of_class("Cloud"), size=a_number)
 def voxel_grid(cloud: Cloud, size: float) -> Cloud:
     """Return one point per voxel: the mean of its points, with their mean colour.
 
@@ -188,10 +188,10 @@ def _chunks(count: int) -> Iterator[slice]:
 def _check_count(value: int, label: str) -> None:
     if not isinstance(value, int) or not 1 <= value <= MAX_NEIGHBOURS:
         raise ConfigurationError(
-            f"{label}: neighbours: expected 1 to {MAX_NEIGHBOURS}, got {shown(value)}"
+            f"{label}: neighbours: expected 1 to {MAX_NEIGHBOURS}, got {excerpt(value)}"
         )
 
 
 def _check_length(value: float, label: str) -> None:
     if not 0 < value < math.inf:
-        raise ConfigurationError(f"{label}: expected metres above 0, got {shown(value)}")
+        raise ConfigurationError(f"{label}: expected metres above 0, got {excerpt(value)}")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, an_integer, or_none, takes
-from smartcam._arguments import check_text, shown
+from smartcam._argument_checks import a_number, an_integer, check_arguments, or_none
+from smartcam._arguments import check_text, excerpt
 from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
 from smartcam.depth._subpixel import refine_disparities
@@ -151,7 +151,7 @@ class StereoMatcher:
         MissingExtraError: OpenCV (extra ``depth``) is not installed.
     """
 
-    @takes(algorithm=check_text, left_right=or_none(a_number), refine=an_integer)
+    @check_arguments(algorithm=check_text, left_right=or_none(a_number), refine=an_integer)
     def __init__(
         self,
         algorithm: Literal["sgbm", "bm"] = "sgbm",
@@ -163,7 +163,7 @@ class StereoMatcher:
     ) -> None:
         if algorithm not in _PARAMETERS:
             raise ConfigurationError(
-                f"StereoMatcher: expected {' or '.join(_PARAMETERS)}, got {shown(algorithm)}"
+                f"StereoMatcher: expected {' or '.join(_PARAMETERS)}, got {excerpt(algorithm)}"
             )
         self.algorithm = algorithm
         self.parameters: Mapping[str, Value] = _merge_parameters(algorithm, parameters)
@@ -270,7 +270,7 @@ def _merge_parameters(algorithm: str, given: Mapping[str, Value]) -> dict[str, V
     for name, value in given.items():
         if name not in known:
             raise ConfigurationError(
-                f"StereoMatcher {algorithm}: no parameter {shown(name)}; there are "
+                f"StereoMatcher {algorithm}: no parameter {excerpt(name)}; there are "
                 f"{', '.join(known)}{did_you_mean(name, known)}"
             )
         if known[name].check(value) is None:
@@ -286,7 +286,7 @@ def _merge_parameters(algorithm: str, given: Mapping[str, Value]) -> dict[str, V
 
 
 def _argument_error(label: str, expected: str, actual: object) -> ConfigurationError:
-    return ConfigurationError(f"StereoMatcher: {label}: expected {expected}, got {shown(actual)}")
+    return ConfigurationError(f"StereoMatcher: {label}: expected {expected}, got {excerpt(actual)}")
 
 
 def _as_grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:

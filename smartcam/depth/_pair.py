@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam._argument_checks import takes
+from smartcam._argument_checks import check_arguments
 from smartcam._arguments import check_path
 from smartcam._extras import load
 from smartcam.calibration._inside import MAX_FILE_BYTES, parse_camera_info, rectify
@@ -42,7 +42,7 @@ MIN_AVERAGING_FACTOR: Final = 1.25
 four pixels."""
 
 
-@takes(left=check_path, right=check_path)
+@check_arguments(left=check_path, right=check_path)
 def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str]) -> CameraChain:
     """Read a pair from two ``camera_info`` files, as ROS' ``camera_calibration`` writes them.
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, takes
-from smartcam._arguments import shown
+from smartcam._argument_checks import a_number, check_arguments
+from smartcam._arguments import excerpt
 from smartcam.depth._cleaning import MILLIMETRE, as_metres
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
@@ -50,7 +50,7 @@ class RegionDepth:
     pixels: int
 
 
-@takes(scale=a_number, shared=a_number)
+@check_arguments(scale=a_number, shared=a_number)
 def region_depth(
     depth: NDArray[Any],
     region: DepthArea | None = None,
@@ -75,7 +75,7 @@ def region_depth(
     """
     if not (shared >= 1 and math.isfinite(shared)):
         raise ConfigurationError(
-            f"region_depth: shared: expected 1 or more pixels, got {shown(shared)}"
+            f"region_depth: shared: expected 1 or more pixels, got {excerpt(shared)}"
         )
     metres = as_metres(depth, scale)
     region_depths = metres[_region_mask(region, metres.shape)]
@@ -173,7 +173,7 @@ def _region_mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np
             return _polygon_mask(given.astype(float), shape)
     raise ConfigurationError(
         "region: expected a box (x, y, width, height) of whole pixels, a polygon (N, 2) or a mask "
-        f"of bool {shape}, got {shown(region)}"
+        f"of bool {shape}, got {excerpt(region)}"
     )
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, of_class, or_none, takes
-from smartcam._arguments import check_text, shown
+from smartcam._argument_checks import a_number, check_arguments, of_class, or_none
+from smartcam._arguments import check_text, excerpt
 from smartcam._extras import load
 from smartcam.depth._filters import voxel_grid
 from smartcam.depth._surface import displacement_jacobian, fit_planes, open_directions
@@ -91,7 +91,7 @@ class _Neighbours(NamedTuple):
     arms: Array  # (M, 3), rotated vectors from the source's origin to its points
 
 
-@takes(
+@check_arguments(
     source=of_class("Cloud"),
     target=of_class("Cloud"),
     method=check_text,
@@ -161,14 +161,14 @@ def register(
 def _check_arguments(method: str, max_distance: float, min_overlap: float) -> None:
     if method not in METHODS:
         raise ConfigurationError(
-            f"method: expected one of {', '.join(METHODS)}, got {shown(method)}"
+            f"method: expected one of {', '.join(METHODS)}, got {excerpt(method)}"
         )
     if not 0 < max_distance < math.inf:
         raise ConfigurationError(
-            f"max_distance: expected metres above 0, got {shown(max_distance)}"
+            f"max_distance: expected metres above 0, got {excerpt(max_distance)}"
         )
     if not 0 <= min_overlap <= 1:
-        raise ConfigurationError(f"min_overlap: expected 0 to 1, got {shown(min_overlap)}")
+        raise ConfigurationError(f"min_overlap: expected 0 to 1, got {excerpt(min_overlap)}")
 
 
 def _align(

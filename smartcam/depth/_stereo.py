@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from smartcam._argument_checks import a_list, a_number, or_none, takes
-from smartcam._arguments import check_flag, shown
+from smartcam._argument_checks import a_list, a_number, check_arguments, or_none
+from smartcam._arguments import check_flag, excerpt
 from smartcam.depth._from_reader import ReaderDriver
 from smartcam.depth._matcher import MAX_DISPARITIES, StereoMatcher
 from smartcam.depth._one_thread import OneThread
@@ -121,7 +121,7 @@ class StereoDepth:
         ConfigurationError: a value that is not valid, or a calibration of other than two cameras.
     """
 
-    @takes(size=or_none(a_list), alpha=a_number, colour=check_flag, focal_sigma=a_number)
+    @check_arguments(size=or_none(a_list), alpha=a_number, colour=check_flag, focal_sigma=a_number)
     def __init__(
         self,
         left: FrameSource | AbstractAsyncContextManager[FrameReader],
@@ -137,15 +137,17 @@ class StereoDepth:
         timeout: float | None = FRAME_TIMEOUT,
     ) -> None:
         if not 0 <= alpha <= 1:
-            raise ConfigurationError(f"stereo: alpha: expected 0 to 1, got {shown(alpha)}")
+            raise ConfigurationError(f"stereo: alpha: expected 0 to 1, got {excerpt(alpha)}")
         if not 0 <= focal_sigma < math.inf:
             raise ConfigurationError(
-                f"stereo: focal_sigma: expected pixels, got {shown(focal_sigma)}"
+                f"stereo: focal_sigma: expected pixels, got {excerpt(focal_sigma)}"
             )
         if size is not None and not (
             len(size) == 2 and all(isinstance(count, int) and count > 0 for count in size)
         ):
-            raise ConfigurationError(f"stereo: size: expected width and height, got {shown(size)}")
+            raise ConfigurationError(
+                f"stereo: size: expected width and height, got {excerpt(size)}"
+            )
         self._make_pair = partial(
             CalibratedPair, calibration, size=size, alpha=alpha, focal_sigma=focal_sigma
         )

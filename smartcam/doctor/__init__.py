@@ -206,9 +206,9 @@ async def examine(
             "doctor: a GigE camera has no applications and no results: trigger, application and "
             "interpret_as are for smart cameras"
         )
-    seconds = check_number(seconds, "seconds", 0, MAX_SECONDS, "doctor", above=True)
+    seconds = check_number(seconds, "seconds", 0, MAX_SECONDS, "doctor", exclusive=True)
     count = check_integer(count, "count", 1, MAX_TRIGGERS, "doctor")
-    timeout = check_seconds_or_none(timeout, "timeout", "doctor", above=True)
+    timeout = check_seconds_or_none(timeout, "timeout", "doctor", exclusive=True)
     y_down = check_flag(y_down, "y_down", "doctor")
     trigger = check_flag(trigger, "trigger", "doctor")
     if trace is not None:

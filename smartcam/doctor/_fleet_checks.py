@@ -20,7 +20,7 @@ from smartcam.fleet._inside import (
     FleetAddress,
     Keys,
     ZenohEnd,
-    ends_soon,
+    expiry_warning,
     may_command,
     read_identity,
     shake_hands,
@@ -123,8 +123,8 @@ async def _check_certificates(exam: Examination, address: FleetAddress) -> bool:
     except ConfigurationError as exc:
         exam.fail(str(exc), f"smartcam fleet certificates makes what belongs into {folder}.")
         return False
-    if own_identity.expired:
-        exam.fail(own_identity.expired, "Until then nothing there takes this program.")
+    if own_identity.expired_text:
+        exam.fail(own_identity.expired_text, "Until then nothing there takes this program.")
         return False
     peer_identity = await shake_hands(address.host, address.port, folder)
     if peer_identity.trouble:
@@ -134,7 +134,7 @@ async def _check_certificates(exam: Examination, address: FleetAddress) -> bool:
             "to name the host of the URL: smartcam fleet certificates --host.",
         )
         return False
-    warning = own_identity.warning or ends_soon("the agent's certificate", peer_identity.ends)
+    warning = own_identity.warning or expiry_warning("the agent's certificate", peer_identity.ends)
     exam.report(
         "hint" if warning else "ok",
         f"this program is {own_identity}: it may look"

@@ -115,7 +115,7 @@ async def examine_gige(
     Cancellation: the camera is given back.
     """
     address = FrameAddress.parse(url)
-    places.wanted(address)  # checks the URL
+    places.read_wanted_stream(address)  # checks the URL
     exam = _GigEExamination(address, seconds, timeout or 5.0)
     checks: tuple[tuple[str, Callable[[_GigEExamination], Awaitable[None]]], ...] = (
         ("address", _find_address),
@@ -147,7 +147,9 @@ async def examine_gige(
 async def _find_address(exam: _GigEExamination) -> None:
     """Check ``address``: find the address that the URL means."""
     try:
-        host, exam.port = await places.place(exam.address, places.wanted(exam.address))
+        host, exam.port = await places.find_camera(
+            exam.address, places.read_wanted_stream(exam.address)
+        )
         addresses = await asyncio.get_running_loop().getaddrinfo(host, None, family=socket.AF_INET)
     except FrameSourceError as exc:
         raise exam.fail(
@@ -241,7 +243,7 @@ async def _no_answer_error(
     exam: _GigEExamination, error: FrameSourceError
 ) -> _ExaminationOverError:
     """Return the error that nothing answered, with the cause if it can be found."""
-    cameras = await discovery.find(discovery.networks())
+    cameras = await discovery.find_cameras(discovery.networks())
     cameras_there = [
         camera for camera in cameras if exam.host in (camera.address, camera.info.address)
     ]

@@ -13,7 +13,7 @@ import contextlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._client._inside import SessionRefusedError, Try, attempt, explain, names_of
+from smartcam._client._inside import Attempt, SessionRefusedError, attempt, dialect_names, explain
 from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
@@ -59,7 +59,7 @@ class CameraAnswer(NamedTuple):
 
 
 @dataclass(slots=True, kw_only=True)
-class Trial(Try):
+class Trial(Attempt):
     """One try and its outcome; ``outcome`` is ``session`` if a camera answered.
 
     Attributes:
@@ -67,20 +67,22 @@ class Trial(Try):
         frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        other: whether the protocol differs from that of the given address.
+        is_other_protocol: whether the protocol differs from that of the given address.
     """
 
     address: Address
     frames: list[TraceEntry] = field(default_factory=list[TraceEntry])
     omitted: int = 0
     answer: CameraAnswer | None = None
-    other: bool = False
+    is_other_protocol: bool = False
 
     def __str__(self) -> str:
         """Return the try in one line, for an error."""
         text = super(Trial, self).__str__()
         return (
-            f"{self.address.protocol} at port {self.address.port}: {text}" if self.other else text
+            f"{self.address.protocol} at port {self.address.port}: {text}"
+            if self.is_other_protocol
+            else text
         )
 
     def keep(self, entry: TraceEntry) -> None:
@@ -147,15 +149,15 @@ async def trials(
     *,
     timeout: float,
     trace: Callable[[TraceEntry], None] | None = None,
-    go_on: bool = False,
+    continue_after_answer: bool = False,
     every_protocol: bool = False,
 ) -> AsyncGenerator[Trial]:
     """Try every way in turn and yield each try; a session is ended before its try is yielded.
 
     The pinned options of ``address`` are tried first. ``timeout``: seconds for all tries; each has
-    an equal share of the rest. ``trace``: called with every frame on the wire. ``go_on``: continue
-    after the first way that answers. ``every_protocol``: try the other registered protocols, too; a
-    protocol whose greeting was received is next.
+    an equal share of the rest. ``trace``: called with every frame on the wire.
+    ``continue_after_answer``: continue after the first way that answers. ``every_protocol``: try
+    the other registered protocols, too; a protocol whose greeting was received is next.
 
     Cancellation: the link is dropped, after a Disconnect if there was a session.
     """
@@ -172,13 +174,13 @@ async def trials(
         way, disconnect_first = remaining.popleft()
         share = max(0.0, deadline - loop.time()) / (len(remaining) + 1)
         trial = await _try_way(way, share, trace, disconnect_first=disconnect_first)
-        trial.other = trial.address.protocol != address.protocol
+        trial.is_other_protocol = trial.address.protocol != address.protocol
         if trial.hung_up and disconnect_first and way.transport is Transport.TCP:
             # the camera may have closed because of the Disconnect
             remaining.appendleft((way, False))
         _put_greeted_first(remaining, trial)
         yield trial
-        if trial.answer is not None and not go_on:
+        if trial.answer is not None and not continue_after_answer:
             return
 
 
@@ -265,7 +267,7 @@ async def _try_way(
     disconnect_first: bool,
 ) -> Trial:
     address, transport, dialects = way
-    trial = Trial(names_of(dialects), transport.value, address=address)
+    trial = Trial(dialect_names(dialects), transport.value, address=address)
 
     def record_frames(frames: Sequence[RawFrame]) -> None:
         for frame in frames:

@@ -19,7 +19,7 @@ from smartcam._arguments import (
     check_integer,
     check_number,
     check_text,
-    shown,
+    excerpt,
 )
 from smartcam.doctor._found import (
     check_consent,
@@ -134,9 +134,9 @@ class CameraSearch:
         opened: number of ports that were tried.
         total: number of ports to try, once names are looked up.
         counts: number of tried ports by outcome.
-        why: reason of the first failure of this machine.
-        left: addresses that were left out, each with the text that named it.
-        begun: whether the first port was tried.
+        failure: reason of the first failure of this machine.
+        left_out: addresses that were left out, each with the text that named it.
+        has_begun: whether the first port was tried.
     """
 
     def __init__(
@@ -153,16 +153,16 @@ class CameraSearch:
         timeout: float = 1.0,
         max_addresses: int = DEFAULT_MAX_ADDRESSES,
     ) -> None:
-        rate = check_number(rate, "rate", 0, MAX_OPENINGS_PER_SECOND, "find", above=True)
+        rate = check_number(rate, "rate", 0, MAX_OPENINGS_PER_SECOND, "find", exclusive=True)
         at_once = check_integer(at_once, "at_once", 1, MAX_OPEN_CONNECTIONS, "find")
-        timeout = check_number(timeout, "timeout", 0, MAX_SECONDS, "find", above=True)
+        timeout = check_number(timeout, "timeout", 0, MAX_SECONDS, "find", exclusive=True)
         max_addresses = check_integer(max_addresses, "max_addresses", 1, MAX_ADDRESSES, "find")
         may_disturb = check_flag(may_disturb, "may_disturb", "find")
         ask = check_flag(ask, "ask", "find")
         if not networks or not all(isinstance(text, str) for text in networks):
             raise ConfigurationError(
                 "find: expected one network or several, each a text of its own; got "
-                f"{shown(networks)}"
+                f"{excerpt(networks)}"
             )
         networks = [check_text(text, "network", "find", most=MAX_NETWORK_TEXT) for text in networks]
         leave = [
@@ -185,9 +185,9 @@ class CameraSearch:
         self.opened = 0
         self.total = 0
         self.counts: collections.Counter[str] = collections.Counter()
-        self.why = ""
-        self.left: dict[str, str] = {}
-        self.begun = False
+        self.failure = ""
+        self.left_out: dict[str, str] = {}
+        self.has_begun = False
 
     @property
     def exclusive(self) -> list[str]:
@@ -222,10 +222,10 @@ class CameraSearch:
         _check_count(len(addresses), self._max_addresses)
         for text, span in excluded:
             if span.size == 1 and span.first in addresses:
-                self.left[str(span.first)] = text
+                self.left_out[str(span.first)] = text
         addresses = addresses.without(AddressSet(span for _, span in excluded))
         self.total = len(addresses) * len(self._ports)
-        self.begun = True
+        self.has_begun = True
         loop = asyncio.get_running_loop()
         free_connections, next_opening = asyncio.Semaphore(self._at_once), loop.time()
         try:
@@ -263,7 +263,7 @@ class CameraSearch:
             self._open_count -= 1
         self.opened += 1
         self.counts[opened.outcome] += 1
-        self.why = self.why or opened.failure
+        self.failure = self.failure or opened.failure
         if opened.outcome == "open":
             self._ports_found[address, port] = describe_port(str(address), port, opened, protocols)
 

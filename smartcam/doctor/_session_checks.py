@@ -7,7 +7,7 @@ import contextlib
 import socket
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client._inside import reason_for, remarks, words
+from smartcam._client._inside import dialect_remarks, reason_for, reason_values
 from smartcam.doctor._findings import Exit
 from smartcam.doctor._probing import most_informative_first, trials
 from smartcam.doctor._timing import figures
@@ -20,7 +20,7 @@ from smartcam.protocols import Transport
 from smartcam.protocols._inside import load_protocol
 
 if TYPE_CHECKING:
-    from smartcam._client._inside import Reason, Try
+    from smartcam._client._inside import Attempt, Reason
     from smartcam.camera import Camera
     from smartcam.doctor._context import Examination
     from smartcam.doctor._probing import CameraAnswer, Trial
@@ -124,7 +124,7 @@ def _report_session(
         protocol_version=camera.protocol_version,
         connect_time=measured._asdict(),
     )
-    for remark in remarks(exam.address):
+    for remark in dialect_remarks(exam.address):
         exam.report("warning", remark)
 
 
@@ -167,7 +167,7 @@ async def _try_all(exam: Examination) -> list[Trial]:
 def _report_no_session(exam: Examination, tries: list[Trial], answer: CameraAnswer | None) -> None:
     address = tries[0].address
     reason, trial = _find_reason(tries, pinned=address.dialect is not None)
-    texts = words(trial, address, load_protocol(address.protocol))
+    texts = reason_values(trial, address, load_protocol(address.protocol))
     if answer is not None:
         cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
     else:
@@ -183,14 +183,14 @@ def _report_no_session(exam: Examination, tries: list[Trial], answer: CameraAnsw
     )
 
 
-def _find_reason(tries: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
+def _find_reason(tries: list[Trial], *, pinned: bool) -> tuple[Reason, Attempt]:
     """Return the reason why the URL gives no session, and the try that shows it."""
     first = tries[0]
     similar_tries = [
         trial
         for trial in tries
         if trial.transport == first.transport
-        and not trial.other
+        and not trial.is_other_protocol
         and (trial.dialect == first.dialect or not pinned)
     ]
     return reason_for(similar_tries)
@@ -200,7 +200,7 @@ def _tries_text(tries: list[Trial]) -> str:
     """Return tries in one line; dialects with equal transport and outcome are listed together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for trial in tries:
-        port_text = f" at port {trial.address.port}" if trial.other else ""
+        port_text = f" at port {trial.address.port}" if trial.is_other_protocol else ""
         key = (f"{trial.transport.upper()}{port_text}", trial.step, trial.outcome)
         groups.setdefault(key, []).append(trial.dialect)
     return "; ".join(

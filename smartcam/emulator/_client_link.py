@@ -161,11 +161,11 @@ class ClientLink(ABC):
             self._faulty = None
 
     @property
-    def settled(self) -> bool:
+    def keeps_place(self) -> bool:
         """True if the link has the session, so that it is never closed for a new client."""
         return self._owner.serves(self)
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         """End the link for a new client, or because it had no session for too long."""
         self.close(why)
 
@@ -276,7 +276,7 @@ class FaultyLink:
             wake=wake,
             carry=carry,
             end=self._end_link,
-            lost=lambda message: self._report_lost(sender, message),
+            on_dropped=lambda message: self._report_lost(sender, message),
         )
 
     @property

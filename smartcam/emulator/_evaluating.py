@@ -59,7 +59,7 @@ class Operator:
 
     def trigger(self) -> None:
         """Trigger at the input; during an evaluation this is an overrun."""
-        self._camera.overrun() if self._camera.busy else self._camera.begin(None)
+        self._camera.overrun() if self._camera.busy else self._camera.begin_evaluation(None)
 
     def switch_application(self, application: int, running: bool = False) -> None:
         """Make another application the active one."""
@@ -70,7 +70,7 @@ class EvaluatingCamera(LineCamera):
     """An emulated camera with applications, each of which evaluates its parts in turn.
 
     A subclass calls :meth:`set_up` before ``super().__init__()``, and reports a result in
-    :meth:`evaluated`.
+    :meth:`report_evaluation`.
 
     Attributes:
         active: number of the active application; 0 or another unused number if none is active.
@@ -150,7 +150,7 @@ class EvaluatingCamera(LineCamera):
         """Seconds of an evaluation."""
         raise NotImplementedError
 
-    def evaluated(self, call: LineClient | None, part: Any) -> None:
+    def report_evaluation(self, call: LineClient | None, part: Any) -> None:
         """Report the values of a part to the client that asked for them, and to others."""
         raise NotImplementedError
 
@@ -168,7 +168,7 @@ class EvaluatingCamera(LineCamera):
         super()._before_stop()
         self.busy, self._asking_client, self._run_number = False, None, self._run_number + 1
 
-    def begin(self, call: LineClient | None) -> None:
+    def begin_evaluation(self, call: LineClient | None) -> None:
         """Begin an evaluation; ``call``: the client that asked for it, None for a trigger input."""
         self.busy, self._run_number, self._asking_client = True, self._run_number + 1, call
         run_number = self._run_number
@@ -178,7 +178,7 @@ class EvaluatingCamera(LineCamera):
         if run_number != self._run_number:
             return
         call, self._asking_client, self.busy = self._asking_client, None, False
-        self.evaluated(
+        self.report_evaluation(
             None if call is None or call.is_closed else call, next(self.parts[self.active])
         )
         self.activated()

@@ -40,16 +40,16 @@ class Inspector(ABC):
     def begin(
         self,
         order: InspectionOrder,
-        seen: Callable[[], None],
-        done: Callable[[Values | None], None],
+        on_exposed: Callable[[], None],
+        on_done: Callable[[Values | None], None],
     ) -> None:
         """Begin an inspection of the next exposed picture.
 
         Args:
             order: the run.
-            seen: function that is called when the picture was taken.
-            done: function that is called with the values of the application's layout; None if the
-                inspection failed and there is no result.
+            on_exposed: function that is called when the picture was taken.
+            on_done: function that is called with the values of the application's layout; None if
+                the inspection failed and there is no result.
 
         Both functions are called in the event loop's thread, after this call has returned, and not
         after :meth:`cancel`.

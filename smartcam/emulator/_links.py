@@ -68,7 +68,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         if self._listener.is_down:
             self.close("the camera is down")
             return
-        refusal = self._listener.enter(self)
+        refusal = self._listener.refusal_on_entry(self)
         if refusal:
             self.close(refusal)
             return
@@ -242,10 +242,10 @@ class TcpListener(Listener):
         await self._acceptor.wait_closed()
         await super().wait_closed()
 
-    def enter(self, link: _TcpLink) -> str:
+    def refusal_on_entry(self, link: _TcpLink) -> str:
         """Accept a new connection; return "", or the reason why it is refused."""
         self.places.most = self._owner.max_links
-        return self._acceptor.enter(link, link.address)
+        return self._acceptor.refusal_on_entry(link, link.address)
 
     def leave(self, link: _TcpLink) -> None:
         """Forget a connection that has ended; harmless when called twice."""
@@ -253,12 +253,12 @@ class TcpListener(Listener):
 
     def session_ended(self, link: _TcpLink) -> None:
         """Note that a client has ended its session; it may now be closed for a new client."""
-        self._acceptor.move_back(link)
-        self._acceptor.expect(link, HANDSHAKE_TIMEOUT, "no session")
+        self._acceptor.restart_idle_time(link)
+        self._acceptor.set_time_limit(link, HANDSHAKE_TIMEOUT, "no session")
 
     def lift_time_limit(self, link: _TcpLink) -> None:
         """Lift the time limit of a connection that a fault keeps silent."""
-        self._acceptor.expect(link, None, "")
+        self._acceptor.set_time_limit(link, None, "")
 
 
 # ---------------------------------------------------------------------- UDP
@@ -359,11 +359,11 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         if link is None:
             link = _UdpLink(self, self._owner, addr)
             self.places.most = self._owner.max_links
-            if self.places.enter(link, str(addr[0]), now):
+            if self.places.refusal_on_entry(link, str(addr[0]), now):
                 return  # every link has a session
             self.links[addr] = link
         else:
-            self.places.move_back(link, now)
+            self.places.restart_idle_time(link, now)
         link.datagram_received(data)
 
     def forget(self, address: Any) -> None:

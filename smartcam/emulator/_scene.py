@@ -88,7 +88,7 @@ class TableScene:
         if not isinstance(offset, tuple) or len(offset) != 2:
             raise wrong_argument("offset", "a pixel's u and v", offset, "scene")
         limit = MAX_PIXELS
-        self.scale: float = check_number(scale, "scale", 0, limit, "scene", above=True)
+        self.scale: float = check_number(scale, "scale", 0, limit, "scene", exclusive=True)
         self.offset: tuple[float, float] = (
             check_number(offset[0], "offset", -limit, limit, "scene"),
             check_number(offset[1], "offset", -limit, limit, "scene"),

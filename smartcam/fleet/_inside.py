@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._agent.summary import CameraSummary
     from smartcam.fleet._bus.address import FleetAddress
     from smartcam.fleet._bus.bus import Bus
-    from smartcam.fleet._bus.keys import Keys, meets
+    from smartcam.fleet._bus.keys import Keys, patterns_overlap
     from smartcam.fleet._bus.zenoh import ZenohEnd
     from smartcam.fleet._file.fleet_file import fleet_schema
     from smartcam.fleet._file.operations import OperationsSection
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._ros import RosFleet, ros_of
     from smartcam.fleet._security.authority import MadeCertificate, make_certificates
     from smartcam.fleet._security.certificates import (
-        ends_soon,
+        expiry_warning,
         may_command,
         read_identity,
         shake_hands,
@@ -49,13 +49,13 @@ __all__ = [
     "RosFleet",
     "RosSection",
     "ZenohEnd",
-    "ends_soon",
+    "expiry_warning",
     "exposition",
     "fleet_camera",
     "fleet_schema",
     "make_certificates",
     "may_command",
-    "meets",
+    "patterns_overlap",
     "raise_descriptor_limit",
     "read_identity",
     "read_numbers",
@@ -75,7 +75,7 @@ if not TYPE_CHECKING:
             "_agent.summary": "CameraSummary",
             "_bus.address": "FleetAddress",
             "_bus.bus": "Bus",
-            "_bus.keys": "Keys meets",
+            "_bus.keys": "Keys patterns_overlap",
             "_bus.zenoh": "ZenohEnd",
             "_file.operations": "OperationsSection",
             "_file.recording": "RecordSection",
@@ -86,7 +86,7 @@ if not TYPE_CHECKING:
             "_outlets": "FleetOutlets",
             "_ros": "RosFleet ros_of",
             "_security.authority": "MadeCertificate make_certificates",
-            "_security.certificates": "ends_soon may_command read_identity shake_hands",
+            "_security.certificates": "expiry_warning may_command read_identity shake_hands",
             "_security.door": "raise_descriptor_limit",
         },
     )

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
-from smartcam._arguments import check_number, check_text, plain, wrong_argument
+from smartcam._arguments import as_plain_value, check_number, check_text, wrong_argument
 from smartcam.exceptions import FrameSourceError, FrameTimeoutError
 
 if TYPE_CHECKING:
@@ -318,7 +318,7 @@ def checked_value(value: object) -> FeatureValue:
     Raises:
         ConfigurationError: the value is not valid.
     """
-    checked = plain(value)
+    checked = as_plain_value(value)
     if isinstance(checked, str):
         return check_text(checked, "value", "set", most=MAX_VALUE_LENGTH)
     if isinstance(checked, (bool, int)) or (isinstance(checked, float) and math.isfinite(checked)):

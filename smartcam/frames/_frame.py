@@ -172,7 +172,7 @@ def amend(frame: Frame, **changes: object) -> Frame:
     return frame
 
 
-def changed(frame: Frame, **changes: object) -> Frame:
+def copy_with(frame: Frame, **changes: object) -> Frame:
     """Return a frame with some attributes changed, in half the time of ``dataclasses.replace``.
 
     Args:

@@ -108,8 +108,8 @@ class FrameGroup:
             raise ConfigurationError(
                 f"group of frame sources: expected one or more, each once, got {list(sources)}"
             )
-        self._within = check_seconds_or_none(within, "within", above=True)
-        self._timeout = check_seconds_or_none(timeout, "timeout", above=True)
+        self._within = check_seconds_or_none(within, "within", exclusive=True)
+        self._timeout = check_seconds_or_none(timeout, "timeout", exclusive=True)
         self._sources = dict(sources)
         self._readers: dict[str, _GroupReader] = {}
         self._is_open = False

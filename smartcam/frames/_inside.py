@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from smartcam.frames._codecs.bitmap import read_bitmap
     from smartcam.frames._codecs.h264 import H264Encoder, entry_point
     from smartcam.frames._codecs.jpeg import jpeg_header
-    from smartcam.frames._codecs.pictures import converted, decoded, to_jpeg, with_pixels
+    from smartcam.frames._codecs.pictures import convert_frame, decode_frame, to_jpeg, with_pixels
     from smartcam.frames._driver import TaskDriver
     from smartcam.frames._features import FEATURE_TIMEOUT, FeatureValue
-    from smartcam.frames._frame import changed
+    from smartcam.frames._frame import copy_with
     from smartcam.frames._gige import discovery, places
     from smartcam.frames._gige.assembler import PacketCounts
     from smartcam.frames._gige.control import ControlChannel
@@ -60,11 +60,11 @@ __all__ = [
     "SourceStatistics",
     "TaskDriver",
     "YuvPairs",
-    "changed",
     "checked_mac",
     "colour_properties",
-    "converted",
-    "decoded",
+    "convert_frame",
+    "copy_with",
+    "decode_frame",
     "discovery",
     "entry_point",
     "force_address",
@@ -91,10 +91,10 @@ if not TYPE_CHECKING:
             "_codecs.bitmap": "read_bitmap",
             "_codecs.h264": "H264Encoder entry_point",
             "_codecs.jpeg": "jpeg_header",
-            "_codecs.pictures": "converted decoded to_jpeg with_pixels",
+            "_codecs.pictures": "convert_frame decode_frame to_jpeg with_pixels",
             "_driver": "TaskDriver",
             "_features": "FeatureValue FEATURE_TIMEOUT",
-            "_frame": "changed",
+            "_frame": "copy_with",
             "_gige.force_address": "checked_mac force_address",
             "_gige.": "discovery places",
             "_gige.assembler": "PacketCounts",

@@ -32,7 +32,7 @@ from smartcam.frames._clocks import DeviceClock
 from smartcam.frames._driver import FrameDriver, FrameSink
 from smartcam.frames._events import FrameEvents
 from smartcam.frames._features import FrameFeatures
-from smartcam.frames._frame import changed
+from smartcam.frames._frame import copy_with
 from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
 from smartcam.frames._trigger import TriggerQueue
 
@@ -105,8 +105,8 @@ class FrameSource(FrameSink):
         stall: float | None = 5.0,
         linger: float = 0.0,
     ) -> None:
-        self._timeout = check_seconds_or_none(timeout, "timeout", above=True)
-        self._stall = check_seconds_or_none(stall, "stall", above=True)
+        self._timeout = check_seconds_or_none(timeout, "timeout", exclusive=True)
+        self._stall = check_seconds_or_none(stall, "stall", exclusive=True)
         self._linger = check_number(linger, "linger", 0, MAX_LINGER, unit="seconds")
         self._driver = driver
         self._camera_info = camera_info
@@ -382,7 +382,7 @@ class FrameSource(FrameSink):
 
         Cancellation: the source continues; a late picture is passed only to readers.
         """
-        seconds = check_seconds(timeout, "timeout", "trigger", above=True)
+        seconds = check_seconds(timeout, "timeout", "trigger", exclusive=True)
         check_choice(when_busy, "when_busy", ("wait", "refuse"), "trigger")
         if fire is not None:
             check_callable(fire, "fire", "trigger")
@@ -394,7 +394,7 @@ class FrameSource(FrameSink):
         """Return a frame with the source's lens added."""
         if self._camera_info is None or frame.camera_info is not None:
             return frame
-        return changed(frame, camera_info=self._camera_info)
+        return copy_with(frame, camera_info=self._camera_info)
 
     async def wait_until_streaming(self, reader: FrameReader, *, anew: bool) -> None:
         """Wait until the device streams; with ``anew`` restart the stream first.
@@ -447,7 +447,7 @@ class FrameSource(FrameSink):
         if captured == frame.captured:
             return frame
         shift = captured - frame.captured
-        return changed(frame, captured=captured, utc=frame.utc + shift)
+        return copy_with(frame, captured=captured, utc=frame.utc + shift)
 
     def lost(self, count: int) -> None:
         """Count lost frames."""

@@ -6,7 +6,7 @@ import dataclasses
 import logging
 from typing import TYPE_CHECKING
 
-from smartcam._accepting import Acceptor, Places, listening
+from smartcam._accepting import Acceptor, Places, listening_socket
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.gateway._account import GatewayAccount
@@ -51,7 +51,10 @@ class Gateway(Server):
         self._shared = GatewayCamera(camera, self.settings, parts, self._account)
         self._writer = AnswerWriter(self.settings.style, parts.names)
         places: Places[RobotLink] = Places(
-            self.settings.clients, within=self.settings.idle, missing="no request", own="a robot"
+            self.settings.clients,
+            within=self.settings.idle,
+            timeout_reason="no request",
+            session_name="a robot",
         )
         self._acceptor: Acceptor[RobotLink] = Acceptor(
             self._make_link, places, _log, name="smartcam.gateway"
@@ -94,7 +97,7 @@ class Gateway(Server):
             return
         host, port = self.settings.place
         try:
-            self._socket = await listening(host, port)
+            self._socket = await listening_socket(host, port)
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
                 f"gateway: cannot listen on {host} port {port}: {exc}"

@@ -39,8 +39,8 @@ class RobotLink(asyncio.Protocol):
         acceptor: acceptor, which bounds the number of connections.
 
     Attributes:
-        settled: whether the robot has requested a part. Then its connection stays; otherwise it may
-            be closed in favour of a new connection.
+        keeps_place: whether the robot has requested a part. Then its connection stays; otherwise
+            it may be closed in favour of a new connection.
     """
 
     _transport: asyncio.Transport
@@ -48,7 +48,7 @@ class RobotLink(asyncio.Protocol):
     def __init__(
         self, shared: GatewayCamera, writer: AnswerWriter, acceptor: Acceptor[RobotLink]
     ) -> None:
-        self.settled: bool = False
+        self.keeps_place: bool = False
         self._shared, self._writer, self._acceptor = shared, writer, acceptor
         self._account = shared.account
         self._robot_requests = RobotRequests(shared)
@@ -66,7 +66,7 @@ class RobotLink(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         address = transport.get_extra_info("peername")
         self._peer = f"{address[0]}:{address[1]}" if address else "?"
-        refusal = self._acceptor.enter(self, address)
+        refusal = self._acceptor.refusal_on_entry(self, address)
         if refusal:
             self._account.refused += 1
             _log.warning("%s: refused: %s", self._peer, refusal)
@@ -76,7 +76,7 @@ class RobotLink(asyncio.Protocol):
         self._closed = False
         self._account.robots += 1
         _keep_alive(transport.get_extra_info("socket"))
-        self._acceptor.expect(self, self._shared.settings.idle, "no request")
+        self._acceptor.set_time_limit(self, self._shared.settings.idle, "no request")
         self._restart_idle_timer()
 
     def data_received(self, data: bytes) -> None:
@@ -98,14 +98,14 @@ class RobotLink(asyncio.Protocol):
         """End the open requests, and forget parts that were not requested."""
         self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         """Close the connection at once, in favour of another one."""
         self._close(why, abort=True)
 
     # ------------------------------------------------------------------ requests
 
     def _accept_request(self, request: RobotRequest) -> None:
-        self.settled = self.settled or request.word in PART_WORDS
+        self.keeps_place = self.keeps_place or request.word in PART_WORDS
         self._account.requests += 1
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self._shared.settings.timeout

@@ -90,7 +90,10 @@ class Parts:
             np.array(part.pose.position, dtype=np.float64),
         )
         numbers = pose_to(self._style.pose, pose)
-        position = [self._length_factor * number / self._convention.metre for number in numbers[:3]]
+        position = [
+            self._length_factor * number / self._convention.units_per_metre
+            for number in numbers[:3]
+        ]
         orientation = [number * self._angle_factor for number in numbers[3:]]
         return [*position, *orientation, *(getattr(part, name) for name in self._settings.also)]
 

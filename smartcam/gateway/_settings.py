@@ -151,7 +151,7 @@ class GatewaySettings(BaseModel):
         names = ("form", "pose", "length", "angle", "decimals", "separator", "width")
         options = {name: value for name in names if (value := getattr(self, name)) is not None}
         if self.pose is not None:
-            metre = ROBOTS[self.pose].metre
+            metre = ROBOTS[self.pose].units_per_metre
             defaults = {"length": "m" if metre == 1.0 else "mm", "angle": "rad"}
             defaults["angle"] = "rad" if self.pose == "ur" else "deg"
             options = {**defaults, **options}

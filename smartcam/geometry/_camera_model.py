@@ -32,7 +32,7 @@ COEFFICIENT_NAMES: dict[DistortionModel, tuple[str, ...]] = {
 """Names of each model's coefficients, in order; those of ``equidistant`` belong to powers of the
 angle."""
 
-COEFFICIENTS: dict[DistortionModel, int] = {
+COEFFICIENT_COUNTS: dict[DistortionModel, int] = {
     model: len(names) for model, names in COEFFICIENT_NAMES.items()
 }
 
@@ -66,7 +66,7 @@ class CameraModel(Stored):
         distortion_model: name of the distortion model.
     """
 
-    _called: ClassVar[str] = "calibration of cameras"
+    _label: ClassVar[str] = "calibration of cameras"
 
     size: Size
     matrix: Matrix3

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam._arguments import plain, shown
+from smartcam._arguments import as_plain_value, excerpt
 from smartcam.geometry._codes import Code
 
 if TYPE_CHECKING:
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 def check_choice(value: object, among: Sequence[str], label: str) -> None:
     """Raise SHAPE if an option is not in the list of known ones."""
-    word = plain(value)  # a user's class may hash and compare in any way
+    word = as_plain_value(value)  # a user's class may hash and compare in any way
     if not isinstance(word, str) or word not in among:
         known = list(among)
-        message = f"{label}: expected one of {known}, got {shown(value)}"
+        message = f"{label}: expected one of {known}, got {excerpt(value)}"
         raise Code.SHAPE.refusal(message, known, value)
 
 

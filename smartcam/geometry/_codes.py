@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from typing import NamedTuple
 
-from smartcam._arguments import shown
+from smartcam._arguments import excerpt
 from smartcam.exceptions import CalibrationError
 
 MAX_VALUE_CHARACTERS = 200
@@ -159,7 +159,7 @@ class Code(enum.StrEnum):
         try:
             shown_value = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
         except Exception:  # noqa: BLE001 - a foreign class may raise any
-            shown_value = shown(got)
+            shown_value = excerpt(got)
         return self.refusal(f"{text}, got {shown_value}", expected, got)
 
     def remark(self, text: str) -> Remark:

@@ -7,7 +7,11 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.geometry._camera_model import COEFFICIENTS, DistortionModel, coefficient_names
+    from smartcam.geometry._camera_model import (
+        COEFFICIENT_COUNTS,
+        DistortionModel,
+        coefficient_names,
+    )
     from smartcam.geometry._checks import check_choice, check_size
     from smartcam.geometry._codes import Code, Remark
     from smartcam.geometry._rigid import (
@@ -26,7 +30,7 @@ if TYPE_CHECKING:
         check_finite,
         frame_from_axes,
         matrix_from_quaternion,
-        not_finite,
+        not_finite_error,
         quaternion_about_z,
         quaternion_from_matrix,
         quaternion_multiply,
@@ -70,7 +74,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._transforms import as_motion
 
 __all__ = [
-    "COEFFICIENTS",
+    "COEFFICIENT_COUNTS",
     "IDENTITY",
     "MAX_COORDINATE",
     "Array",
@@ -120,7 +124,7 @@ __all__ = [
     "motion",
     "motion_from_data",
     "motion_to_data",
-    "not_finite",
+    "not_finite_error",
     "quaternion_about_z",
     "quaternion_from_matrix",
     "quaternion_multiply",
@@ -136,11 +140,11 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_codes": "Remark Code",
-            "_camera_model": "COEFFICIENTS DistortionModel coefficient_names",
+            "_camera_model": "COEFFICIENT_COUNTS DistortionModel coefficient_names",
             "_checks": "check_choice check_size",
             "_rigid": "IDENTITY Rigid cross_matrix exp_rotation log_rotation right_jacobian",
             "_rotations": "Array MAX_COORDINATE as_points as_vector check_finite frame_from_axes "
-            "matrix_from_quaternion not_finite quaternion_about_z "
+            "matrix_from_quaternion not_finite_error quaternion_about_z "
             "quaternion_from_matrix quaternion_multiply rotate rotate_ccw",
             "_stored": "AsList Context Count Form Keys Matrix3 Matrix43 NonNegative Number "
             "NumberOrNaN PairOrNaN NullableTriple ExtraKeys Pair Positive Remarks SheetOffsets "

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Final, overload
 
 import numpy as np
 
-from smartcam._arguments import check_integer, check_number, check_text, plain, wrong_argument
+from smartcam._arguments import (
+    as_plain_value,
+    check_integer,
+    check_number,
+    check_text,
+    wrong_argument,
+)
 from smartcam.geometry._codes import Code
 from smartcam.geometry._rotations import as_vector
 from smartcam.geometry._transforms import Transform, as_motion
@@ -69,7 +75,7 @@ class PlacePattern(Sequence[Transform]):
             )
         counts = (self.columns, self.rows, self.layers)
         pitch = [
-            check_number(plain(step), "pitch", 0, 1e3, caller, above=count > 1)
+            check_number(as_plain_value(step), "pitch", 0, 1e3, caller, exclusive=count > 1)
             for step, count in zip(self.pitch, counts, strict=True)
         ]
         object.__setattr__(self, "pitch", tuple(pitch))

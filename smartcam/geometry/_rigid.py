@@ -41,7 +41,7 @@ class Rigid(NamedTuple):
     translation: Array
 
     @classmethod
-    def stacked(cls, motions: Iterable[Rigid]) -> Rigid:
+    def stack(cls, motions: Iterable[Rigid]) -> Rigid:
         """Return single motions as one array."""
         rows = list(motions)
         rotations = np.array([row.rotation for row in rows], dtype=np.float64)
@@ -78,27 +78,27 @@ class Rigid(NamedTuple):
         """Return the motions with their translations scaled."""
         return Rigid(self.rotation, scale * self.translation)
 
-    def turned_before(self, step: Array) -> Rigid:
+    def turned_in_source(self, step: Array) -> Rigid:
         """Return the motions after small steps (..., 6) that turn about their source's axes."""
         return Rigid(self.rotation @ exp_rotation(step[..., :3]), self.translation + step[..., 3:])
 
-    def turned_after(self, step: Array) -> Rigid:
+    def turned_in_target(self, step: Array) -> Rigid:
         """Return the motions after small steps (..., 6) that turn about their target's axes."""
         return Rigid(exp_rotation(step[..., :3]) @ self.rotation, self.translation + step[..., 3:])
 
-    def before(self, other: Rigid) -> Array:
-        """Return the steps (..., 6) with which :meth:`turned_before` leads to other motions."""
+    def source_steps_to(self, other: Rigid) -> Array:
+        """Return the steps (..., 6) with which :meth:`turned_in_source` leads to other motions."""
         turn = log_rotation(np.swapaxes(self.rotation, -1, -2) @ other.rotation)
         return np.concatenate([turn, other.translation - self.translation], axis=-1)
 
-    def steps_to(self, other: Rigid) -> Array:
-        """Return the steps (..., 6) with which :meth:`turned_after` leads to other motions."""
+    def target_steps_to(self, other: Rigid) -> Array:
+        """Return the steps (..., 6) with which :meth:`turned_in_target` leads to other motions."""
         turn = log_rotation(other.rotation @ np.swapaxes(self.rotation, -1, -2))
         return np.concatenate([turn, other.translation - self.translation], axis=-1)
 
     def angle_to(self, other: Rigid) -> Array:
         """Return the angles (...) between the rotations of these and other motions, radians."""
-        angles: Array = np.linalg.norm(self.before(other)[..., :3], axis=-1)
+        angles: Array = np.linalg.norm(self.source_steps_to(other)[..., :3], axis=-1)
         return angles
 
 

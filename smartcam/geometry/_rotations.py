@@ -76,10 +76,10 @@ def check_finite(values: Array, label: str) -> None:
     """Raise NOT_FINITE if a calibration's result is not finite; ``label`` names this result."""
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
-        raise not_finite(label, np.atleast_1d(values[row]).tolist())
+        raise not_finite_error(label, np.atleast_1d(values[row]).tolist())
 
 
-def not_finite(label: str, actual: object) -> CalibrationError:
+def not_finite_error(label: str, actual: object) -> CalibrationError:
     """Return the error for a calibration's result that is not finite."""
     return Code.NOT_FINITE.refusal(
         f"{label}: expected finite numbers, the calibration gives {actual}: it is damaged, or this "

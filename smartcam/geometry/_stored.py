@@ -116,7 +116,7 @@ def _schema_of_parts(
 class Stored:
     """A dataclass whose annotations say how its fields stand in a file."""
 
-    _called: ClassVar[str] = "data"
+    _label: ClassVar[str] = "data"
     """Name of the value in errors."""
 
     _keys: ClassVar[Keys] = {}
@@ -124,10 +124,10 @@ class Stored:
     _extra_keys: ClassVar[ExtraKeys] = {}
     """Keys that are written before the fields."""
 
-    _shared: ClassVar[frozenset[str]] = frozenset({"target"})
+    _context_keys: ClassVar[frozenset[str]] = frozenset({"target"})
     """Keys whose values are put in the context, where the forms of later keys find them."""
 
-    _later: ClassVar[frozenset[str]] = frozenset()
+    _optional_keys: ClassVar[frozenset[str]] = frozenset()
     """Keys that may be missing in a file; their fields then have defaults."""
 
     def to_data(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class Stored:
             CalibrationError: SHAPE: the data have another structure; NOT_FINITE or NOT_RIGID:
                 numbers that are not possible.
         """
-        value: Self = _validate(cls, data, cls._called, **known)
+        value: Self = _validate(cls, data, cls._label, **known)
         return value
 
     @classmethod
@@ -162,9 +162,9 @@ class Stored:
 
         def field(key: str) -> core_schema.TypedDictField:
             schema = handler.generate_schema(types[key])
-            if key in cls._shared:
+            if key in cls._context_keys:
                 schema = core_schema.with_info_after_validator_function(_share(key), schema)
-            return core_schema.typed_dict_field(schema, required=key not in cls._later)
+            return core_schema.typed_dict_field(schema, required=key not in cls._optional_keys)
 
         def write(instance: Stored) -> dict[str, Any]:
             extra_data = {key: value(instance) for key, (_, value) in cls._extra_keys.items()}

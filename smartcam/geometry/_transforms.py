@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from smartcam._argument_checks import takes
+from smartcam._argument_checks import check_arguments
 from smartcam._arguments import check_seconds
 from smartcam.geometry._codes import Code
 from smartcam.geometry._rigid import Rigid, exp_rotation, log_rotation
@@ -300,7 +300,7 @@ class PoseHistory:
             between them: 1.25 mm for 0.1 s and 1 m/s^2.
     """
 
-    @takes(max_gap=check_seconds)
+    @check_arguments(max_gap=check_seconds)
     def __init__(self, *, size: int = 1000, max_gap: float = 0.1) -> None:
         self._transforms: list[Transform] = []
         self._times: list[datetime] = []

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias, TypeVar
 
-from smartcam._arguments import check_flag, shown
+from smartcam._arguments import check_flag, excerpt
 from smartcam._suggestions import closest, did_you_mean
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.exceptions import (
@@ -376,7 +376,7 @@ def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
         raise _interpretation_error(exc, reader.data) from exc
 
 
-def plain(interpreter: Interpreter) -> PlainInterpreter | None:
+def as_plain_interpreter(interpreter: Interpreter) -> PlainInterpreter | None:
     """Return the interpreter if :func:`run_plain` can run it, None if it needs a Reader."""
     if not isinstance(interpreter, PlainInterpreter):
         return None
@@ -430,7 +430,7 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
         return _ClassInterpreter(spec, lenient=lenient)
     else:
         return _make_interpreter(
-            getattr(spec, "__name__", None) or shown(spec), spec, None, lenient=lenient
+            getattr(spec, "__name__", None) or excerpt(spec), spec, None, lenient=lenient
         )
     return _make_interpreter(name, INTERPRETERS.load(name), layout, lenient=lenient)
 
@@ -471,9 +471,9 @@ def _check_name(spec: str, name: str, tail: str) -> None:
         suggestion = closest(name, known, least=MISSPELLED_SCORE)
         if suggestion:
             raise PluginError(
-                f"interpreter {shown(name)} is unknown, did you mean {suggestion!r}? "
+                f"interpreter {excerpt(name)} is unknown, did you mean {suggestion!r}? "
                 f"known are {', '.join(known)} (a group may have that name in a "
-                f"Layout({shown(spec)}))",
+                f"Layout({excerpt(spec)}))",
                 name=name,
             )
 
@@ -487,7 +487,7 @@ def _raise_unknown_name(spec: str, name: str) -> NoReturn:
         layout_text_error = f"; nor is it a layout text: {exc}"
     known = [info.name for info in INTERPRETERS.available()]
     raise PluginError(
-        f"interpreter {shown(name)} is unknown; known are {', '.join(known)}"
+        f"interpreter {excerpt(name)} is unknown; known are {', '.join(known)}"
         f"{did_you_mean(name, known)}{layout_text_error}",
         name=name,
     )
@@ -514,6 +514,6 @@ def _make_interpreter(
     raise PluginError(
         f"interpreter {name}: expected a function of a Reader, a subclass of Interpreter, "
         "or a dataclass, model or NamedTuple whose fields are annotated with their layout, "
-        f"got {shown(loaded)}",
+        f"got {excerpt(loaded)}",
         name=name,
     )

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.interpreters._base import AnySpec, Spec, TypedSpec, plain, run_plain, run_sequence
+    from smartcam.interpreters._base import (
+        AnySpec,
+        Spec,
+        TypedSpec,
+        as_plain_interpreter,
+        run_plain,
+        run_sequence,
+    )
     from smartcam.interpreters._localizations import LocalizationsInterpreter
 
 __all__ = [
@@ -15,7 +22,7 @@ __all__ = [
     "LocalizationsInterpreter",
     "Spec",
     "TypedSpec",
-    "plain",
+    "as_plain_interpreter",
     "run_plain",
     "run_sequence",
 ]
@@ -24,7 +31,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_base": "Spec AnySpec TypedSpec plain run_plain run_sequence",
+            "_base": "Spec AnySpec TypedSpec as_plain_interpreter run_plain run_sequence",
             "_localizations": "LocalizationsInterpreter",
         },
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
-from smartcam._arguments import check_path, shown
+from smartcam._arguments import check_path, excerpt
 from smartcam._suggestions import did_you_mean, hint
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS, BadYamlError, compose, construct
@@ -42,7 +42,7 @@ def read_model(
     label: str,
     kind: type[M],
     such_as: str,
-    mistake: Callable[[M], tuple[Sequence[int | str], str] | None],
+    find_mistake: Callable[[M], tuple[Sequence[int | str], str] | None],
 ) -> M:
     """Read a file.
 
@@ -51,7 +51,7 @@ def read_model(
         label: kind of the file for errors, such as ``scenario``.
         kind: pydantic model of the file's fields.
         such_as: name of a field, as an example for errors.
-        mistake: function that returns the place of a value that cannot work and the reason, or
+        find_mistake: function that returns the place of a value that cannot work and the reason, or
             None.
 
     Raises:
@@ -96,7 +96,7 @@ def read_model(
             for item in exc.errors(include_url=False)
         )
         raise ConfigurationError(_mistakes_text(file_label, root, findings)) from exc
-    found_mistake = mistake(model)
+    found_mistake = find_mistake(model)
     if found_mistake is not None:
         raise ConfigurationError(_mistakes_text(file_label, root, [found_mistake]))
     return model
@@ -118,7 +118,7 @@ def _actual_text(item: ErrorDetails) -> str:
     given: object = item["input"]
     if isinstance(given, dict):
         return " (got fields)"
-    return " (got a list)" if isinstance(given, list) else f" (got {shown(given)})"
+    return " (got a list)" if isinstance(given, list) else f" (got {excerpt(given)})"
 
 
 def _field_hint(kind: type[BaseModel], item: ErrorDetails) -> str:

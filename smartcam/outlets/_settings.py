@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from smartcam._file_values import Patterns, Size, chosen
+from smartcam._file_values import Patterns, Size, matches_any
 from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.layout._inside import read_model
 from smartcam.outlets._outlet import Outlet
@@ -104,7 +104,7 @@ class OutletSettings(_OutletFields):
 
     def chooses(self, camera: str) -> bool:
         """Return True if this outlet is for a camera of this name."""
-        return chosen(self.cameras, camera)
+        return matches_any(self.cameras, camera)
 
 
 Section = dict[str, dict[str, Any]]

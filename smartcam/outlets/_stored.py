@@ -8,7 +8,7 @@ import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam._file_values import chosen
+from smartcam._file_values import matches_any
 from smartcam._meanings import meaning
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets._database import open_for_reading
@@ -96,7 +96,7 @@ def read_store(path: Path, question: StoreQuestion) -> StoredResults:
 
 def _query(database: sqlite3.Connection, question: StoreQuestion) -> StoredResults:
     database.create_function(
-        "chosen", 1, lambda name: name == "" or chosen((question.camera,), name)
+        "chosen", 1, lambda name: name == "" or matches_any((question.camera,), name)
     )
     failed_condition = _failure_condition(database)
     conditions, values = ["1"], list[Any]()

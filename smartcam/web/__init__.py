@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from smartcam._extras import missing
+from smartcam._extras import missing_extra_error
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
@@ -58,4 +58,4 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as exc:
         if exc.name != "aiohttp":
             raise
-        raise missing("aiohttp") from exc
+        raise missing_extra_error("aiohttp") from exc

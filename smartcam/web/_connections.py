@@ -54,7 +54,10 @@ class SiteConnections:
         self.make_protocol: Callable[[], asyncio.Protocol] = make_protocol
         self.closed: bool = False
         self.places: Places[SiteConnection] = Places(
-            MAX_CONNECTIONS, within=HEAD_TIMEOUT, missing="no request", own="a request"
+            MAX_CONNECTIONS,
+            within=HEAD_TIMEOUT,
+            timeout_reason="no request",
+            session_name="a request",
         )
         self.acceptor: Acceptor[SiteConnection] = Acceptor(
             lambda: SiteConnection(self), self.places, _log, name="smartcam.web"
@@ -67,7 +70,7 @@ class SiteConnection(asyncio.Protocol):
     _transport: asyncio.Transport
 
     def __init__(self, connections: SiteConnections) -> None:
-        self.settled: bool = False  # whether a complete request is being answered
+        self.keeps_place: bool = False  # whether a complete request is being answered
         self._connections = connections
         self._acceptor = connections.acceptor
         self._inner: asyncio.Protocol | None = None  # the HTTP protocol; None: refused
@@ -89,7 +92,7 @@ class SiteConnection(asyncio.Protocol):
         if self._connections.closed:
             self._transport.abort()
             return
-        refusal = self._acceptor.enter(self, address)
+        refusal = self._acceptor.refusal_on_entry(self, address)
         if refusal:
             _log.info("= %s: connection closed: %s", self._peer, refusal)
             self._transport.write(_BUSY)
@@ -133,29 +136,29 @@ class SiteConnection(asyncio.Protocol):
     @contextlib.contextmanager
     def serving_request(self, request: web.BaseRequest) -> Iterator[None]:
         """Serve a request in the block; afterwards bound the wait for the next request."""
-        self._acceptor.expect(self, None, "")
+        self._acceptor.set_time_limit(self, None, "")
         self._head = None
         try:
             yield
         finally:
             if request.content.is_eof():
                 self._head, self._awaits_request = bytearray(), True
-                self._acceptor.expect(self, KEEP_ALIVE_TIMEOUT, "no request")
+                self._acceptor.set_time_limit(self, KEEP_ALIVE_TIMEOUT, "no request")
             else:  # the connection ends with the request
                 self._body = request.content
-                self._acceptor.expect(self, HEAD_TIMEOUT, "no end of a body")
+                self._acceptor.set_time_limit(self, HEAD_TIMEOUT, "no end of a body")
 
     @contextlib.contextmanager
     def answering(self) -> Iterator[None]:
         """Keep the connection open during the block, which answers a complete request."""
-        self.settled = True
+        self.keeps_place = True
         try:
             yield
         finally:
-            self.settled = False
-            self._acceptor.move_back(self)
+            self.keeps_place = False
+            self._acceptor.restart_idle_time(self)
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         """Close the connection at once."""
         _log.info("= %s: connection closed: %s", self._peer, why)
         self._acceptor.leave(self)
@@ -167,14 +170,14 @@ class SiteConnection(asyncio.Protocol):
         """Find the end of the unfinished head; close the connection if the head is too long."""
         if self._awaits_request:
             self._awaits_request = False
-            self._acceptor.expect(self, HEAD_TIMEOUT, "half a request")
+            self._acceptor.set_time_limit(self, HEAD_TIMEOUT, "half a request")
         search_start = max(0, len(head) - len(_HEAD_END) + 1)
         head += data
         end = head.find(_HEAD_END, search_start)
         if end >= 0:
             self._head = None
         if (end if end >= 0 else len(head)) > MAX_HEAD_BYTES:
-            self.turn_away(f"the head of its request has more than {MAX_HEAD_BYTES} bytes")
+            self.close_for(f"the head of its request has more than {MAX_HEAD_BYTES} bytes")
 
 
 def connection_of(request: web.BaseRequest) -> SiteConnection | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
-from smartcam.frames._inside import Planes, YuvPairs, decoded, to_jpeg, with_pixels
+from smartcam.frames._inside import Planes, YuvPairs, decode_frame, to_jpeg, with_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -81,7 +81,7 @@ def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
         MissingExtraError: a codec of a compressed format or a Bayer pattern is not installed.
     """
     if frame.format.name in {"PNG", "JPEGXL"}:
-        frame = decoded(frame, "")
+        frame = decode_frame(frame, "")
     if frame.format.name.startswith("Coord3D") and not grey:
         return frame.array()
     return frame.grey() if grey or frame.format.name.startswith("Mono") else frame.rgb()

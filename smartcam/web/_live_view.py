@@ -9,7 +9,7 @@ import math
 import time
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
-from smartcam._client._inside import own_interpreter
+from smartcam._client._inside import camera_interpreter
 from smartcam.exceptions import ConnectionTakenError, InterpretationError, SmartCamError
 from smartcam.layout._inside import units_of
 from smartcam.models import Connected, Disconnected, Localization, Reconnected, Result, jsonable
@@ -315,7 +315,7 @@ class LiveView:
 
 def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
     """Return the layout by which a camera's result was interpreted; None without a layout."""
-    interpreter = own_interpreter(camera, result.application)
+    interpreter = camera_interpreter(camera, result.application)
     return None if interpreter is None else interpreter.layout
 
 

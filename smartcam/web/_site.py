@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from aiohttp import web
 
-from smartcam._accepting import is_loopback, listening
+from smartcam._accepting import is_loopback, listening_socket
 from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
@@ -214,7 +214,7 @@ async def open_port(
         keepalive_timeout=KEEP_ALIVE_TIMEOUT,
         logger=at_info_level(_log),
     )
-    listener = await listening(host, port, local=local)
+    listener = await listening_socket(host, port, local=local)
     try:
         await runner.setup()
     except BaseException:

@@ -15,7 +15,7 @@ CALLS = {
     "start_unix_server",
     "create_unix_server",
     "create_datagram_endpoint",
-    "listening",
+    "listening_socket",
     "open_listening",
     "bind",
     "TCPSite",
@@ -33,9 +33,9 @@ KNOWN = {
     # connections: rows of tests.accepting.servers
     "_accepting.py": {"create_server"},
     "emulator/_port.py": {"bind"},
-    "web/_site.py": {"listening"},
-    "gateway/_gateway.py": {"listening"},
-    "frames/_streaming/rtsp/server.py": {"listening"},
+    "web/_site.py": {"listening_socket"},
+    "gateway/_gateway.py": {"listening_socket"},
+    "frames/_streaming/rtsp/server.py": {"listening_socket"},
     "testing/proxy/_relay.py": {"bind"},
     # datagrams, for which there are tests in test_datagrams
     "emulator/_links.py": {"create_datagram_endpoint"},

@@ -14,13 +14,13 @@ from smartcam._accepting import Places, is_loopback, share_of
 class Guest:
     """A connection, as the policy sees it."""
 
-    def __init__(self, *, settled: bool = False) -> None:
-        self.settled = settled
+    def __init__(self, *, keeps_place: bool = False) -> None:
+        self.keeps_place = keeps_place
         self.why = ""
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         assert not self.why
-        assert not self.settled, "one with a session was turned away"
+        assert not self.keeps_place, "one with a session was turned away"
         self.why = why
 
 
@@ -29,14 +29,14 @@ def full(count: int, peer: str = "127.0.0.1", most: int = 0) -> tuple[Places[Gue
     places: Places[Guest] = Places(most or count, within=10)
     guests = [Guest() for _ in range(count)]
     for moment, one in enumerate(guests):
-        assert places.enter(one, peer, moment) == ""
+        assert places.refusal_on_entry(one, peer, moment) == ""
     return places, guests
 
 
 def test_the_one_without_a_session_for_longest_makes_room() -> None:
     places, guests = full(3)
-    guests[0].settled = True
-    assert places.enter(newcomer := Guest(), "127.0.0.1", 3) == ""
+    guests[0].keeps_place = True
+    assert places.refusal_on_entry(newcomer := Guest(), "127.0.0.1", 3) == ""
     assert guests[1].why == "3 others are open, it was without a session for longest"
     assert list(places) == [guests[0], guests[2], newcomer]
     assert places.crowded_out == 1
@@ -44,18 +44,21 @@ def test_the_one_without_a_session_for_longest_makes_room() -> None:
 
 def test_who_had_a_session_makes_room_last() -> None:
     places, guests = full(3)
-    places.move_back(guests[0], 5)
-    places.enter(Guest(), "127.0.0.1", 6)
-    places.enter(Guest(), "127.0.0.1", 7)
+    places.restart_idle_time(guests[0], 5)
+    places.refusal_on_entry(Guest(), "127.0.0.1", 6)
+    places.refusal_on_entry(Guest(), "127.0.0.1", 7)
     assert [bool(one.why) for one in guests] == [False, True, True]
 
 
 def test_where_each_has_a_session_the_newcomer_has_no_place() -> None:
     places, guests = full(2)
     for one in guests:
-        one.settled = True
+        one.keeps_place = True
     newcomer = Guest()
-    assert places.enter(newcomer, "127.0.0.1", 3) == "2 others are open, and each has a session"
+    assert (
+        places.refusal_on_entry(newcomer, "127.0.0.1", 3)
+        == "2 others are open, and each has a session"
+    )
     assert newcomer not in places
     assert places.crowded_out == 1
 
@@ -63,15 +66,15 @@ def test_where_each_has_a_session_the_newcomer_has_no_place() -> None:
 def test_one_address_has_three_quarters_and_its_own_make_room() -> None:
     places, guests = full(6, "10.0.0.1", 8)
     assert share_of(8) == 6
-    assert places.enter(Guest(), "10.0.0.2", 7) == ""
-    assert places.enter(Guest(), "10.0.0.1", 8) == ""
+    assert places.refusal_on_entry(Guest(), "10.0.0.2", 7) == ""
+    assert places.refusal_on_entry(Guest(), "10.0.0.1", 8) == ""
     assert guests[0].why == "6 others of 10.0.0.1 are open, it was without a session for longest"
     for one in guests:
-        one.settled = not one.why
-    places.enter(Guest(settled=True), "10.0.0.3", 9)
+        one.keeps_place = not one.why
+    places.refusal_on_entry(Guest(keeps_place=True), "10.0.0.3", 9)
     for one in list(places):
-        one.settled = True
-    assert places.enter(Guest(), "10.0.0.1", 10).startswith("8 others")
+        one.keeps_place = True
+    assert places.refusal_on_entry(Guest(), "10.0.0.1", 10).startswith("8 others")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1", "::ffff:127.0.0.1", "127.1.2.3"])
@@ -84,12 +87,12 @@ def test_programs_of_this_machine_may_have_all_places(host: str) -> None:
 
 def test_time_without_a_session_is_bounded() -> None:
     places, guests = full(3)  # at 0, 1, 2; each for 10
-    guests[1].settled = True
+    guests[1].keeps_place = True
     assert places.next_deadline() == 10
     places.end_overdue(11.5)
     assert guests[0].why == "no session within 10 s"
     assert [bool(one.why) for one in guests] == [True, False, False]
-    guests[1].settled = False
+    guests[1].keeps_place = False
     places.end_overdue(20)
     assert guests[2].why
     assert not guests[1].why  # its time began anew when it was looked at
@@ -100,12 +103,12 @@ def test_time_without_a_session_is_bounded() -> None:
 
 def test_what_is_expected_can_be_set_and_be_nothing() -> None:
     places, (one, two) = full(2)
-    places.expect(one, None, "", 2)
-    places.expect(two, 3, "no end of a body", 2)
+    places.set_time_limit(one, None, "", 2)
+    places.set_time_limit(two, 3, "no end of a body", 2)
     assert places.next_deadline() == 5
     places.end_overdue(1e9)
     assert (one.why, two.why) == ("", "no end of a body within 3 s")
-    places.expect(two, 1, "", 2)  # it is gone: harmless
+    places.set_time_limit(two, 1, "", 2)  # it is gone: harmless
 
 
 @given(
@@ -126,8 +129,8 @@ def test_bounds_hold_whatever_happens(steps: list[tuple[str, int, str]]) -> None
         now += 0.1
         if what == "enter":
             newcomer = Guest()
-            unsettled = [one for one, _ in there if not one.settled]
-            refusal = places.enter(newcomer, peer, now)
+            unsettled = [one for one, _ in there if not one.keeps_place]
+            refusal = places.refusal_on_entry(newcomer, peer, now)
             if not refusal:
                 there.append((newcomer, peer))
             elif unsettled:
@@ -142,8 +145,8 @@ def test_bounds_hold_whatever_happens(steps: list[tuple[str, int, str]]) -> None
                 places.leave(one)
                 there = [row for row in there if row[0] is not one]
             else:
-                one.settled = what == "settle"
-                places.move_back(one, now)
+                one.keeps_place = what == "settle"
+                places.restart_idle_time(one, now)
         there = [row for row in there if not row[0].why]
         assert set(places) == {one for one, _ in there}
         assert len(places) <= 8

@@ -11,7 +11,7 @@ from smartcam._suggestions import MAX_KNOWN_WORDS, MAX_WORD_CHARACTERS, did_you_
 from smartcam.depth import load_cloud
 from smartcam.emulator import load_scenario
 from smartcam.exceptions import ConfigurationError, FrameFormatError
-from smartcam.fleet._inside import meets
+from smartcam.fleet._inside import patterns_overlap
 
 
 def test_scenario_with_aliases_in_a_key_is_refused(tmp_path: Path) -> None:
@@ -60,5 +60,5 @@ def test_cloud_with_a_line_of_a_megabyte_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_patterns_meet(one: str, other: str, met: bool) -> None:
-    assert meets(one, other) is met
-    assert meets(other, one) is met
+    assert patterns_overlap(one, other) is met
+    assert patterns_overlap(other, one) is met

@@ -16,7 +16,7 @@ from smartcam.calibration import (
     make_sheet,
     target_from_data,
 )
-from smartcam.calibration._inside import on_paper
+from smartcam.calibration._inside import target_from_description
 from tests.cli.commandline import run
 
 BOARD = ("sheet", "checkerboard", "--columns", "9", "--rows", "6", "--square", "25")
@@ -104,7 +104,7 @@ def test_sheet_of_rays_is_described_too(tmp_path: Path) -> None:
     run("sheet", "rays", "--page", "200x300", "-o", "r.pdf", "--describe", "r.json").done()
     text = '{"kind": "rays", "diameter": 0.02}\n'
     assert (tmp_path / "r.json").read_text() == text
-    same = make_sheet(on_paper(json.loads(text)), page="200x300")
+    same = make_sheet(target_from_description(json.loads(text)), page="200x300")
     assert (tmp_path / "r.pdf").read_bytes() == same.pdf()
 
 

@@ -98,7 +98,7 @@ def test_account_of_a_client_that_was_never_connected_is_empty() -> None:
 
 def test_session_open_is_counted_as_it_goes() -> None:
     account, wire = ClientCounters(), Counters()
-    account.begin(wire)
+    account.begin_session(wire)
     assert account.statistics([]).frames_received == 0
     wire.frames_received += 3
     assert account.statistics([]).frames_received == 3
@@ -107,18 +107,18 @@ def test_session_open_is_counted_as_it_goes() -> None:
 def test_reconnects_are_the_sessions_after_the_first() -> None:
     account = ClientCounters()
     for sessions in range(1, 4):
-        account.begin(Counters())
+        account.begin_session(Counters())
         statistics = account.statistics([])
         assert (statistics.sessions, statistics.reconnects) == (sessions, sessions - 1)
 
 
 def test_session_that_ended_counts_no_more() -> None:
     account, wire = ClientCounters(), Counters(bytes_sent=5)
-    account.begin(wire)
-    account.end()
+    account.begin_session(wire)
+    account.end_session()
     wire.bytes_sent += 1000
     assert account.statistics([]).bytes_sent == 5
-    account.end()  # twice is the same as once
+    account.end_session()  # twice is the same as once
     assert account.statistics([]).bytes_sent == 5
 
 
@@ -126,9 +126,9 @@ def test_session_that_ended_counts_no_more() -> None:
 def test_counters_of_all_sessions_are_added_up(links: list[Counters], *, ended: bool) -> None:
     account = ClientCounters()
     for wire in links:
-        account.begin(wire)
+        account.begin_session(wire)
     if ended:
-        account.end()
+        account.end_session()
     total = {name: sum(getattr(wire, name) for wire in links) for name in OF_THE_WIRE}
     assert wire_of(account) == total
     assert wire_of(account) == total  # asking changes nothing

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from smartcam._client._inside import Session, Try
+from smartcam._client._inside import Attempt, Session
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -619,5 +619,5 @@ def test_load_protocol_entry_point_that_gives_something_else_is_refused(
 
 
 def test_try_is_one_line() -> None:
-    tried = Try("handbook", "tcp", outcome="silence")
+    tried = Attempt("handbook", "tcp", outcome="silence")
     assert str(tried) == "handbook over TCP: opening the link: silence"

@@ -10,7 +10,7 @@ import pytest
 import smartcam
 from smartcam import NoticeReceived
 from smartcam.makes import EmulatedIfm
-from tests.makes.test_ifm import PATIENCE, by_hand
+from tests.makes.test_ifm import PATIENCE, scripted_device
 
 FLOOD = 1000
 MAX_LINES = 20
@@ -27,7 +27,7 @@ async def test_lines_of_a_kind_have_a_bound_in_each_minute(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "smartcam.client")
-    async with by_hand(liveness_timeout=None) as (peer, camera):
+    async with scripted_device(liveness_timeout=None) as (peer, camera):
         for number in range(FLOOD):
             peer.say("0001", b"%09d:short circuit" % number)
         peer.say("0010", b"000500002:{}")
@@ -50,7 +50,7 @@ async def test_lines_of_a_kind_have_a_bound_in_each_minute(
 
 @pytest.mark.asyncio
 async def test_end_of_a_session_says_what_was_left_out(caplog: pytest.LogCaptureFixture) -> None:
-    async with by_hand() as (peer, camera):
+    async with scripted_device() as (peer, camera):
         for _ in range(MAX_LINES + 3):
             peer.say("0001", b"110002001:short circuit")
         await camera.query_application()
@@ -64,7 +64,7 @@ async def test_camera_that_floods_floods_no_log_and_is_counted(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "smartcam.client")
-    async with by_hand() as (peer, camera):
+    async with scripted_device() as (peer, camera):
         for number in range(FLOOD):
             peer.say("0001", b"%09d:short circuit" % (110002001 + number % 2))
             peer.say("0010", b"000500002:{}")
@@ -75,7 +75,7 @@ async def test_camera_that_floods_floods_no_log_and_is_counted(
 
 @pytest.mark.asyncio
 async def test_notices_are_events_in_order_with_the_others() -> None:
-    async with by_hand() as (peer, camera):
+    async with scripted_device() as (peer, camera):
         events = camera.events(max_queue=8)
         peer.say("0001", b"110002001:Short circuit on OUT1")
         peer.say("0010", b'000500002:{"ID":1}')

@@ -72,7 +72,7 @@ def pair(shape: Shape, seed: int, noise: float = NOISE, count: int = 3000) -> tu
 
 def error(found: Any) -> Array:
     """Return turn and shift (6,) from the true to the found pose, in the covariance's order."""
-    return MOTION.rigid.steps_to(found.pose.rigid)
+    return MOTION.rigid.target_steps_to(found.pose.rigid)
 
 
 @pytest.mark.parametrize("method", METHODS)

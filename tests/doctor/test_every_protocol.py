@@ -44,10 +44,10 @@ async def tried(url: str, timeout: float = 2.0, **options: Any) -> list[Trial]:
 async def test_camera_that_greets_is_asked_next_in_its_protocol() -> None:
     async with EmulatedInSight(host=HOST) as emulator:
         first, last = await tried(f"bvs://{HOST}:{emulator.port}")
-    assert (first.address.protocol, first.other, first.answer) == ("bvs", False, None)
+    assert (first.address.protocol, first.is_other_protocol, first.answer) == ("bvs", False, None)
     assert last.answer is not None
     assert last.answer.url == f"insight://{HOST}:{emulator.port}?dialect=native"
-    assert last.other
+    assert last.is_other_protocol
 
 
 async def test_camera_of_a_plug_in_is_found_at_its_own_port(

@@ -345,7 +345,7 @@ async def test_network_that_is_left_is_left_whole(monkeypatch: pytest.MonkeyPatc
     )
     await search.run()
     assert len(times) == search.total == 4
-    assert search.left == {"10.0.0.17": "10.0.0.17"}
+    assert search.left_out == {"10.0.0.17": "10.0.0.17"}
 
 
 async def test_address_of_ipv6() -> None:

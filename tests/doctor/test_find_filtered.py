@@ -50,7 +50,7 @@ async def _search() -> dict[str, object]:
         return {
             "found": [(one.host, one.protocols) for one in search.results()],
             "counts": search.counts,
-            "why": search.why,
+            "why": search.failure,
             "lost": statistics.received - statistics.triggered,
             "sessions": statistics.sessions,
         }

@@ -109,7 +109,7 @@ async def test_session_is_over_before_its_try_is_reported() -> None:
 
 async def test_going_on_tries_the_rest_too() -> None:
     async with EmulatedCamera() as emulator:
-        found = await tried(emulator.url, go_on=True)
+        found = await tried(emulator.url, continue_after_answer=True)
     assert [trial.answer is not None for trial in found] == [True] + [False] * (len(found) - 1)
     assert len(found) == len(ways(parse_address(emulator.url)))
 

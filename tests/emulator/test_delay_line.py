@@ -27,7 +27,7 @@ class Line:
             wake=lambda: self.delayed.run(),
             carry=self.carry,
             end=lambda ending: self.seen.append(f"[{ending.how}]"),
-            lost=lambda sent: self.seen.append(f"[lost {sent.faults[0]}]"),
+            on_dropped=lambda sent: self.seen.append(f"[lost {sent.faults[0]}]"),
         )
 
     def carry(self, batch: list[tuple[Transmission, bytes]]) -> None:

@@ -8,7 +8,7 @@ import struct
 from pathlib import Path
 
 from smartcam._zenoh import MAX_WAITING_BYTES
-from smartcam.fleet._inside import meets, read_identity
+from smartcam.fleet._inside import patterns_overlap, read_identity
 from tests.budgets.inputs import JSON
 from tests.budgets.parser import Make, Parser, fill, fill_text, grown
 from tests.fleet.inside import CERTIFICATE_FILES, decode_bundle, decode_part, request_fields
@@ -107,9 +107,9 @@ _PATTERNS: dict[str, Make] = {
 
 
 def _meets(pattern: str) -> None:
-    meets.cache_clear()
+    patterns_overlap.cache_clear()
     for name in ("line1/cell2/cam3", "a" * 100, "a/a/a/a"):
-        meets(pattern, name)
+        patterns_overlap(pattern, name)
 
 
 def _identity(data: bytes | str) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from smartcam.fleet._agent.calls import ACTIONS
 from smartcam.fleet._bus.keys import COMMANDS
-from smartcam.fleet._inside import Keys, ZenohEnd, may_command, meets
+from smartcam.fleet._inside import Keys, ZenohEnd, may_command, patterns_overlap
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.inside import RIGHTS, ROLES, SERVICES, THESIS, ros_rights
 from tests.fleet.plantkit import WHO, certified, guarded, joined
@@ -47,7 +47,9 @@ def allowed(role: str, does: str, key: str) -> bool:
     if role == "router":
         return True
     return any(
-        role in right.roles and right.does == does and any(meets(one, key) for one in right.keys)
+        role in right.roles
+        and right.does == does
+        and any(patterns_overlap(one, key) for one in right.keys)
         for right in TABLE
     )
 

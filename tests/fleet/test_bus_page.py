@@ -18,7 +18,7 @@ import pytest
 import smartcam.fleet
 from smartcam.emulator import EmulatedCamera
 from smartcam.fleet import FleetServer, MemoryBus
-from smartcam.fleet._inside import Keys, meets
+from smartcam.fleet._inside import Keys, patterns_overlap
 from smartcam.models import CameraEvent
 from tests import ROOT
 from tests.fleet.fleetkit import until
@@ -208,7 +208,7 @@ async def test_nothing_is_on_the_bus_that_the_page_does_not_list(
     unlisted = {
         key: does
         for key, does in noted.items()
-        if not any(meets(key, pattern) for pattern in LISTED.values())
+        if not any(patterns_overlap(key, pattern) for pattern in LISTED.values())
     }
     assert unlisted == {}
     assert all(key.startswith("smartcam/") for key in noted)
@@ -216,7 +216,9 @@ async def test_nothing_is_on_the_bus_that_the_page_does_not_list(
 
 async def test_all_that_the_page_lists_is_on_the_bus(noted: dict[str, set[str]]) -> None:
     told = {
-        listed: set().union(*(does for key, does in noted.items() if meets(key, pattern)))
+        listed: set().union(
+            *(does for key, does in noted.items() if patterns_overlap(key, pattern))
+        )
         for listed, pattern in LISTED.items()
     }
     # each has two ends: who says and who hears, who asks and who answers, who is there and who sees
@@ -233,7 +235,7 @@ def test_page_lists_the_key_of_every_kind() -> None:
         if name not in {"__init__", "tail"}:
             wanted = inspect.signature(method).parameters
             key = method(*("results" if one == "kind" else "x" for one in wanted))
-            assert any(meets(key, pattern) for pattern in LISTED.values()), name
+            assert any(patterns_overlap(key, pattern) for pattern in LISTED.values()), name
 
 
 def test_page_lists_every_service_and_no_other() -> None:
@@ -271,5 +273,7 @@ async def test_what_a_spy_hears_at_the_engine_is_listed() -> None:
         finally:
             await asyncio.to_thread(spy.close)
     patterns = LISTED.values()
-    assert {key for key in heard if not any(meets(key, one) for one in patterns)} == set()
+    assert {
+        key for key in heard if not any(patterns_overlap(key, one) for one in patterns)
+    } == set()
     assert any(f"{PREFIX}/command/" in key for key in heard)

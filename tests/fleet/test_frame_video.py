@@ -204,7 +204,7 @@ class Encoder:
         self.anew = True
         self.keys: list[float] = []
 
-    def begin_anew(self) -> None:
+    def request_key_frame(self) -> None:
         self.anew = True
 
     async def encode(self, given: Frame) -> Frame:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from smartcam.fleet._inside import Keys, meets
+from smartcam.fleet._inside import Keys, patterns_overlap
 
 CHUNKS = ("a", "b", "*", "**")
 SHORT = [
@@ -41,13 +41,13 @@ def test_patterns_meet_where_a_name_is_meant_by_both(one: str) -> None:
     """Two patterns of three chunks have at most four patterns in common."""
     for other in SHORT:
         common = MEANT[one] & MEANT[other]
-        assert meets(one, other) == bool(common), (one, other)
+        assert patterns_overlap(one, other) == bool(common), (one, other)
 
 
 @given(pattern=PATTERNS, name=st.sampled_from(NAMES))
 def test_pattern_means_names(pattern: str, name: str) -> None:
     meant = means(pattern.split("/"), name.split("/"))
-    assert meets(pattern, name) == meets(name, pattern) == meant
+    assert patterns_overlap(pattern, name) == patterns_overlap(name, pattern) == meant
 
 
 @pytest.mark.real_time
@@ -56,7 +56,7 @@ def test_pattern_means_names(pattern: str, name: str) -> None:
 def test_patterns_meet_as_the_engine_says(one: str, other: str) -> None:
     zenoh = importlib.import_module("zenoh")
     left, right = zenoh.KeyExpr.autocanonize(one), zenoh.KeyExpr.autocanonize(other)
-    assert meets(one, other) == left.intersects(right)
+    assert patterns_overlap(one, other) == left.intersects(right)
 
 
 @pytest.mark.real_time
@@ -78,4 +78,4 @@ def test_keys_are_keys_of_the_engine() -> None:
     assert keys.tail(every[1], "presence/camera") == ["desk-1", "line1", "cam3"]
     for pattern in ("*", "**"):
         other_fleet = Keys("plant2").camera("*", pattern)
-        assert not any(meets(other_fleet, one) for one in every)
+        assert not any(patterns_overlap(other_fleet, one) for one in every)

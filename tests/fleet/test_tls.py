@@ -333,7 +333,7 @@ async def test_certificates_that_end_while_all_runs(
                 assert "the certificate of operator robot" in caplog.text
                 assert ", in 0.0" in caplog.text
                 await until(lambda: "has expired" in caplog.text)
-                assert read_identity(folder / "robot").expired
+                assert read_identity(folder / "robot").expired_text
                 assert (await robot.trigger()).number == 1
                 assert "has expired" in await refused(url(server, folder / "robot"))
                 await certified(folder, {})
@@ -364,7 +364,7 @@ def test_warnings(tmp_path: Path) -> None:
         found = identity._replace(ends=now + timedelta(days=days))
         assert found.urgency == urgency
         assert bool(found.warning) == bool(urgency)
-        assert bool(found.expired) == (days < 0)
+        assert bool(found.expired_text) == (days < 0)
     assert (
         ", in 6 days; smartcam fleet"
         in identity._replace(ends=now + timedelta(days=6, hours=1)).warning

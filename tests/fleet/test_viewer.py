@@ -19,7 +19,7 @@ import smartcam
 import smartcam.fleet
 from smartcam.exceptions import LocalProtocolError, ReservationLostError, TriggerTimeoutError
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._inside import Bus, Keys, meets
+from smartcam.fleet._inside import Bus, Keys, patterns_overlap
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FLEET, NAME, PATIENCE, NumberedCamera, Plant, end_of, until
 from tests.fleet.framekit import FramePlant
@@ -95,7 +95,8 @@ def test_viewer_may_do_nothing_at_a_key_of_an_operator_but_hear_and_look() -> No
         name: {
             right.does
             for right in RIGHTS
-            if "viewer" in right.roles and any(meets(pattern, key) for pattern in right.keys)
+            if "viewer" in right.roles
+            and any(patterns_overlap(pattern, key) for pattern in right.keys)
         }
         for name, key in keys().items()
     }
@@ -115,7 +116,7 @@ def test_roles_share_no_key_under_which_anything_is_said_or_present(does: str) -
     for role, pattern in of:
         for other, theirs in of:
             if role != other:
-                assert not meets(pattern, theirs), (role, pattern, other, theirs)
+                assert not patterns_overlap(pattern, theirs), (role, pattern, other, theirs)
 
 
 def test_viewer_asks_agents_only_what_changes_nothing() -> None:
@@ -133,8 +134,8 @@ def test_name_is_that_of_who_knows_its_secret() -> None:
     one, other = ProgramName.new("operator"), ProgramName.new("operator")
     assert one.is_genuine
     assert ProgramName.from_token(one.token) == one
-    assert meets(names_pattern("operator"), one.name)
-    assert not meets(names_pattern("viewer"), one.token)
+    assert patterns_overlap(names_pattern("operator"), one.name)
+    assert not patterns_overlap(names_pattern("viewer"), one.token)
     for forged in (
         ProgramName(one.name, other.secret),
         ProgramName(one.name, ""),

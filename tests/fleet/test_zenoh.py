@@ -634,14 +634,14 @@ async def test_flood_of_what_is_patient_neither_delays_nor_fills_up_all_else(
         for pattern, patient in (("ask/*", True), ("command", False), ("last", False)):
             listens.subscribe(pattern, hear, patient=patient)
         for number in range(2000):
-            listens.in_loop_patiently(hear, 10, f"ask/{number}", b"")
-        listens.in_loop(hear, 10, "command", b"")
+            listens.call_in_loop_patiently(hear, 10, f"ask/{number}", b"")
+        listens.call_in_loop(hear, 10, "command", b"")
         await until(lambda: len(came) == 2001)
         assert came[0] == "command"
         assert came[1:] == [f"ask/{number}" for number in range(2000)]  # in their order
 
         monkeypatch.setattr(_zenoh, "MAX_WAITING_BYTES", 1000)
-        listens.in_loop_patiently(hear, 990, "ask/x", b"")
+        listens.call_in_loop_patiently(hear, 990, "ask/x", b"")
         assert listens.full(20, patient=True)
         assert not listens.full(20)
         connects.put("last", b"")

@@ -15,7 +15,7 @@ from smartcam.frames._gige.discovery import (
     AnsweringCamera,
     Network,
     _NetworkSearch,
-    find,
+    find_cameras,
     networks,
 )
 from smartcam.frames._gige.event_channel import decode_events

@@ -186,7 +186,7 @@ def test_any_depth_picture_comes_back(
     codec: str, width: int, height: int, seed: int, top: int
 ) -> None:
     pixels = np.random.default_rng(seed).integers(0, top, (height, width)).astype("<u2")
-    back = pictures.decoded(getattr(pictures, codec)(frame_of(pixels, "Z16")), "Z16")
+    back = pictures.decode_frame(getattr(pictures, codec)(frame_of(pixels, "Z16")), "Z16")
     assert (back.array() == pixels).all()
 
 
@@ -210,7 +210,7 @@ def test_any_bytes_are_a_picture_or_an_error(data: bytes, name: str) -> None:
     magic = {"MJPEG": b"\xff\xd8\xff", "PNG": b"\x89PNG\r\n\x1a\n", "JPEGXL": b"\xff\x0a"}[name]
     for bytes_of in (data, magic + data):
         try:
-            pictures.decoded(replace(GREY, data=bytes_of, format=find_format(name)), "")
+            pictures.decode_frame(replace(GREY, data=bytes_of, format=find_format(name)), "")
         except FrameFormatError:
             continue
 

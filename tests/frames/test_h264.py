@@ -150,7 +150,7 @@ async def test_no_picture_after_a_loss_before_it_is_whole(codecs: Codecs) -> Non
     decoder = codecs.h264_decoder()
     for one in sent[:10]:
         assert await decoder.decode(one) is not None
-    decoder.lost()  # frame 10
+    decoder.note_loss()  # frame 10
     got = [await decoder.decode(one) for one in sent[11:]]
     assert got[0] is None
     assert got[2 * KEYINT] is not None
@@ -162,7 +162,7 @@ async def test_key_frame_on_request_ends_the_wait(codecs: Codecs) -> None:
     encoder, decoder = codecs.h264_encoder(keyint=KEYINT), codecs.h264_decoder()
     await encoded(encoder, 3)
     assert await decoder.decode(await encoder.encode(drawn(3))) is None
-    encoder.begin_anew()
+    encoder.request_key_frame()
     for number in range(4, 8):
         got = await decoder.decode(await encoder.encode(drawn(number)))
         assert got is not None

@@ -18,7 +18,7 @@ import pytest
 from smartcam import frames
 from smartcam._extras import load
 from smartcam.frames import Codecs, RtspServer
-from smartcam.frames._inside import changed
+from smartcam.frames._inside import copy_with
 from smartcam.recording import Recorder
 from tests.frames.drivers import ShowingDriver
 from tests.frames.pictures import HEIGHT, WIDTH, frame_of
@@ -132,7 +132,7 @@ async def test_a_file(tmp_path: Path, codec: str, name: str, matrix: str, full: 
 def red_frame(matrix: str, *, full: bool) -> Frame:
     made = frame_of(np.zeros((HEIGHT, WIDTH), np.uint8), "Mono8", 1)
     form = frames.find_format(FORMATS[matrix, full])
-    return changed(made, format=form, data=planes_of(matrix, full=full), device_time=None)
+    return copy_with(made, format=form, data=planes_of(matrix, full=full), device_time=None)
 
 
 class Showing(ShowingDriver):
@@ -148,7 +148,7 @@ class Showing(ShowingDriver):
     async def show(self, sink: FrameSink) -> None:
         for number in itertools.count(1):
             now = {"captured": time.monotonic(), "utc": time.time()}
-            sink.frame(changed(self.frame, sequence=number, lost=0, **now))
+            sink.frame(copy_with(self.frame, sequence=number, lost=0, **now))
             await asyncio.sleep(0.02)
 
 

@@ -143,18 +143,18 @@ def test_rigid_inverse_of_many_leads_back() -> None:
 
 
 def test_stack_of_no_motions_is_empty() -> None:
-    assert (Rigid.stacked([]).size, Rigid.stacked([IDENTITY]).size) == (0, 1)
+    assert (Rigid.stack([]).size, Rigid.stack([IDENTITY]).size) == (0, 1)
 
 
 def test_rigid_turned_after_turns_in_the_frame_it_leads_to() -> None:
-    moved = MANY.turned_after(STEPS)
+    moved = MANY.turned_in_target(STEPS)
     np.testing.assert_allclose(moved.rotation, exp_rotation(STEPS[:, :3]) @ MANY.rotation)
     np.testing.assert_allclose(moved.translation, MANY.translation + STEPS[:, 3:])
-    np.testing.assert_allclose(MANY.steps_to(moved), STEPS, atol=1e-12)
+    np.testing.assert_allclose(MANY.target_steps_to(moved), STEPS, atol=1e-12)
 
 
 def test_rigid_turned_before_turns_in_the_frame_it_comes_from() -> None:
-    moved = MANY.turned_before(STEPS)
+    moved = MANY.turned_in_source(STEPS)
     np.testing.assert_allclose(moved.rotation, MANY.rotation @ exp_rotation(STEPS[:, :3]))
-    np.testing.assert_allclose(MANY.before(moved), STEPS, atol=1e-12)
+    np.testing.assert_allclose(MANY.source_steps_to(moved), STEPS, atol=1e-12)
     np.testing.assert_allclose(MANY.angle_to(moved), np.linalg.norm(STEPS[:, :3], axis=1))

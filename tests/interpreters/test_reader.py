@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve, run
-from smartcam.interpreters._inside import plain, run_plain
+from smartcam.interpreters._inside import as_plain_interpreter, run_plain
 from smartcam.layout import Layout
 from smartcam.models import ByteOrder
 from smartcam.registry import INTERPRETERS
@@ -163,7 +163,7 @@ class Reversed(PlainInterpreter):
 def test_plain_interpreter_needs_neither_reader_nor_context() -> None:
     interpreter = Reversed()
     assert run(interpreter, Reader(b"\1\2", Context(byte_order="big"))) == 0x81
-    assert plain(interpreter) is interpreter
+    assert as_plain_interpreter(interpreter) is interpreter
     assert run_plain(interpreter, b"\1\2", Context(byte_order="big")) == 0x81
     assert interpreter.read_all([b"\1\2", b"\4"], Context(byte_order="big")) == [0x81, 4]
 
@@ -181,7 +181,7 @@ def test_run_plain_turns_any_error_into_an_interpretation_error() -> None:
 )
 def test_built_in_interpreters_of_bytes_alone_are_plain(spec: str) -> None:
     interpreter, data = resolve(spec), bytes(50) if spec == "strings50" else b"\1\2"
-    simple = plain(interpreter)
+    simple = as_plain_interpreter(interpreter)
     assert simple is not None
     value: Any = run(interpreter, Reader(data, Context(byte_order="big")))
     big = Context(byte_order="big")
@@ -217,7 +217,7 @@ def test_interpreters_of_a_reader_have_no_plain_way() -> None:
             return reader.context.camera
 
     for interpreter in (Own(), resolve(len)):
-        assert plain(interpreter) is None
+        assert as_plain_interpreter(interpreter) is None
 
 
 def test_run_gives_the_reader_the_interpreters_layout() -> None:

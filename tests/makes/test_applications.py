@@ -12,7 +12,7 @@ import pytest
 import smartcam
 from smartcam.exceptions import InterpretationError, WrongApplicationError
 from tests.handmade import until
-from tests.makes.test_ifm import PATIENCE, Peer, by_hand
+from tests.makes.test_ifm import PATIENCE, Peer, scripted_device
 
 
 @contextlib.asynccontextmanager
@@ -27,7 +27,7 @@ async def switching(**options: Any) -> AsyncIterator[tuple[list[int], Peer, smar
             active = applications.pop(0) if len(applications) > 1 else applications[0]
             return b"003\t%02d\t01\t02\t03" % active
 
-    async with by_hand(**options) as (peer, camera):
+    async with scripted_device(**options) as (peer, camera):
         peer.says = ApplicationAnswers(peer.says)
         yield applications, peer, camera
 
@@ -105,7 +105,7 @@ async def test_mapping_reads_no_result_of_ifm_with_another_applications_layout()
 
 @pytest.mark.asyncio
 async def test_device_that_never_says_its_application_costs_the_link_and_no_wait() -> None:
-    async with by_hand(request_timeout=0.3, reconnect=None) as (peer, camera):
+    async with scripted_device(request_timeout=0.3, reconnect=None) as (peer, camera):
         del peer.says["A?"]
         peer.says["T?"] = b"star;1;stop"
         trigger = asyncio.create_task(camera.trigger(timeout=0.3))

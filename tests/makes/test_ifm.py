@@ -75,7 +75,7 @@ class Peer:
 
 
 @contextlib.asynccontextmanager
-async def by_hand(**options: Any) -> AsyncIterator[tuple[Peer, smartcam.Camera[Any]]]:
+async def scripted_device(**options: Any) -> AsyncIterator[tuple[Peer, smartcam.Camera[Any]]]:
     peer = Peer()
     server = await asyncio.start_server(peer.serve, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
@@ -92,7 +92,7 @@ async def by_hand(**options: Any) -> AsyncIterator[tuple[Peer, smartcam.Camera[A
 
 @pytest.mark.asyncio
 async def test_results_that_come_while_a_command_waits_are_not_lost() -> None:
-    async with by_hand() as (peer, camera), camera.results() as results:
+    async with scripted_device() as (peer, camera), camera.results() as results:
         waiting = asyncio.create_task(camera.request("S?"))
         ticket, line = await peer.requests.get()
         assert line == "S?"
@@ -107,7 +107,7 @@ async def test_results_that_come_while_a_command_waits_are_not_lost() -> None:
 
 @pytest.mark.asyncio
 async def test_result_of_somebody_else_never_ends_a_trigger() -> None:
-    async with by_hand() as (peer, camera):
+    async with scripted_device() as (peer, camera):
         trigger = asyncio.create_task(camera.trigger(timeout=PATIENCE))
         ticket, line = await peer.requests.get()
         assert line == "T?"
@@ -123,7 +123,7 @@ async def test_result_of_somebody_else_never_ends_a_trigger() -> None:
 
 @pytest.mark.asyncio
 async def test_answer_under_an_unknown_ticket_ends_the_link() -> None:
-    async with by_hand(reconnect=None) as (peer, camera):
+    async with scripted_device(reconnect=None) as (peer, camera):
         peer.say(4711, b"*")
         with pytest.raises(smartcam.ConnectionLostError, match="nothing was asked"):
             await camera.trigger(timeout=PATIENCE)
@@ -131,7 +131,7 @@ async def test_answer_under_an_unknown_ticket_ends_the_link() -> None:
 
 @pytest.mark.asyncio
 async def test_refused_trigger_is_tried_again_or_told() -> None:
-    async with by_hand() as (peer, camera):
+    async with scripted_device() as (peer, camera):
         refused = asyncio.create_task(camera.trigger(when_busy="refuse"))
         ticket, _ = await peer.requests.get()
         peer.say(ticket, b"!")
@@ -146,7 +146,7 @@ async def test_refused_trigger_is_tried_again_or_told() -> None:
 
 @pytest.mark.asyncio
 async def test_device_in_configuration_mode_is_not_running() -> None:
-    async with by_hand() as (peer, camera):
+    async with scripted_device() as (peer, camera):
         peer.says["E?"] = b"!"
         with pytest.raises(NotRunningError):
             await camera.trigger()
@@ -155,7 +155,7 @@ async def test_device_in_configuration_mode_is_not_running() -> None:
 @pytest.mark.asyncio
 async def test_errors_and_notifications_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "smartcam.client")
-    async with by_hand() as (peer, camera):
+    async with scripted_device() as (peer, camera):
         peer.say("0001", b"110002001:Short circuit on OUT1")
         peer.say("0010", b'000500003:{"ID":1}')
         peer.say("0020", b"anything")
@@ -267,7 +267,7 @@ async def test_version_without_lengths_has_no_binary_results() -> None:
 
 @pytest.mark.asyncio
 async def test_result_of_another_layout_is_reported_and_not_read() -> None:
-    async with by_hand(interpret_as="n: int32") as (peer, camera):
+    async with scripted_device(interpret_as="n: int32") as (peer, camera):
         trigger = asyncio.create_task(camera.trigger(timeout=PATIENCE))
         ticket, _ = await peer.requests.get()
         peer.say(ticket, b"star;1;stop")

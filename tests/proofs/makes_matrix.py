@@ -84,15 +84,15 @@ class Books:
 class Ifm(Books, EmulatedIfm):
     """A sensor whose values are the numbers of its evaluations."""
 
-    def evaluated(self, call: LineClient | None, part: Any) -> None:
-        super().evaluated(call, {"n": self.note()})
+    def report_evaluation(self, call: LineClient | None, part: Any) -> None:
+        super().report_evaluation(call, {"n": self.note()})
 
 
 class Iv3(Books, EmulatedIv3):
     """A sensor whose first tool's rate is the number of the inspection."""
 
-    def evaluated(self, call: LineClient | None, part: Any) -> None:
-        super().evaluated(call, (self.note(),))
+    def report_evaluation(self, call: LineClient | None, part: Any) -> None:
+        super().report_evaluation(call, (self.note(),))
 
 
 class Sr(Books, EmulatedSr):

@@ -131,7 +131,7 @@ def test_robots_of_random_halves_differ_as_they_predict() -> None:
     found = []
     for both in halves(50):
         a, b = (robot_of(tuple(half)) for half in both)
-        step = a.camera_pose.rigid.before(b.camera_pose.rigid).ravel()
+        step = a.camera_pose.rigid.source_steps_to(b.camera_pose.rigid).ravel()
         spread = a.covariance[:6, :6] + b.covariance[:6, :6]
         found.append(float(np.sqrt(step @ np.linalg.solve(spread, step) / 6)))
     check_z("camera of MoveIt's robot", found)

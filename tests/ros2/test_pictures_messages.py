@@ -192,7 +192,7 @@ def test_the_format_of_compressed_pictures(name: str, text: str) -> None:
 
 
 def test_compressed_pictures_are_read() -> None:
-    from smartcam.frames._inside import decoded, to_jpeg
+    from smartcam.frames._inside import decode_frame, to_jpeg
 
     grey = picture("Mono8")
     jpeg = to_jpeg(grey, 90)
@@ -203,7 +203,7 @@ def test_compressed_pictures_are_read() -> None:
     assert choose_compression(jpeg).format_text() == "mono8; jpeg compressed mono8"
     depth = picture("Coord3D_C16")
     png = COMPRESSED.new(**compressed_fields(asyncio.run(as_png(depth)), "x", "a"))
-    assert np.array_equal(decoded(frame_from(png), "Coord3D_C16").array(), depth.array())
+    assert np.array_equal(decode_frame(frame_from(png), "Coord3D_C16").array(), depth.array())
     for data in (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"GIF89a"):
         with pytest.raises(FrameFormatError):
             frame_from(COMPRESSED.new(format="jpeg", data=data))

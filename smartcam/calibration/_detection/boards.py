@@ -150,7 +150,7 @@ def find_boards(image: GreyImage, wanted_count: int, *, max_count: int) -> Itera
     """
     min_factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
     for factor in dict.fromkeys((2 * min_factor, min_factor, (min_factor + 1) // 2)):
-        saddles = find_saddles(reduce_levels(image.bytes, factor))
+        saddles = find_saddles(reduce_levels(image.uint8_levels, factor))
         largest: Lattice = {}
         grids = grow_grids(
             saddles.points,

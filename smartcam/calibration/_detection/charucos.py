@@ -157,7 +157,8 @@ def _other_pattern_error(target: Charuco, sighting: _Sighting) -> CalibrationErr
 
 def _flipped(image: GreyImage) -> GreyImage:
     return GreyImage(
-        np.ascontiguousarray(image.levels[:, ::-1]), np.ascontiguousarray(image.bytes[:, ::-1])
+        np.ascontiguousarray(image.levels[:, ::-1]),
+        np.ascontiguousarray(image.uint8_levels[:, ::-1]),
     )
 
 
@@ -185,10 +186,10 @@ def _search_sizes(image: GreyImage, target: Charuco) -> _Sighting:
     best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0, 0, 0, (), 0.0)
     factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
     if factor > 1:
-        best = _search_image(reduce_levels(image.bytes, factor), 1 / factor, target, best)
+        best = _search_image(reduce_levels(image.uint8_levels, factor), 1 / factor, target, best)
         if _has_all_corners(best, target, image):
             return best
-    best = _search_image(image.bytes, 1.0, target, best)
+    best = _search_image(image.uint8_levels, 1.0, target, best)
     can_double = max(image.size) <= MAX_DOUBLED_PX and 2 * len(best.ids) <= len(target.points)
     if can_double and (
         best.marker_count
@@ -196,7 +197,7 @@ def _search_sizes(image: GreyImage, target: Charuco) -> _Sighting:
         < best.marker_side
         < MAX_UNREAD_MODULE_PIXELS * _modules_per_side(charuco_board(target))
     ):
-        best = _search_image(resize_image(image.bytes, 2.0), 2.0, target, best)
+        best = _search_image(resize_image(image.uint8_levels, 2.0), 2.0, target, best)
     return best
 
 

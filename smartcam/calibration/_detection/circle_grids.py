@@ -103,13 +103,15 @@ def _find_grids(
 
     The image is the one in which the dots are dark: the given one or its negative.
     """
-    for is_negative, scale, spots in _search_image(image.bytes, target):
+    for is_negative, scale, spots in _search_image(image.uint8_levels, target):
         for points, grid_positions in _find_layouts(spots, target, counts):
             centres = (points + 0.5) / scale - 0.5
             numberings = find_arrangements(centres, grid_positions, target)
             if numberings and _fits_flat_grid(target, centres[numberings[0].order.ravel()]):
                 dark_image = (
-                    GreyImage(255 - image.levels, 255 - image.bytes) if is_negative else image
+                    GreyImage(255 - image.levels, 255 - image.uint8_levels)
+                    if is_negative
+                    else image
                 )
                 yield dark_image, centres, numberings
 

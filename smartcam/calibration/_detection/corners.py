@@ -115,7 +115,9 @@ def _refine_by_opencv(image: GreyImage, points: Array, reach: Array) -> Array:
     half_window = int(np.clip(0.8 * reach.min(), 2, 5))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-2)
     corners = points.astype(np.float32).reshape(-1, 1, 2)
-    corners = cv2.cornerSubPix(image.bytes, corners, (half_window, half_window), (-1, -1), criteria)
+    corners = cv2.cornerSubPix(
+        image.uint8_levels, corners, (half_window, half_window), (-1, -1), criteria
+    )
     refined: Array = np.array(corners, dtype=np.float64).reshape(-1, 2)
     return refined
 

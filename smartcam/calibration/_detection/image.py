@@ -39,12 +39,12 @@ class GreyImage(NamedTuple):
     """The grey levels of an image."""
 
     levels: NDArray[np.float32]  # (H, W), float32, 0 to 255; for refinement
-    bytes: NDArray[np.uint8]  # (H, W), ``levels`` as uint8; for OpenCV's detectors
+    uint8_levels: NDArray[np.uint8]  # (H, W), ``levels`` as uint8; for OpenCV's detectors
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height, pixels."""
-        height, width = self.bytes.shape
+        height, width = self.uint8_levels.shape
         return width, height
 
 

@@ -60,7 +60,9 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
         ):
             break
         scaled_image = (
-            reduce_levels(image.bytes, factor) if scale < 1 else resize_image(image.bytes, scale)
+            reduce_levels(image.uint8_levels, factor)
+            if scale < 1
+            else resize_image(image.uint8_levels, scale)
         )
         markers = _read_markers(scaled_image, target, scale)
         mask, contrary_here = compare_with_board(markers, board_corners)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, or_none, takes
+from smartcam._argument_checks import a_number, check_arguments, or_none
 from smartcam._arguments import check_text
 from smartcam.calibration._drawing.bars import Chart, Series, draw_bars, short_names
 from smartcam.calibration._drawing.maps import Map, draw_maps
@@ -36,7 +36,7 @@ FromImages = IntrinsicCalibration | StereoCalibration | HandEyeCalibration
 MILLIMETRES: Final = 1e3
 
 
-@takes(title=check_text)
+@check_arguments(title=check_text)
 def draw_views(calibration: FromImages, *, title: str = "") -> str:
     """Return a picture of each view's errors as bars, SVG.
 
@@ -52,7 +52,7 @@ def draw_views(calibration: FromImages, *, title: str = "") -> str:
     return draw_bars(_choose_drawing(calibration, _CHARTS, "draw_views")(calibration), title)
 
 
-@takes(title=check_text)
+@check_arguments(title=check_text)
 def draw_scene(calibration: FromImages, *, title: str = "") -> str:
     """Return a picture of targets and cameras in space, SVG, otherwise as :func:`draw_views`.
 
@@ -63,7 +63,7 @@ def draw_scene(calibration: FromImages, *, title: str = "") -> str:
     return _draw_scene(_choose_drawing(calibration, _SCENES, "draw_scene")(calibration), title)
 
 
-@takes(distance=or_none(a_number), title=check_text)
+@check_arguments(distance=or_none(a_number), title=check_text)
 def draw_uncertainty(
     shown: IntrinsicCalibration | ProjectionUncertainty | LensComparison,
     *,

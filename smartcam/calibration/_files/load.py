@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from smartcam._argument_checks import takes
+from smartcam._argument_checks import check_arguments
 from smartcam._arguments import check_path
 from smartcam.calibration._files.store import Document, read_document
 from smartcam.calibration._plane.calibration import PlaneCalibration
@@ -24,7 +24,7 @@ KINDS: Final[Mapping[str, type[AnyCalibration]]] = {
 """Calibrations that a file may hold, by their kinds."""
 
 
-@takes(path=check_path)
+@check_arguments(path=check_path)
 def load_calibration(path: str | os.PathLike[str]) -> AnyCalibration:
     """Load the calibration of a plane or a sheet from a file.
 
@@ -34,10 +34,10 @@ def load_calibration(path: str | os.PathLike[str]) -> AnyCalibration:
         CalibrationError: the file is damaged, newer, or of another kind.
         OSError: the file does not exist, or cannot be read.
     """
-    return of_document(read_document(path), str(path))
+    return calibration_from_document(read_document(path), str(path))
 
 
-def of_document(document: Document, name: str) -> AnyCalibration:
+def calibration_from_document(document: Document, name: str) -> AnyCalibration:
     """Return the calibration that a document holds; ``name``, of the file, is for messages.
 
     Raises WRONG_KIND, or SHAPE if the data are no calibration.

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import a_list, a_number, each, of_class, or_none, takes
+from smartcam._argument_checks import a_list, a_number, check_arguments, each, of_class, or_none
 from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._hand_eye.closed_forms import (
     LINEAR,
@@ -129,7 +129,7 @@ ASSUMED_POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
 """Standard deviations (rad, m) of target poses without a covariance: only their ratio counts."""
 
 
-@takes(
+@check_arguments(
     robot_poses=a_list,
     views=each(of_class("TargetView")),
     setup=check_text,
@@ -222,7 +222,7 @@ def calibrate_hand_eye(
         views = [ordered[i] for i in np.argsort(order)]
     ordered, stray_remarks = remove_strays(ordered, located, lens, is_lens_given=camera is not None)
     located = [locate(view, lens) for view in ordered] if stray_remarks else located
-    poses = Rigid.stacked(view.transform.rigid for view in located)
+    poses = Rigid.stack(view.transform.rigid for view in located)
     observations = _pixel_observations(ordered, located, lens)
     problem = Problem(
         robot=robot,
@@ -261,7 +261,7 @@ def calibrate_hand_eye(
     )
 
 
-@takes(
+@check_arguments(
     robot_poses=a_list,
     target_poses=each(of_class("Transform")),
     setup=check_text,
@@ -310,7 +310,7 @@ def calibrate_hand_eye_from_poses(
         robot_poses, len(target_poses), "poses of the target", setup
     )
     ordered = [target_poses[i] for i in order]
-    poses = Rigid.stacked(pose.rigid for pose in ordered)
+    poses = Rigid.stack(pose.rigid for pose in ordered)
     scale = np.repeat(1.0 / np.array(ASSUMED_POSE_SIGMAS), 3)
     whitening = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
     problem = Problem(
@@ -357,7 +357,7 @@ def _check_robot_poses(
         [[*transform.translation, *transform.rotation.ravel()] for transform in transforms]
     )
     order = np.lexsort(rows.T[::-1]).tolist() if len(rows) else []
-    ordered = Rigid.stacked(transforms[i].rigid for i in order)
+    ordered = Rigid.stack(transforms[i].rigid for i in order)
     robot = RobotPoses(ordered, in_hand)
     check_motion(robot)
     return transforms, order, robot
@@ -381,7 +381,7 @@ def _renumber_views(
 ) -> list[TargetView]:
     """Return the views of a target that looks the same after half a turn, numbered from one end."""
     target = views[0].target
-    poses = Rigid.stacked(view.transform.rigid for view in located)
+    poses = Rigid.stack(view.transform.rigid for view in located)
     lever = float(np.ptp(target.points, axis=0).max())
     turned_mask = find_other_numbering(robot, poses, half_turn(target), lever).tolist()
     return [
@@ -505,8 +505,8 @@ def _move_remarks(
     )
     camera, target = result.camera_pose.rigid, result.target_pose.rigid
     lever = float(np.linalg.norm(target_poses.translation, axis=1).mean())
-    steps_by_object = {"target": target.before(motion.inverse() @ (camera @ target_poses))}
-    steps_by_object["camera"] = camera.before(motion @ (target @ target_poses.inverse()))
+    steps_by_object = {"target": target.source_steps_to(motion.inverse() @ (camera @ target_poses))}
+    steps_by_object["camera"] = camera.source_steps_to(motion @ (target @ target_poses.inverse()))
     for name, steps in steps_by_object.items():
         if (shift := common_move(steps * np.repeat([lever, 1.0], 3))) is not None:
             yield Code.POOR_FIT.remark(
@@ -646,8 +646,8 @@ def _covariance(candidate: Candidate) -> Array:
     if left_out is None or candidate.problem.count < MIN_POSES_FOR_ERROR:
         return np.full((12, 12), np.nan)
     cameras, targets = (
-        solution.camera.before(left_out.camera),
-        solution.target.before(left_out.target),
+        solution.camera.source_steps_to(left_out.camera),
+        solution.target.source_steps_to(left_out.target),
     )
     steps = np.concatenate([cameras, targets], axis=1)
     information, left_out_information = solution.information, left_out.information
@@ -671,7 +671,10 @@ def _covariance(candidate: Candidate) -> Array:
         :12, :12
     ]
     for rival in candidate.rivals:
-        differences = solution.camera.before(rival.camera), solution.target.before(rival.target)
+        differences = (
+            solution.camera.source_steps_to(rival.camera),
+            solution.target.source_steps_to(rival.target),
+        )
         scatter += np.outer(step := np.concatenate(differences), step)
     lens, observations = candidate.problem.lens_covariance, candidate.problem.observations
     if (

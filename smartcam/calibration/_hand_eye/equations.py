@@ -113,8 +113,8 @@ def predicted_views(camera: Rigid, robot: RobotPoses, target: Rigid) -> Rigid:
 def _pose_derivatives(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Array]:
     """Return the derivatives of ``T_camera_target`` of each view, (V, 6, 12) and (V, 6, 6).
 
-    The first are those by steps of ``X`` and ``Z``, as in :meth:`Rigid.turned_before`, the second
-    those by a step of the robot's pose.
+    The first are those by steps of ``X`` and ``Z``, as in :meth:`Rigid.turned_in_source`, the
+    second those by a step of the robot's pose.
     """
     # S = X^-1 A Z has R_S = R_X^T R_A R_Z and t_S = R_X^T (R_A t_Z + t_A - t_X). Each step (a, b)
     # turns by R exp([a]x) and shifts by b; what it does to S is written exp([w]x) R_S, t_S + d.
@@ -340,7 +340,7 @@ class PoseObservations(Observations):
         # The turn e = log(R_S R_m^T) becomes log(exp([w]x) exp([e]x)), to first order e +
         # J_l(e)^-1 w, and the left Jacobian is J_l(e) = J_r(-e).
         # Source: Sola, Deray and Atchuthan, A micro Lie theory (arXiv 1812.01537), appendix B.
-        residuals = self.poses.scaled(self.scale(change)).steps_to(target_poses)
+        residuals = self.poses.scaled(self.scale(change)).target_steps_to(target_poses)
         slopes = np.zeros((len(residuals), 6, 6 + self.extra_count))
         slopes[:, :3, :3] = np.linalg.inv(right_jacobian(-residuals[:, :3]))
         slopes[:, 3:, 3:6] = np.eye(3)
@@ -380,7 +380,7 @@ def view_products(
     ``solution``. ``poses_only`` leaves out the part of the residuals that no pose of the view
     changes.
     """
-    corrected = dataclasses.replace(robot, poses=robot.poses.turned_before(solution.corrections))
+    corrected = dataclasses.replace(robot, poses=robot.poses.turned_in_source(solution.corrections))
     residuals, slopes = observations.evaluate(
         predicted_views(solution.camera, corrected, solution.target), solution.change
     )
@@ -479,8 +479,8 @@ def adjust(
 def _apply_steps(solution: Solution, step: Array, corrections: Array) -> Solution:
     return dataclasses.replace(
         solution,
-        camera=solution.camera.turned_before(step[:6]),
-        target=solution.target.turned_before(step[6:12]),
+        camera=solution.camera.turned_in_source(step[:6]),
+        target=solution.target.turned_in_source(step[6:12]),
         change=solution.change + step[12:],
         corrections=solution.corrections + corrections
         if corrections.size
@@ -515,8 +515,8 @@ def leave_each_out(robot: RobotPoses, observations: Observations, solution: Solu
     remaining, rights = matrices.sum(axis=0) - matrices, rights.sum(axis=0) - rights
     steps = np.stack([solve_scaled(*system) for system in zip(remaining, rights, strict=True)])
     return Solution(
-        solution.camera.turned_before(steps[:, :6]),
-        solution.target.turned_before(steps[:, 6:12]),
+        solution.camera.turned_in_source(steps[:, :6]),
+        solution.target.turned_in_source(steps[:, 6:12]),
         solution.change + steps[:, 12:],
         information=remaining,
     )

@@ -335,8 +335,8 @@ def _reprojection_like(robot: Candidate) -> Candidate | None:
         steps = (robot.left_out_solutions.change - change) @ slopes.T
         reprojection.left_out_solutions = dataclasses.replace(
             reprojection.left_out_solutions,
-            camera=reprojection.left_out_solutions.camera.turned_before(steps[:, :6]),
-            target=reprojection.left_out_solutions.target.turned_before(steps[:, 6:]),
+            camera=reprojection.left_out_solutions.camera.turned_in_source(steps[:, :6]),
+            target=reprojection.left_out_solutions.target.turned_in_source(steps[:, 6:]),
             change=robot.left_out_solutions.change,
         )
         reprojection.held_out_vectors = problem.error_vectors(reprojection.left_out_solutions)
@@ -503,8 +503,8 @@ def _closed_form_candidate(problem: Problem, name: str, solution: Solution) -> C
             for i, previous in enumerate(solutions)
         ]
     candidate.left_out_solutions = Solution(
-        Rigid.stacked(solution.camera for solution in solutions),
-        Rigid.stacked(solution.target for solution in solutions),
+        Rigid.stack(solution.camera for solution in solutions),
+        Rigid.stack(solution.target for solution in solutions),
     )
     candidate.held_out_vectors = problem.error_vectors(candidate.left_out_solutions)
     return candidate

@@ -101,7 +101,7 @@ class HandEyeCalibration(storage.SavedCalibration):
     """
 
     kind: ClassVar[str] = KIND
-    _called: ClassVar[str] = "hand-eye calibration"
+    _label: ClassVar[str] = "hand-eye calibration"
     _extra_keys: ClassVar[storage.ExtraKeys] = {
         "frames": (
             FrameNames,
@@ -112,8 +112,8 @@ class HandEyeCalibration(storage.SavedCalibration):
             lambda result: result.views[0].target if result.views else None,
         ),
     }
-    _shared: ClassVar[frozenset[str]] = frozenset({"frames", "setup", "target"})
-    _later: ClassVar[frozenset[str]] = frozenset({"allowed_error"})
+    _context_keys: ClassVar[frozenset[str]] = frozenset({"frames", "setup", "target"})
+    _optional_keys: ClassVar[frozenset[str]] = frozenset({"allowed_error"})
 
     setup: Setup
     camera_pose: CameraPlace
@@ -369,7 +369,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         for axis in range(6):
             shifted_points = []
             for shift in (-step, step):
-                moved_pose = self.camera_pose.rigid.turned_before(shift * np.eye(6)[axis])
+                moved_pose = self.camera_pose.rigid.turned_in_source(shift * np.eye(6)[axis])
                 camera_pose = carrier_pose @ Transform(
                     self.camera_pose.target, self.camera_pose.source, *moved_pose
                 )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, of_class, takes
+from smartcam._argument_checks import a_number, check_arguments, of_class
 from smartcam._extras import load
 from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_linear
 from smartcam.calibration._hand_eye.equations import RobotPoses, is_in_hand, predicted_views
@@ -59,7 +59,7 @@ class TimeOffset(NamedTuple):
     after: float
 
 
-@takes(history=of_class("PoseHistory"), most=a_number)
+@check_arguments(history=of_class("PoseHistory"), most=a_number)
 def estimate_time_offset(
     history: PoseHistory, target_poses: Sequence[Transform], *, setup: Setup, most: float = 0.2
 ) -> TimeOffset:
@@ -118,7 +118,7 @@ class _OffsetFit:
     ) -> None:
         self._history, self._max_offset = history, max_offset
         self._in_hand = is_in_hand(setup, "time offset")
-        self._views = Rigid.stacked(view.rigid for view in views)
+        self._views = Rigid.stack(view.rigid for view in views)
         for number, view in enumerate(views):
             if view.at is None:
                 raise Code.BAD_TIME.refusal(
@@ -131,7 +131,7 @@ class _OffsetFit:
     def _robot(self, offset: float, index: NDArray[np.intp]) -> RobotPoses:
         shift = timedelta(seconds=offset)
         poses = [self._history.at(self._times[i] + shift).rigid for i in index.tolist()]
-        return RobotPoses(Rigid.stacked(poses), self._in_hand)
+        return RobotPoses(Rigid.stack(poses), self._in_hand)
 
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the RMS difference between poses and views at some indices, metres."""
@@ -140,7 +140,9 @@ class _OffsetFit:
         if solution is None:
             return math.inf
         turn, shift = np.split(
-            target_poses.steps_to(predicted_views(solution[0], robot, solution[1])), 2, axis=1
+            target_poses.target_steps_to(predicted_views(solution[0], robot, solution[1])),
+            2,
+            axis=1,
         )
         squares = (shift**2).sum(axis=1) + self._lever**2 * (turn**2).sum(axis=1)
         return math.sqrt(float(squares.mean()))

@@ -176,7 +176,7 @@ def _improve_agreement(
 
 def _pose_distances(poses: Rigid, expected: Rigid, lever: float) -> Array:
     """Return the distances (V,) of poses from the expected ones, metres; turns act on the lever."""
-    turn, shift = np.split(poses.steps_to(expected), 2, axis=1)
+    turn, shift = np.split(poses.target_steps_to(expected), 2, axis=1)
     distances: Array = np.hypot(np.linalg.norm(shift, axis=1), lever * np.linalg.norm(turn, axis=1))
     return distances
 

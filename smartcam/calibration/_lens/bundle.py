@@ -104,7 +104,7 @@ class Bundle:
     ) -> Bundle:
         """Return the bundle of one camera; without a basis its lens is known."""
         lens_basis = empty_basis(camera) if basis is None else basis
-        return cls((camera,), Rigid.stacked([]), poses, (lens_basis,), points=points)
+        return cls((camera,), Rigid.stack([]), poses, (lens_basis,), points=points)
 
     def with_known_cameras(self) -> Bundle:
         """Return the bundle with lenses, rig and points fixed, so that only poses are adjusted."""
@@ -142,13 +142,13 @@ class Bundle:
         )
         rig, points = self.rig, self.points
         if not self.is_rig_known and rig.size:
-            rig = rig.turned_after(
+            rig = rig.turned_in_target(
                 shared[columns[-1].stop : self.camera_unknown_count].reshape(-1, 6)
             )
         if points is not None and self.has_free_points:
             points = points + shared[self.camera_unknown_count :].reshape(-1, 3)
         return dataclasses.replace(
-            self, cameras=cameras, rig=rig, poses=self.poses.turned_after(poses), points=points
+            self, cameras=cameras, rig=rig, poses=self.poses.turned_in_target(poses), points=points
         )
 
     def camera_changes(self, other: Bundle) -> Array:
@@ -158,7 +158,7 @@ class Bundle:
             for camera, to, basis in zip(self.cameras, other.cameras, self.basis, strict=True)
         ]
         return np.concatenate(
-            [*lenses, *([] if self.is_rig_known else self.rig.steps_to(other.rig))]
+            [*lenses, *([] if self.is_rig_known else self.rig.target_steps_to(other.rig))]
         )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, an_integer, each, or_none, takes
+from smartcam._argument_checks import a_number, an_integer, check_arguments, each, or_none
 from smartcam.calibration._lens.field import (
     DEFAULT_MAP_SHAPE,
     MIN_MOTION_PLACES,
@@ -141,7 +141,7 @@ class LensComparison:
         return f"they differ by more than their noise explains: {noise}"
 
 
-@takes(distance=or_none(a_number), shape=each(an_integer, 2))
+@check_arguments(distance=or_none(a_number), shape=each(an_integer, 2))
 def compare(
     a: IntrinsicCalibration | CameraModel,
     b: IntrinsicCalibration | CameraModel,
@@ -282,7 +282,7 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, at_infinity
         step = np.asarray(
             np.linalg.lstsq(by_motion[finite], residuals[finite], rcond=None)[0], dtype=np.float64
         )
-        motion = motion.turned_after(step)
+        motion = motion.turned_in_target(step)
         if np.abs(by_motion[finite] @ step).max() < MAX_FINAL_STEP_PX:
             return motion
     raise Code.POOR_FIT.refusal(

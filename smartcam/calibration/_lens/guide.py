@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, a_target, of_class, or_none, takes
+from smartcam._argument_checks import a_number, a_target, check_arguments, of_class, or_none
 from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.bundle import Bundle, BundleEquations, Sight
 from smartcam.calibration._lens.field import (
@@ -93,7 +93,7 @@ class CandidateViews(NamedTuple):
     outlines: Array  # (C, 4, 2), pixels
 
 
-@takes(
+@check_arguments(
     calibration=of_class("IntrinsicCalibration"),
     distance=or_none(a_number),
     roll=a_number,
@@ -171,7 +171,7 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
     points = None
     if calibration.sheet is not None:
         points = used[0].view.target.points + calibration.sheet
-    poses = Rigid.stacked(fit.transform.rigid for fit in used)
+    poses = Rigid.stack(fit.transform.rigid for fit in used)
     bundle = Bundle.single(calibration.camera, poses, basis, points)
     sights = [Sight(0, number, fit.view) for number, fit in enumerate(used)]
     equations = BundleEquations(bundle, sights, calibration.sigma**2)

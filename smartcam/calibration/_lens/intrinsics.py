@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, get_args
 import numpy as np
 from pydantic import Field
 
-from smartcam._argument_checks import each, of_class, takes
+from smartcam._argument_checks import check_arguments, each, of_class
 from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, camera_covariance
@@ -134,7 +134,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     """
 
     kind: ClassVar[str] = "camera"
-    _called: ClassVar[str] = "calibration of cameras"
+    _label: ClassVar[str] = "calibration of cameras"
     _extra_keys: ClassVar[storage.ExtraKeys] = {
         "target": (storage.StoredTarget, lambda calibration: calibration.views[0].view.target)
     }
@@ -225,7 +225,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
                 target,
                 view.target,
             )
-        pose = Rigid.stacked([locate(view, self.camera).transform.rigid])
+        pose = Rigid.stack([locate(view, self.camera).transform.rigid])
         points = None if self.sheet is None else target.points + self.sheet
         bundle = Bundle.single(self.camera, pose, points=points)
         return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
@@ -239,7 +239,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
             storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
 
 
-@takes(
+@check_arguments(
     views=each(of_class("TargetView")),
     distortion_model=check_text,
     fixed=each(check_text),

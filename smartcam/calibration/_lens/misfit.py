@@ -23,7 +23,7 @@ from smartcam.calibration._lens.projection import (
     smooth_changes,
     whitening,
 )
-from smartcam.geometry._inside import COEFFICIENTS, Code, Remark
+from smartcam.geometry._inside import COEFFICIENT_COUNTS, Code, Remark
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 FLIPS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
 """Ways to flip a picture, each with the axes of the image whose direction changes."""
 
-_LENS_VALUES: Final = 4 + max(COEFFICIENTS.values())
+_LENS_VALUES: Final = 4 + max(COEFFICIENT_COUNTS.values())
 _ENDS: Final = np.cumsum(
     [0, _LENS_VALUES, _LENS_VALUES, 6, 5, 2, SMOOTH_TERM_COUNT, SMOOTH_TERM_COUNT]
 ).tolist()

@@ -246,7 +246,7 @@ def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
 
     Raises ``POOR_FIT`` if no pose puts the target in front of the camera.
     """
-    return Rigid.stacked(_likeliest(view, camera) for view in views)
+    return Rigid.stack(_likeliest(view, camera) for view in views)
 
 
 def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:

@@ -17,7 +17,7 @@ from smartcam.calibration._lens.bundle import (
 from smartcam.calibration._lens.poses import likeliest_poses
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import CameraModel
-from smartcam.geometry._inside import COEFFICIENTS, Code, coefficient_names
+from smartcam.geometry._inside import COEFFICIENT_COUNTS, Code, coefficient_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -130,11 +130,11 @@ def _opencv_lens(
     flags = sum(
         getattr(namespace, f"CALIB_{name}", 0) or getattr(cv2, f"CALIB_{name}") for name in names
     )
-    initial = np.zeros(COEFFICIENTS["equidistant" if model == "equidistant" else "plumb_bob"])
+    initial = np.zeros(COEFFICIENT_COUNTS["equidistant" if model == "equidistant" else "plumb_bob"])
     _, fitted_matrix, coefficients, *_ = calibrate(
         points, pixels, (width, height), matrix, initial, flags=flags, criteria=criteria
     )
-    distortion = np.zeros(COEFFICIENTS[model])
+    distortion = np.zeros(COEFFICIENT_COUNTS[model])
     distortion[: coefficients.size] = coefficients.ravel()
     fitted_matrix[0, 1] = 0.0
     return CameraModel(

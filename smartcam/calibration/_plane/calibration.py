@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 import numpy as np
 from pydantic import StrictBool
 
-from smartcam._argument_checks import numbers, or_none, takes
-from smartcam._arguments import check_flag, check_text, shown
+from smartcam._argument_checks import check_arguments, numbers, or_none
+from smartcam._arguments import check_flag, check_text, excerpt
 from smartcam._forks import cached_property
 from smartcam.calibration._files import storage
 from smartcam.calibration._homography import element_derivatives
@@ -42,7 +42,7 @@ from smartcam.calibration._plane.model_selection import (
     rms,
     sum_of_squares,
 )
-from smartcam.calibration._plane.order import better_order
+from smartcam.calibration._plane.order import find_better_order
 from smartcam.calibration._plane.pose_sigmas import robot_sigmas
 from smartcam.calibration._plane.robust import find_agreeing
 from smartcam.calibration._plane.validation import (
@@ -149,8 +149,8 @@ class PlaneCalibration(storage.SavedCalibration):
     """
 
     kind: ClassVar[str] = KIND
-    _called: ClassVar[str] = "plane calibration"
-    _later: ClassVar[frozenset[str]] = frozenset(
+    _label: ClassVar[str] = "plane calibration"
+    _optional_keys: ClassVar[frozenset[str]] = frozenset(
         {"tool_z", "height", "camera_frame", "y_down", "allowed_error"}
     )
 
@@ -516,7 +516,7 @@ class PlaneCalibration(storage.SavedCalibration):
         _ = self._map  # raises now for an invalid matrix, not only when the first part comes
 
 
-@takes(
+@check_arguments(
     model=check_text,
     weights=or_none(numbers),
     tool_z=or_none(numbers),
@@ -585,7 +585,7 @@ def fit_plane(
     """
     if model != "auto" and model not in MODELS:
         raise ConfigurationError(
-            f"fit_plane: model: expected auto, {', '.join(MODELS)}, got {shown(model)}"
+            f"fit_plane: model: expected auto, {', '.join(MODELS)}, got {excerpt(model)}"
         )
     camera, robot, point_weights = read_pairs(camera_points, robot_points, weights)
     check_positive(touch_sigma, "touch_sigma", "metres")
@@ -603,7 +603,7 @@ def fit_plane(
     check_samples(marks[inliers], touches[inliers], min_points, touch_sigma)
     max_sigma = MAX_SIGMA.of(extent(touches[inliers])) if touch_sigma is None else touch_sigma
     # all points are used, since points in a wrong order may also agree with one another
-    reordered = better_order(marks, touches, max_sigma)
+    reordered = find_better_order(marks, touches, max_sigma)
     if reordered is not None and set(reordered.moved).isdisjoint(inliers):
         reordered = None
     tool_axis = None if tool_z is None else mean_axis(tool_z, len(camera))

@@ -19,7 +19,7 @@ from smartcam.geometry._inside import (
     Code,
     as_points,
     check_finite,
-    not_finite,
+    not_finite_error,
     quaternion_from_matrix,
 )
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
@@ -66,7 +66,7 @@ class PlaneMap:
             self._prepare(matrix, centre)
         arrays = [self.origin, self.frame, self._plane_matrix, self._inverse_plane_matrix]
         if not (all(np.isfinite(array).all() for array in arrays) and 0 < self.scale < math.inf):
-            raise not_finite("plane's matrix", matrix.tolist())
+            raise not_finite_error("plane's matrix", matrix.tolist())
 
     def _prepare(self, matrix: Array, centre: Array) -> None:
         self.origin: Array = apply_homography(matrix, centre[None])[0]
@@ -85,7 +85,7 @@ class PlaneMap:
                 np.linalg.inv(self._plane_matrix), dtype=np.float64
             )
         except np.linalg.LinAlgError as exc:
-            raise not_finite("plane's matrix", matrix.tolist()) from exc
+            raise not_finite_error("plane's matrix", matrix.tolist()) from exc
         self._quaternion = Quaternion(*quaternion_from_matrix(self.frame).tolist())
 
     def transform(self, points: ArrayLike, out: Array | None = None) -> Array:
@@ -212,7 +212,7 @@ class PlaneMap:
             position = (ox + xx * x + yx * y, oy + xy * x + yy * y, oz + xz * x + yz * y)
             # the sum of all numbers is one operation, and is not finite if one of them is not
             if not isfinite(sum(position) + (i + j + m + r)):
-                raise not_finite(f"pose of {feature_id!r:.60}", (*position, *orientation))
+                raise not_finite_error(f"pose of {feature_id!r:.60}", (*position, *orientation))
             result = new(Pose, (header, new(Position, position), new(Quaternion, orientation)))
             mapped.append(new(Localization, (feature_id, quality, photo_index, result)))
         return mapped
@@ -253,7 +253,7 @@ def _check_mapped(points: Array, result: Array) -> None:
     is_wrong = is_finite & ~np.isfinite(result).all(axis=1)
     if is_wrong.any():
         row = int(np.argmax(is_wrong))
-        raise not_finite(f"point {points[row].tolist()}", result[row].tolist())
+        raise not_finite_error(f"point {points[row].tolist()}", result[row].tolist())
 
 
 def _check_out(out: Array, count: int) -> Array:

@@ -81,7 +81,7 @@ class Reordered(NamedTuple):
         )
 
 
-def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
+def find_better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
     """Return an order that explains the touches far better than the given one; None without one.
 
     ``camera`` (N, 2), ``robot`` (N, 3), metres, in the order as given. ``sigma``: largest

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam._argument_checks import a_number, numbers, of_class, or_none, takes
+from smartcam._argument_checks import a_number, check_arguments, numbers, of_class, or_none
 from smartcam.calibration._plane.calibration import PlaneCalibration, mean_axis
 from smartcam.calibration._plane.diagnostics import (
     TYPICAL_SIGMA_M,
@@ -51,7 +51,7 @@ class _FittedRays(NamedTuple):
     covariance: Array  # (6, 6), covariance of shift and turn, for touches with a variance of 1 m^2
 
 
-@takes(
+@check_arguments(
     origin=of_class("Localization"),
     o=numbers,
     a=numbers,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam._arguments import plain, shown
+from smartcam._arguments import as_plain_value, excerpt
 from smartcam.calibration._plane.fitting import Normalization, Pairs
 from smartcam.calibration._units import MAX_UNASKED_M
 from smartcam.geometry._inside import Code, as_points
@@ -117,11 +117,11 @@ def check_positive(value: float | None, name: str, unit: str) -> None:
     """Raise NOT_FINITE if an option is neither None nor a positive number."""
     if value is None:
         return
-    number: object = plain(value)
+    number: object = as_plain_value(value)
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
     if not (is_number and 0 < value <= sys.float_info.max):
         raise Code.NOT_FINITE.refusal(
-            f"{name}: expected a positive number of {unit}, got {shown(value)}",
+            f"{name}: expected a positive number of {unit}, got {excerpt(value)}",
             "a positive number",
             value,
         )

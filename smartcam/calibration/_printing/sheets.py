@@ -22,7 +22,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
-from smartcam._argument_checks import a_number, each, takes
+from smartcam._argument_checks import a_number, check_arguments, each
 from smartcam._arguments import check_text
 from smartcam.calibration._printing.page import (
     Disc,
@@ -162,7 +162,7 @@ class Sheet:
         return PrintedPage(self.width, self.height, self.title, description, self.shapes)
 
 
-@takes(page=check_text)
+@check_arguments(page=check_text)
 def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
     """Lay out a sheet.
 
@@ -224,7 +224,7 @@ def _page_too_small_error(target: Target | Rays, page: str, layout: PageLayout) 
     )
 
 
-def on_paper(data: Mapping[str, Any]) -> Target | Rays:
+def target_from_description(data: Mapping[str, Any]) -> Target | Rays:
     """Return the target, or the rays, that a sheet's ``data`` describes; raise SHAPE otherwise."""
     if data.get("kind") != Rays.kind or set(data) != {"kind", "diameter"}:
         return target_from_data(data)
@@ -247,7 +247,7 @@ def page_size(page: str) -> tuple[float, float]:
     return size
 
 
-@takes(measured_ruler=each(a_number, 2))
+@check_arguments(measured_ruler=each(a_number, 2))
 def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     """Return a target with its lengths as they are on paper.
 

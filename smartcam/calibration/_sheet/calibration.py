@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, overload
 
 import numpy as np
 
-from smartcam._argument_checks import a_target, an_integer, each, numbers, of_class, or_none, takes
+from smartcam._argument_checks import (
+    a_target,
+    an_integer,
+    check_arguments,
+    each,
+    numbers,
+    of_class,
+    or_none,
+)
 from smartcam._arguments import check_flag
 from smartcam._forks import cached_property
 from smartcam.calibration._files import storage
@@ -29,7 +37,7 @@ from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._plane.pose_sigmas import robot_sigmas
-from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
+from smartcam.calibration._sheet.plane import SheetPlane, fit_sheet_view
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
 from smartcam.calibration._verdict import CalibrationVerdict, Judgement
 from smartcam.calibration._views import TargetView
@@ -85,9 +93,9 @@ class SheetCalibration(storage.SavedCalibration):
 
     y_down: ClassVar[bool] = True
     kind: ClassVar[str] = KIND
-    _called: ClassVar[str] = "sheet's calibration"
+    _label: ClassVar[str] = "sheet's calibration"
     _keys: ClassVar[storage.Keys] = {"sheet": "", "remarks": "warnings"}
-    _later: ClassVar[frozenset[str]] = frozenset({"lens_covariance"})
+    _optional_keys: ClassVar[frozenset[str]] = frozenset({"lens_covariance"})
     _extra_keys: ClassVar[storage.ExtraKeys] = {
         "target": (storage.StoredTarget, lambda calibration: calibration.view.target),
         "camera": (CameraModel | None, lambda calibration: calibration.sheet.camera),
@@ -182,7 +190,7 @@ class SheetCalibration(storage.SavedCalibration):
             return ()
         values, moves = lens_values(self.camera), independent_parts(self.lens_covariance)
         return tuple(
-            look_at_sheet(self.view, with_lens(self.camera, values + move)).plane for move in moves
+            fit_sheet_view(self.view, with_lens(self.camera, values + move)).plane for move in moves
         )
 
     def transform(self, pixels: ArrayLike) -> Array:
@@ -316,7 +324,7 @@ def _check_lens(covariance: Array, camera: CameraModel | None, called: str) -> N
     check_finite(covariance, f"{called}: lens_covariance")
 
 
-@takes(
+@check_arguments(
     view=of_class("TargetView"),
     plane=of_class("PlaneCalibration"),
     camera=or_none(of_class("CameraModel")),
@@ -344,13 +352,13 @@ def calibrate_sheet(
 
     Raises:
         CalibrationError: TOO_FEW, COLLINEAR, WRONG_SIZE, NOT_FINITE, POOR_FIT, MIRRORED: see
-            :func:`~smartcam.calibration._sheet.plane.look_at_sheet`. SHAPE or NOT_FINITE: the
+            :func:`~smartcam.calibration._sheet.plane.fit_sheet_view`. SHAPE or NOT_FINITE: the
             covariance is not valid.
     """
     if lens_covariance is not None:
         lens_covariance = storage.as_array(lens_covariance)
         _check_lens(lens_covariance, camera, "calibrate_sheet")
-    fit = look_at_sheet(view, camera)
+    fit = fit_sheet_view(view, camera)
     remarks: list[Remark] = []
     if camera is None:
         remarks.append(
@@ -378,7 +386,7 @@ def calibrate_sheet(
     )
 
 
-@takes(
+@check_arguments(
     target=a_target,
     ids=each(an_integer),
     tool_z=or_none(numbers),

@@ -28,7 +28,7 @@ from smartcam.geometry._inside import (
     as_points,
     check_finite,
     cross_matrix,
-    not_finite,
+    not_finite_error,
     quaternion_about_z,
 )
 
@@ -195,13 +195,13 @@ def _invert_matrix(matrix: Array) -> Array:
     try:
         inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     except np.linalg.LinAlgError as exc:
-        raise not_finite("sheet's matrix", matrix.tolist()) from exc
+        raise not_finite_error("sheet's matrix", matrix.tolist()) from exc
     check_finite(inverse, "sheet's matrix")
     return inverse
 
 
 class PlaneView(NamedTuple):
-    """The result of :func:`look_at_sheet`."""
+    """The result of :func:`fit_sheet_view`."""
 
     plane: SheetPlane
     # standard deviation of a coordinate of the target's points from their predicted places, pixels
@@ -210,7 +210,7 @@ class PlaneView(NamedTuple):
     unexplained: float
 
 
-def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneView:
+def fit_sheet_view(view: TargetView, camera: CameraModel | None = None) -> PlaneView:
     """Fit the map from pixels to the sheet that a view shows.
 
     ``view`` has at least 4 points of the target that are not on a line; without a lens (``camera``,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, g
 
 import numpy as np
 
-from smartcam._argument_checks import a_list, each, takes
+from smartcam._argument_checks import a_list, check_arguments, each
 from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust_weighted, camera_covariance
@@ -116,7 +116,7 @@ class StereoCalibration(storage.SavedCalibration):
     """
 
     kind: ClassVar[str] = "stereo"
-    _called: ClassVar[str] = "calibration of cameras"
+    _label: ClassVar[str] = "calibration of cameras"
     _extra_keys: ClassVar[storage.ExtraKeys] = {
         "target": (storage.StoredTarget, lambda calibration: _first_target(calibration))
     }
@@ -298,7 +298,7 @@ def _first_target(calibration: StereoCalibration) -> Target:
     return next(view.target for pair in pairs for view in (pair.left, pair.right) if view)
 
 
-@takes(
+@check_arguments(
     left_views=a_list,
     right_views=a_list,
     distortion_model=check_text,

@@ -130,13 +130,13 @@ def guess_start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
                 (left_view, half_turned(right_view)),
                 (left_pose, right_pose @ turns[1]),
             )
-    target_poses = Rigid.stacked(
+    target_poses = Rigid.stack(
         in_left or (rig.inverse() @ in_right if in_right else IDENTITY)
         for in_left, in_right in poses
     )
     basis = lenses.basis(0), lenses.basis(1)
     return FirstGuess(
-        moments, Bundle((left, right), Rigid.stacked([rig]), target_poses, basis), mismatched
+        moments, Bundle((left, right), Rigid.stack([rig]), target_poses, basis), mismatched
     )
 
 

@@ -42,7 +42,7 @@ from smartcam.calibration.formats._plain import (
     stored_matrix,
 )
 from smartcam.geometry import CameraModel
-from smartcam.geometry._inside import COEFFICIENTS, Code, check_size
+from smartcam.geometry._inside import COEFFICIENT_COUNTS, Code, check_size
 
 if TYPE_CHECKING:
     import os
@@ -540,19 +540,19 @@ def _choose_size(stated: Sequence[Plain], given_size: tuple[int, int] | None) ->
 
 
 def _parse_model(name: Plain, coefficients: Array) -> DistortionModel:
-    for model in COEFFICIENTS:
+    for model in COEFFICIENT_COUNTS:
         if model == name:
             return model
     if not len(coefficients) and name in {"", "none"}:
         return "plumb_bob"
-    raise malformed_error("distortion_model", ", ".join(COEFFICIENTS), name)
+    raise malformed_error("distortion_model", ", ".join(COEFFICIENT_COUNTS), name)
 
 
 def _make_camera(
     size: tuple[int, int], matrix: Array, coefficients: Array, model: DistortionModel
 ) -> CameraModel:
     """Return a lens; missing coefficients at the end are 0, and surplus coefficients must be 0."""
-    count = COEFFICIENTS[model]
+    count = COEFFICIENT_COUNTS[model]
     short_counts = {"plumb_bob": {0, 4}}.get(model, {0})
     if len(coefficients) in short_counts:
         coefficients = np.concatenate([coefficients, np.zeros(count - len(coefficients))])

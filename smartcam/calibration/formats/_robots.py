@@ -128,7 +128,7 @@ class PoseConvention(NamedTuple):
     """The convention by which a robot's poses are written."""
 
     numbers: tuple[str, ...]  # names of the numbers, in order
-    metre: float  # number of length units in a metre
+    units_per_metre: float  # number of length units in a metre
     # function that converts the numbers after the position to a rotation (3, 3)
     to_matrix: Callable[[Array], Array]
     # function that converts a pose to the numbers after the position
@@ -204,7 +204,7 @@ def pose_from(
             f"{label}: expected numbers of at most {MAX_NUMBER:g}", MAX_NUMBER, given.tolist()
         )
     if unit is None:
-        position = given[:3] / convention.metre
+        position = given[:3] / convention.units_per_metre
         check_length(float(np.linalg.norm(position)), label)
     else:
         position = given[:3] * metres_of(unit, label)
@@ -229,5 +229,5 @@ def pose_to(robot: str, pose: Transform) -> list[float]:
         CalibrationError: ``UNKNOWN_FORMAT``.
     """
     convention = look_up(ROBOTS, robot, "robot's convention")
-    position: list[float] = (convention.metre * pose.translation).tolist()
+    position: list[float] = (convention.units_per_metre * pose.translation).tolist()
     return position + convention.from_pose(pose)

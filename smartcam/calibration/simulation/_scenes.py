@@ -210,7 +210,7 @@ class HandEyeScene:
         observations = PixelObservations(
             whitening, self.camera, np.stack(points), np.stack(pixels), no_heights
         )
-        poses = Rigid.stacked(pose.rigid for pose in self.robot_poses)
+        poses = Rigid.stack(pose.rigid for pose in self.robot_poses)
         noise = RobotNoise(robot_sigmas) if max(robot_sigmas) > 0 else None
         truth = Solution(self.camera_pose.rigid, self.target_pose.rigid, noise=noise)
         information = fisher_information(
@@ -228,7 +228,7 @@ class HandEyeScene:
         self, pose: Transform, sigmas: RobotSigmas, random: np.random.Generator
     ) -> Transform:
         step = np.repeat(sigmas, 3) * random.normal(size=6)
-        return Transform(pose.target, pose.source, *pose.rigid.turned_before(step))
+        return Transform(pose.target, pose.source, *pose.rigid.turned_in_source(step))
 
 
 def hand_eye_scene(

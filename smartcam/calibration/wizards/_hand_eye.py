@@ -22,7 +22,7 @@ from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
 from smartcam.calibration._hand_eye.closed_forms import MIN_POSES
 from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
 from smartcam.calibration._lens.poses import CAMERA, TARGET, locate
-from smartcam.calibration._verdict import VIEW_CURES, Judgement, refused
+from smartcam.calibration._verdict import VIEW_CURES, Judgement, poor_judgement
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
 from smartcam.calibration.wizards._pictures import (
@@ -44,7 +44,7 @@ from smartcam.calibration.wizards._target_drawing import draw_preview
 from smartcam.calibration.wizards._target_steps import ask_target
 from smartcam.calibration.wizards._touches import ALLOWED
 from smartcam.calibration.wizards._usage import usage
-from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
+from smartcam.calibration.wizards._view_suggestions import STANDARD_VIEWS, suggest_view
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Transform
 from smartcam.geometry._inside import Code, motion_from_data, motion_to_data
@@ -81,7 +81,7 @@ _MOVES: Mapping[str, str] = {
 TOUCHES = 3
 """Number of touches that verify a calibration; the touched points of the sheet are far apart."""
 
-SUGGESTIONS = tuple(look.text for look in LOOKS)
+SUGGESTIONS = tuple(look.text for look in STANDARD_VIEWS)
 """Texts of the suggested views, in order; after the last one, the first one follows."""
 
 
@@ -337,7 +337,7 @@ class _HandEyeRun:
         The SVG is "" if it is too large.
         """
         view, earlier = find_target(image, self._target, name=name), self._named_views()
-        next_view = suggestion([*earlier, view], lens_known=self._camera is not None)
+        next_view = suggest_view([*earlier, view], lens_known=self._camera is not None)
         svg = draw_preview(
             image,
             view=view,
@@ -371,7 +371,7 @@ class _HandEyeRun:
         solution = (await ask(step, self._solve)).outcome
         if "code" in solution:
             worst, code = len(self._samples), Code(solution["code"])
-            judgement = refused(code, solution["text"], worst=worst, cures=VIEW_CURES)
+            judgement = poor_judgement(code, solution["text"], worst=worst, cures=VIEW_CURES)
             return None, (f"{code}: {solution['text']}",), judgement
         views = [view.to_data() for view in self._named_views()]
         calibration = HandEyeCalibration.from_data({**solution, "views": views})
@@ -423,7 +423,7 @@ class _HandEyeRun:
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
     """Return the inputs of a pose; ``optional``: whether they may be empty."""
     convention = ROBOTS[robot]
-    unit = "mm" if convention.metre > 1 else "m"
+    unit = "mm" if convention.units_per_metre > 1 else "m"
     return tuple(
         Number(
             name=name, label=name, unit=unit if name in {"x", "y", "z"} else "", optional=optional

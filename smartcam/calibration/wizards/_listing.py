@@ -21,7 +21,7 @@ MAX_CALIBRATIONS: Final = 200
 """Largest number of calibrations that are read; they are the first by name."""
 
 
-def listing(folder: Folder) -> list[dict[str, Any]]:
+def list_calibrations(folder: Folder) -> list[dict[str, Any]]:
     """Return a row of JSON data for each calibration of a folder, sorted by name.
 
     Its keys are ``name``, ``kind``, ``written_at`` (UTC, ISO 8601), ``held_out_mm`` (RMS; None: not

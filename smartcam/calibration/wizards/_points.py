@@ -21,11 +21,11 @@ import numpy as np
 
 from smartcam.calibration._files.store import write
 from smartcam.calibration._plane.diagnostics import MAX_SIGMA
-from smartcam.calibration._plane.order import Reordered, better_order
+from smartcam.calibration._plane.order import Reordered, find_better_order
 from smartcam.calibration._plane.robust import MIN_POINTS
 from smartcam.calibration._plane.touches import fit_touches
 from smartcam.calibration._plane.validation import extent
-from smartcam.calibration._verdict import CURES, Judgement, refused
+from smartcam.calibration._verdict import CURES, Judgement, poor_judgement
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, number_input
 from smartcam.calibration.wizards._touch_previews import compare_touches, touch_points
@@ -248,23 +248,23 @@ class PointSource(Touches, ABC):
         touched = np.array(self.tip_positions)
         sigma = self.sigma or MAX_SIGMA.of(extent(touched))
         marks = np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
-        return better_order(marks, touched, sigma)
+        return find_better_order(marks, touched, sigma)
 
     def _judge_error(self, error: CalibrationError) -> Judgement:
         """Return the judgement of a failed fit; name a wrong or exchanged touch if possible."""
         if (order := self._better_order()) is not None:
             numbers = np.arange(1, 1 + len(self.touches))
-            return refused(Code.WRONG_ORDER, order.remark(numbers).text)
+            return poor_judgement(Code.WRONG_ORDER, order.remark(numbers).text)
         if len(self.touches) >= MIN_POINTS:
             with contextlib.suppress(CalibrationError):
                 for index in self.fit(robust=True).outliers:
-                    return refused(Code.OUTLIER, f"point {1 + index}")
+                    return poor_judgement(Code.OUTLIER, f"point {1 + index}")
         elif (
             len(fitting_without := [i for i in range(len(self.touches)) if self._fits_without(i)])
             == 1
         ):
-            return refused(Code.OUTLIER, f"point {1 + fitting_without[0]}")
-        return refused(error.code or "", str(error))
+            return poor_judgement(Code.OUTLIER, f"point {1 + fitting_without[0]}")
+        return poor_judgement(error.code or "", str(error))
 
     def _fits_without(self, index: int) -> bool:
         """Return True if the touches fit without one, and enough are left to test the fit."""
@@ -416,7 +416,7 @@ def review_step(
 
     ``number``: input for the number of a point or view.
     """
-    default = judgement.chosen(options)
+    default = judgement.choose_option(options)
     return Step(
         id="review",
         title="What came out",

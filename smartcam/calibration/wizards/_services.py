@@ -14,11 +14,11 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration._files.directory import EXPORTS, Folder
-from smartcam.calibration._files.load import of_document
+from smartcam.calibration._files.load import calibration_from_document
 from smartcam.calibration._files.store import keep_backup, read_document, replace_file
 from smartcam.calibration._plane.calibration import KIND, PlaneCalibration
 from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._listing import listing
+from smartcam.calibration.wizards._listing import list_calibrations
 from smartcam.calibration.wizards._sequence import WizardSession
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
@@ -79,7 +79,7 @@ class CalibrationService:
         and ``problem``; values that are not known are None. A file that cannot be read has a
         ``problem``.
         """
-        return listing(self.folder)
+        return list_calibrations(self.folder)
 
     @property
     def wizards(self) -> list[str]:
@@ -219,7 +219,7 @@ class CalibrationService:
             OSError: the file cannot be read.
         """
         path = self.folder.find(name_or_path)
-        self._calibration = of_document(read_document(path), path.name)
+        self._calibration = calibration_from_document(read_document(path), path.name)
         return self._calibration
 
     def transform(self, x: float, y: float, theta: float = 0.0, frame: str | None = None) -> Pose:

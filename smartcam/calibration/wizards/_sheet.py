@@ -20,7 +20,7 @@ import numpy as np
 
 from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._sheet.calibration import KIND, calibrate_sheet, fit_corners
-from smartcam.calibration._sheet.plane import look_at_sheet
+from smartcam.calibration._sheet.plane import fit_sheet_view
 from smartcam.calibration._targets import Charuco
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.wizards._marks import Mark
@@ -334,7 +334,7 @@ class _SheetSource(PointSource):
 def _find_sheet(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
     """Find the sheet in a picture; return the view, the lens and a small SVG as JSON data."""
     view = find_target(image, target)
-    preview = draw_sheet(image, view, look_at_sheet(view, lens).plane)
+    preview = draw_sheet(image, view, fit_sheet_view(view, lens).plane)
     return {
         "view": view.to_data(),
         "camera": None if lens is None else lens.to_data(),

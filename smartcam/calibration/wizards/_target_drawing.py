@@ -103,7 +103,7 @@ def draw_preview(
     counts = cell_counts([*earlier, view] if view is not None else earlier)
     lines = [
         f'<image x="{BORDER:.0f}" y="{HEAD_HEIGHT:.0f}" width="{PICTURE_WIDTH:.0f}" height="'
-        f'{canvas.height:.2f}" href="data:image/png;base64,{_encode_png(grey.bytes)}"/>',
+        f'{canvas.height:.2f}" href="data:image/png;base64,{_encode_png(grey.uint8_levels)}"/>',
         *canvas.draw_covered_cells(counts),
     ]
     summary = f"{len(view.ids)} of {len(view.target.points)} points" if view else "no target found"

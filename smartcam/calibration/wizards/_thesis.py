@@ -220,7 +220,7 @@ class ThesisCalibration:
     Args:
         folder: folder of calibrations and journals; nothing is written outside of it.
         name: name of the camera.
-        abandoned: seconds without a call after which a running calibration is abandoned.
+        abandon_timeout: seconds without a call after which a running calibration is abandoned.
 
     Attributes:
         graph: topics and frames of ROS; None: the camera is not in ROS.
@@ -230,10 +230,10 @@ class ThesisCalibration:
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str], name: str, *, abandoned: float = ABANDONED_AFTER
+        self, folder: str | os.PathLike[str], name: str, *, abandon_timeout: float = ABANDONED_AFTER
     ) -> None:
         self._files = CalibrationService(Folder(folder))
-        self._name, self._abandon_timeout = name, abandoned
+        self._name, self._abandon_timeout = name, abandon_timeout
         self.graph: RobotGraph | None = None
         self._sequence: _Sequence | None = None
         self._loaded: AnyCalibration | None = None

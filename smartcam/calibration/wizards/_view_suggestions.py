@@ -37,7 +37,7 @@ class Look(NamedTuple):
     place: tuple[float, float] = (0.5, 0.5)  # centre, as shares of the image's width and height
 
 
-LOOKS: Final = (
+STANDARD_VIEWS: Final = (
     Look("straight from the front, the sheet in the middle of the image"),
     Look("tilted by 30 degrees about one side of the sheet", tilt=30),
     Look("tilted by 30 degrees to the opposite side", tilt=-30),
@@ -70,14 +70,14 @@ class Suggestion(NamedTuple):
     gain: str = ""  # benefit of the view, for people; empty if it is not known
 
 
-def suggestion(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
+def suggest_view(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
     """Return the next view to take after views (one or more) of one target.
 
     ``lens_known``: whether the lens is known already, so that the views need not determine it.
     """
     next_view = None if lens_known else _most_helpful_view(views)
     if next_view is None:
-        look = LOOKS[len(views) % len(LOOKS)]
+        look = STANDARD_VIEWS[len(views) % len(STANDARD_VIEWS)]
         return Suggestion(look.text, outline(look, views[0].target, views[0].size))
     return Suggestion(
         f"with the sheet {next_view.text}",

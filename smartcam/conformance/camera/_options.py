@@ -116,7 +116,7 @@ class ConformanceOptions:
         check_kind(self.allow, Allow, "allow", "flags of Allow")
         for name in ("timeout", "quiet", "switch_timeout", "reboot_timeout"):
             seconds = check_number(
-                getattr(self, name), name, 0, MAX_SECONDS, above=True, unit="seconds"
+                getattr(self, name), name, 0, MAX_SECONDS, exclusive=True, unit="seconds"
             )
             object.__setattr__(self, name, seconds)
         for name, least, most in (

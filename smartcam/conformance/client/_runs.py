@@ -128,7 +128,7 @@ async def run_scene(
     """
     check_kind(client, Client, "client", "a client", "run_scene")
     check_kind(scene, Scene, "scene", "a Scene", "run_scene")
-    timeout = check_seconds(timeout, "timeout", "run_scene", above=True)
+    timeout = check_seconds(timeout, "timeout", "run_scene", exclusive=True)
     async with EmulatedCamera(
         APPLICATIONS,
         builtins=False,

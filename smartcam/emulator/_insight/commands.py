@@ -198,11 +198,13 @@ class InSightCommands:
 
     def _read_image(self, _argument: str, respond: Respond) -> None:
         device = self._device
-        if device.sight is None:
+        if device.get_last_image is None:
             self._send_image(coded_image(device.image), respond)
             return
         # a sensor's image is large: it is written in a thread
-        writing_future = asyncio.get_running_loop().run_in_executor(None, _last_image, device.sight)
+        writing_future = asyncio.get_running_loop().run_in_executor(
+            None, _last_image, device.get_last_image
+        )
 
         def on_written(future: asyncio.Future[CodedImage | None]) -> None:
             if not future.cancelled():

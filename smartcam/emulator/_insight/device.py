@@ -88,7 +88,7 @@ class InSightDevice:
         # context around an operator's actions; the emulator sets one that sends messages at its end
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
         # function that returns the image of the last run, if an inspector takes the pictures
-        self.sight: Callable[[], Any] | None = None
+        self.get_last_image: Callable[[], Any] | None = None
         self.runs: int = 0  # number of acquisitions with a result since the device was created
         self._image: NDArray[np.uint8] = grey_pattern() if image is None else check_image(image)
         self._now = 0

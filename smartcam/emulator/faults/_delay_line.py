@@ -41,7 +41,7 @@ class Transmission:
     # number of later parts to wait for, and the longest wait in seconds
     gather: tuple[int, float] | None = None
     # without an order: whether the transmission is sent after those parts, not with them
-    behind: bool = False
+    after_gathered: bool = False
     end: Ending | None = None  # event of the connection after it
     faults: list[str] = field(
         default_factory=list[str]
@@ -108,7 +108,7 @@ class DelayLine(Generic[T]):
     # gets passing transmissions and the bytes of each, for one write; it may stop() the line
     carry: Callable[[list[tuple[T, bytes]]], None]
     end: Callable[[Ending], None]  # ends the connection after a transmission
-    lost: Callable[[T], None]  # called with each transmission that was dropped by close()
+    on_dropped: Callable[[T], None]  # called with each transmission that was dropped by close()
     turns: int = 0  # turns of the event loop that a pause of no time takes
 
     def __post_init__(self) -> None:
@@ -169,7 +169,7 @@ class DelayLine(Generic[T]):
         self._unordered.clear()
         for waiting in dropped:
             for transmission in (waiting.sent, *waiting.gathered):
-                self.lost(transmission)
+                self.on_dropped(transmission)
 
     @property
     def _now(self) -> int:
@@ -180,16 +180,18 @@ class DelayLine(Generic[T]):
         waiting = [entry for entry in (*self._queue, *self._unordered) if entry.missing_count > 0]
         for entry in waiting:
             entry.missing_count -= amount
-            if entry.sent.behind and entry.missing_count <= 0:
+            if entry.sent.after_gathered and entry.missing_count <= 0:
                 entry.due_at = max(entry.due_at, now)
-        gatherers = [entry for entry in waiting if not self.ordered and not entry.sent.behind]
+        gatherers = [
+            entry for entry in waiting if not self.ordered and not entry.sent.after_gathered
+        ]
         return gatherers[0] if gatherers else None
 
     def _send_unordered(self) -> None:
         """Send transmissions that may be overtaken, and all without an order."""
         now = self._now
         due_at = [entry for entry in self._unordered if entry.send_at <= now]
-        for entry in sorted(due_at, key=lambda entry: (entry.send_at, entry.sent.behind)):
+        for entry in sorted(due_at, key=lambda entry: (entry.send_at, entry.sent.after_gathered)):
             if entry not in self._unordered:  # closed meanwhile
                 return
             if self.ordered:
@@ -201,7 +203,7 @@ class DelayLine(Generic[T]):
     def _send_datagrams(self, entry: _WaitingTransmission[T]) -> None:
         """Send the due parts, one datagram each; joined parts are one datagram."""
         sent = entry.sent
-        if sent.gather is not None and not sent.behind:
+        if sent.gather is not None and not sent.after_gathered:
             self._unordered.remove(entry)
             gatherers = [sent, *entry.gathered]
             self._carry_batch([self._take_next(each, whole=True) for each in gatherers])

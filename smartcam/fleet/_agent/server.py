@@ -423,7 +423,7 @@ class FleetServer(Server):
             lambda result, judged: observers.picture(result, judged.marked_frame),
             max_kept=0,
         )
-        device.inspector.viewers.add(reporter.take)
+        device.inspector.viewers.add(reporter.record_picture)
         return device, FrameSupply(make, masked(camera.frames), reporter)
 
     async def _emulate(self, planned: PlannedCamera, stack: contextlib.AsyncExitStack) -> str:

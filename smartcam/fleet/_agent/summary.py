@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._bus.bus import always
-from smartcam.fleet._bus.keys import meets
+from smartcam.fleet._bus.keys import patterns_overlap
 from smartcam.fleet._json.topics import as_json
 from smartcam.fleet._program.program_name import in_words
 from smartcam.models import Status
@@ -102,7 +102,9 @@ class Summaries:
         """Answer in parts, so that a thousand cameras do not block the event loop."""
         key = self._keys.summary(self._agent.name)
         try:
-            hosts = [host for host in self._agent.hosts.values() if meets(pattern, host.name)]
+            hosts = [
+                host for host in self._agent.hosts.values() if patterns_overlap(pattern, host.name)
+            ]
             for begin in range(0, len(hosts), CAMERAS_PER_TURN):
                 cameras = [_summary_row(host) for host in hosts[begin : begin + CAMERAS_PER_TURN]]
                 summary = {

@@ -15,7 +15,7 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
-from smartcam.fleet._bus.keys import meets
+from smartcam.fleet._bus.keys import patterns_overlap
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -254,8 +254,8 @@ class _PatternTable(Generic[P]):
     def matching(self, pattern: str) -> list[P]:
         """Return the entries whose patterns overlap with a pattern or a key."""
         if "*" in pattern:
-            return [entry for entry in self if meets(entry.pattern, pattern)]
-        wild = [entry for entry in self._wildcards if meets(entry.pattern, pattern)]
+            return [entry for entry in self if patterns_overlap(entry.pattern, pattern)]
+        wild = [entry for entry in self._wildcards if patterns_overlap(entry.pattern, pattern)]
         return [*self._exact_keys.get(pattern, ()), *wild]
 
 

@@ -43,7 +43,7 @@ RESERVED_COMMANDS = COMMANDS - {"release", "leave"}
 
 
 @lru_cache(maxsize=4096)
-def meets(one: str, other: str) -> bool:
+def patterns_overlap(one: str, other: str) -> bool:
     """Return True if some key matches both patterns: ``*`` is one chunk, ``**`` any number."""
     return _patterns_overlap(tuple(one.split("/")), tuple(other.split("/")))
 

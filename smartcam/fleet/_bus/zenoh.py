@@ -168,8 +168,8 @@ class ZenohEnd(ZenohSession, Bus):
         """
         folder, loop = Path(self._link.certificates or ""), asyncio.get_running_loop()
         identity = await loop.run_in_executor(None, read_identity, folder)
-        if identity.expired:
-            raise self._connect_error(identity.expired)
+        if identity.expired_text:
+            raise self._connect_error(identity.expired_text)
         warning = identity.digest, identity.urgency
         if identity.urgency and warning != self._warned:
             logger.warning("%s ! %s", self._link.place, identity.warning)
@@ -284,10 +284,12 @@ class ZenohEnd(ZenohSession, Bus):
             data = sample.payload.to_bytes()
             if head is not None and not self.full(len(data)):
                 part_head, key = head.to_bytes(), str(sample.key_expr)
-                self.in_loop(declared.call, len(data), on_part, key, part_head, data)
+                self.call_in_loop(declared.call, len(data), on_part, key, part_head, data)
 
         declared = _OnBus(self)
-        return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
+        return declared.declare(
+            lambda session: session.declare_subscriber(pattern, direct(on_sample))
+        )
 
     def _send_in_thread(
         self,
@@ -353,7 +355,7 @@ class ZenohEnd(ZenohSession, Bus):
     def subscribe(
         self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        in_loop = self.in_loop_patiently if patient else self.in_loop
+        in_loop = self.call_in_loop_patiently if patient else self.call_in_loop
         full = functools.partial(self.full, patient=True) if patient else self.full
 
         key = None if "*" in pattern else pattern  # faster than the engine's text of the key
@@ -365,7 +367,9 @@ class ZenohEnd(ZenohSession, Bus):
                 in_loop(declared.call, len(payload), on_message, key_text, payload)
 
         declared = _OnBus(self)
-        return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
+        return declared.declare(
+            lambda session: session.declare_subscriber(pattern, direct(on_sample))
+        )
 
     def answer(
         self,
@@ -380,11 +384,11 @@ class ZenohEnd(ZenohSession, Bus):
             if self.full(size, patient=is_patient):
                 quietly(query.drop)
                 return
-            in_loop = self.in_loop_patiently if is_patient else self.in_loop
+            in_loop = self.call_in_loop_patiently if is_patient else self.call_in_loop
             in_loop(declared.call, size, answer, question)
 
         declared = _OnBus(self)
-        return declared.of(
+        return declared.declare(
             lambda session: session.declare_queryable(pattern, direct(on_query), complete=False)
         )
 
@@ -420,11 +424,11 @@ class ZenohEnd(ZenohSession, Bus):
         def on_reply(reply: Any) -> None:
             if reply.ok is not None:
                 payload = reply.ok.payload.to_bytes()
-                self.in_loop(add, len(payload), str(reply.ok.key_expr), payload)
+                self.call_in_loop(add, len(payload), str(reply.ok.key_expr), payload)
 
         if session is None:
             return answers
-        on_end = functools.partial(self.in_loop, end, 0)
+        on_end = functools.partial(self.call_in_loop, end, 0)
         ask(session, direct(on_reply, on_end))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
@@ -434,7 +438,7 @@ class ZenohEnd(ZenohSession, Bus):
     # ------------------------------------------------------------------ presence
 
     def be_present(self, key: str) -> Handle:
-        return _OnBus(self).of(lambda session: session.liveliness().declare_token(key))
+        return _OnBus(self).declare(lambda session: session.liveliness().declare_token(key))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
         answers = await self._answers(
@@ -459,10 +463,12 @@ class ZenohEnd(ZenohSession, Bus):
                 note_presence(key, False)
 
         def on_sample(sample: Any) -> None:
-            self.in_loop(declared.call, 0, note_presence, str(sample.key_expr), sample.kind == put)
+            self.call_in_loop(
+                declared.call, 0, note_presence, str(sample.key_expr), sample.kind == put
+            )
 
         declared = _OnBus(self).when_lost(on_session_lost)
-        return declared.of(
+        return declared.declare(
             lambda session: session.liveliness().declare_subscriber(
                 pattern, direct(on_sample), history=True
             )
@@ -522,7 +528,7 @@ class _FrequentKey(_OnBus):
         self.used_at = now
         if not self._is_declared:
             self._is_declared = True
-            self.of(lambda session: session.declare_publisher(self._key, **self._options))
+            self.declare(lambda session: session.declare_publisher(self._key, **self._options))
         return self._declaration
 
 
@@ -549,18 +555,20 @@ class _ZenohPublisher(Publisher):
             )
 
         def on_matching(status: Any) -> None:
-            end.later(self._declared.call, self._on_subscribers, status.matching)
+            end.call_in_loop_uncounted(self._declared.call, self._on_subscribers, status.matching)
 
         self._declared = _OnBus(end)
         self._publisher: Any = None
-        self._declared.of(lambda session: self._declare(declare(session), on_matching))
+        self._declared.declare(lambda session: self._declare(declare(session), on_matching))
 
     def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
         is_new_session, self._publisher = self._publisher is not None, publisher
         publisher.declare_matching_listener(direct(on_matching))
         has_subscribers = bool(publisher.matching_status.matching)
         if is_new_session:
-            self._end.later(self._declared.call, self._on_subscribers, has_subscribers)
+            self._end.call_in_loop_uncounted(
+                self._declared.call, self._on_subscribers, has_subscribers
+            )
         else:
             self.has_subscribers = has_subscribers
         return publisher

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from smartcam._file_values import Age, Patterns, Size, chosen
+from smartcam._file_values import Age, Patterns, Size, matches_any
 from smartcam.fleet._file.ros import Fields
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class RecordSection(Fields):
 
     def chooses(self, camera: str) -> bool:
         """Return True if a camera of this name is recorded."""
-        return chosen(self.cameras, camera)
+        return matches_any(self.cameras, camera)
 
     def path(self, folder: Path) -> Path:
         """Return the folder of the files.

@@ -63,7 +63,7 @@ class VideoReceiver:
                 continue
             try:
                 if number != self.last_number + 1:
-                    self._decoder.lost()
+                    self._decoder.note_loss()
                 picture = await self._decoder.decode(frame)
             except FrameFormatError as exc:
                 logger.warning("%s", exc)

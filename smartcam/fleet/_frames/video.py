@@ -159,7 +159,7 @@ class SharedVideo:
 
         loop = asyncio.get_running_loop()
         if self._needs_key_frame and loop.time() - self._last_key_at >= MIN_KEY_INTERVAL:
-            self._encoder.begin_anew()
+            self._encoder.request_key_frame()
         started_at = time.perf_counter()
         encoded = await self._encoder.encode(frame)
         encoding_time = time.perf_counter() - started_at

@@ -14,7 +14,7 @@ from smartcam._thesis_calibration import (
     CALIBRATION,
     CalibrationCall,
     checked_localizations,
-    own_localizations,
+    localization_spec,
 )
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import UnsupportedError
@@ -52,7 +52,7 @@ class JsonCalibrationCamera:
         self.y_down: bool = work.host.settings.y_down
         self.unit: str
         active = self._host.camera.active_application
-        self._spec, self.unit = own_localizations(self._topics.interpretation, active)
+        self._spec, self.unit = localization_spec(self._topics.interpretation, active)
 
     async def localize(self) -> list[Localization]:
         """Trigger; return the localizations in the camera's own frame."""
@@ -98,7 +98,7 @@ class JsonCalibrationCamera:
         return self._work._replace(timeout=min(self._work.timeout, seconds))
 
 
-class JsonCalibrationFace:
+class JsonCalibrationHost:
     """An agent's camera as the five calibration services use it.
 
     Args:
@@ -128,7 +128,7 @@ def _bus_service(name: str) -> Service:
     )
 
     async def carry_out(work: Work) -> dict[str, Any]:
-        call = CalibrationCall(JsonCalibrationFace(work), work.request, work.timeout)
+        call = CalibrationCall(JsonCalibrationHost(work), work.request, work.timeout)
         fields = {key: plain(value) for key, value in (await wizard_service.do(call)).items()}
         return {**fields, "kind": "CalibrationError"} if fields.get("error") else fields
 

@@ -29,7 +29,7 @@ from smartcam.fleet._agent.shared import Owner
 from smartcam.fleet._bus.address import check_name
 from smartcam.fleet._bus.bus import always
 from smartcam.fleet._bus.errors import late_call_error
-from smartcam.fleet._bus.keys import meets
+from smartcam.fleet._bus.keys import patterns_overlap
 from smartcam.fleet._json.calibrations import CALIBRATIONS
 from smartcam.fleet._json.services import SERVICES, UNKNOWN, PlainRequest, Service, Work
 from smartcam.fleet._json.thesis import SETUP, STOP, new_camera
@@ -229,7 +229,7 @@ class PlainServices:
     def _on_listing(self, question: BusQuestion) -> None:
         for name, host in self._agent.hosts.items():
             key = self._keys.listing(name)
-            if meets(question.key, key):
+            if patterns_overlap(question.key, key):
                 question.reply(key, as_json(host.topics.listing()))
         question.close()
 

@@ -62,7 +62,7 @@ def new_camera(request: SetupRequest) -> CameraSettings:
     return CameraSettings.of(request.address(), options)
 
 
-class JsonThesisFace:
+class JsonThesisCamera:
     """An agent's camera as the thesis' services use it.
 
     Args:
@@ -167,11 +167,11 @@ def _bus_service(name: str) -> Service:
 
     async def carry_out(work: Work) -> dict[str, Any]:
         return await thesis_service.answer(
-            ThesisCall(JsonThesisFace(work), work.request, work.timeout)
+            ThesisCall(JsonThesisCamera(work), work.request, work.timeout)
         )
 
     empty_fields: dict[str, Any] = (
-        {} if thesis_service.nothing is None else {thesis_service.nothing: []}
+        {} if thesis_service.empty_field is None else {thesis_service.empty_field: []}
     )
     is_command = name != "EnablePublishing"
     return Service(

@@ -210,9 +210,9 @@ class Caller:
             raise self.final_error.with_traceback(None)
         if self.no_agent_error is not None:
             identity = self.program.bus.identity
-            if identity is not None and identity.expired:
+            if identity is not None and identity.expired_text:
                 raise ConnectionLostError(
-                    f"{self.no_agent_error}; {identity.expired}"
+                    f"{self.no_agent_error}; {identity.expired_text}"
                 ) from self.no_agent_error
             raise self.no_agent_error.with_traceback(None)
         if self._task is not None:

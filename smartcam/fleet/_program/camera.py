@@ -185,7 +185,7 @@ class FleetCamera(Camera[ValueT]):
                     lenient=settings.lenient,
                     y_down=y_down,
                     calibration=settings.calibration,
-                    own=own,
+                    strict_calibration=own,
                 )
             except ConfigurationError as exc:
                 refused = refused or exc
@@ -296,7 +296,7 @@ class FleetCamera(Camera[ValueT]):
         if self._has_session:
             self._has_session = False
             self._publish_end("closed by this side" if wanted else str(error), expected=wanted)
-        self._counters.end()
+        self._counters.end_session()
         self._fail(error)
         self._listeners.end(None if wanted else error)
 
@@ -541,7 +541,7 @@ class FleetCamera(Camera[ValueT]):
         self._has_session, self._no_session_error = True, None
         self._caller.has_session = True
         self._agent_facts |= state.get("about", {})
-        self._counters.begin(self._wire if not self._sessions else Counters())
+        self._counters.begin_session(self._wire if not self._sessions else Counters())
         self._sessions += 1
         event = Connected if self._sessions == 1 else Reconnected
         self._listeners.publish(event(camera=self.name, at=at, url=self.url))
@@ -571,7 +571,7 @@ class FleetCamera(Camera[ValueT]):
         return self.settings.address.url
 
     @property
-    def _place(self) -> Address:
+    def _camera_address(self) -> Address:
         url = self._agent_facts.get("url")
         return self.settings.address if url is None else parse_address(url)
 

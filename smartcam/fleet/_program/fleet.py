@@ -38,7 +38,7 @@ from smartcam.fleet._agent.outlet_service import (
 from smartcam.fleet._agent.reload_service import reload_agents
 from smartcam.fleet._agent.summary import ask_cameras, best_by_name
 from smartcam.fleet._bus.address import FleetAddress, check_name, check_pattern
-from smartcam.fleet._bus.keys import meets
+from smartcam.fleet._bus.keys import patterns_overlap
 from smartcam.fleet._program.camera import FleetCamera
 from smartcam.fleet._program.exchange import Exchange
 from smartcam.fleet._program.program import Program
@@ -391,7 +391,7 @@ class Fleet:
         """
         pattern = check_pattern(pattern)
         shared = (name for name, agents in self._agents.items() if agents)
-        return sorted(name for name in shared if meets(pattern, name))
+        return sorted(name for name in shared if patterns_overlap(pattern, name))
 
     def url_of(self, name: str) -> str:
         """Return the URL of a single camera, for :func:`smartcam.connect`.
@@ -416,7 +416,9 @@ class Fleet:
             ConfigurationError: the pattern is not valid.
         """
         pattern = check_pattern(pattern)
-        sharing = (agents for name, agents in self._agents.items() if meets(pattern, name))
+        sharing = (
+            agents for name, agents in self._agents.items() if patterns_overlap(pattern, name)
+        )
         return sorted({agent for agents in sharing for agent in agents})
 
     def __getitem__(self, name: str) -> FleetCamera[Any]:
@@ -780,7 +782,10 @@ class Fleet:
         results = FleetResults[Any](subscribe)
         self._results = [entry for entry in self._results if entry[1]() is not None]
         self._results.append((pattern, weakref.ref(results)))
-        names = {*self.names(pattern), *(name for name in self._cameras if meets(pattern, name))}
+        names = {
+            *self.names(pattern),
+            *(name for name in self._cameras if patterns_overlap(pattern, name)),
+        }
         if len(names) > MAX_CAMERAS_SUBSCRIBED and 2 * len(names) > len(self):
             self._exchange.subscribe_all("results")
         for name in names:
@@ -791,5 +796,7 @@ class Fleet:
 
     def _matching_results(self, name: str) -> list[FleetResults[Any]]:
         """Return the streams of results whose pattern can match this name or pattern."""
-        streams = [results() for pattern, results in self._results if meets(pattern, name)]
+        streams = [
+            results() for pattern, results in self._results if patterns_overlap(pattern, name)
+        ]
         return [stream for stream in streams if stream is not None]

@@ -206,7 +206,7 @@ class Program:
 
         Without a reply by ``deadline`` (loop time) the future raises :exc:`TimeoutError`.
         """
-        reply = self._bell.outcome()
+        reply = self._bell.make_outcome()
         self._pending_calls[number] = new_tuple(Pending, (camera, reply, deadline))
         if deadline < self._timer_at:
             self._timer_at = deadline
@@ -258,4 +258,4 @@ class Program:
         if pending.camera.streams_results:
             pending.reply.set_result(message)
         else:
-            self._bell.give(pending.reply, message)
+            self._bell.set_outcome(pending.reply, message)

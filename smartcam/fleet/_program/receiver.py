@@ -501,7 +501,7 @@ class Receiver:
                 range(run.number, run.next), run.payloads, values, strict=True
             )
         ]
-        self._counters.skip(empty_slots)
+        self._counters.add_empty_slots(empty_slots)
         self._counters.count("streamed", count)
         self._listeners.offer_burst(results, now, run.size)
         return True
@@ -510,7 +510,7 @@ class Receiver:
         at = run.received_at
         value, sequence, empty_slots = interpret_run(run, interpretation, self._name, at)
         if empty_slots:
-            self._counters.skip(empty_slots)
+            self._counters.add_empty_slots(empty_slots)
         return to_result(run, self._name, value, sequence, at)
 
     def _wrong_application_error(self, run: ResultRun, expected: int) -> WrongApplicationError:

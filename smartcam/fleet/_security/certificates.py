@@ -85,7 +85,7 @@ class Identity(NamedTuple):
         return f"{self.role} {self.name}".strip()
 
     @property
-    def expired(self) -> str:
+    def expired_text(self) -> str:
         """Text which says that a certificate has expired; empty if none has."""
         now = datetime.now(UTC)
         for certificate, ends in self._certificate_ends:
@@ -96,7 +96,9 @@ class Identity(NamedTuple):
     @property
     def warning(self) -> str:
         """Text which says that a certificate ends soon, or has expired; empty otherwise."""
-        return self.expired or ends_soon(*min(self._certificate_ends, key=lambda ending: ending[1]))
+        return self.expired_text or expiry_warning(
+            *min(self._certificate_ends, key=lambda ending: ending[1])
+        )
 
     @property
     def urgency(self) -> int:
@@ -124,7 +126,7 @@ class Identity(NamedTuple):
         return (own_text, self.ends), (authority_text, self.authority_ends)
 
 
-def ends_soon(certificate: str, ends: datetime | None) -> str:
+def expiry_warning(certificate: str, ends: datetime | None) -> str:
     """Return a text which says that a certificate ends soon; empty if it does not."""
     if ends is None or (remaining := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
         return ""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, TypeVar
 from smartcam._arguments import check_integer, check_number
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
-from smartcam.frames._codecs.pictures import decoded
-from smartcam.frames._frame import changed
+from smartcam.frames._codecs.pictures import decode_frame
+from smartcam.frames._frame import copy_with
 from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._video.frames import from_video, reformatted, to_video
 
@@ -81,7 +81,7 @@ class H264Encoder:
         self._restarts = 0  # how often the stream was to begin with a new key frame
         self._count = 0
 
-    def begin_anew(self) -> None:
+    def request_key_frame(self) -> None:
         """Make the next frame a key frame, for a viewer that joins or has lost data."""
         self._restarts += 1
 
@@ -98,13 +98,13 @@ class H264Encoder:
             try:
                 return await self._run(partial(self._encode, frame, self._restarts))
             except BaseException:
-                self.begin_anew()
+                self.request_key_frame()
                 raise
 
     def _encode(self, frame: Frame, restarts: int) -> Frame:
         with self._codec_lock:
             if frame.format.name == "MJPEG":
-                frame = decoded(frame, "RGB8")
+                frame = decode_frame(frame, "RGB8")
             video = to_video(frame, self._grey)
             self._grey = video if frame.format.name == "Mono8" else None
             stream_key = (
@@ -122,7 +122,7 @@ class H264Encoder:
             self._count += 1
             packets = self._codec.encode(video)
             data = bytes(packets[0]) if len(packets) == 1 else b"".join(map(bytes, packets))
-            return changed(frame, data=data, format=find_format("H264"), stride=0)
+            return copy_with(frame, data=data, format=find_format("H264"), stride=0)
 
     def _new_codec(self, video: Any) -> Any:
         codec = load("av").CodecContext.create("libx264", "w")
@@ -142,8 +142,8 @@ class H264Decoder:
     It returns only whole pictures. The first one follows a key frame, or the end of a refresh that
     began after the decoder had decoded something: FFmpeg may take a refresh for complete although
     its first frame had no reference. In the middle of a stream the first picture takes up to three
-    times the encoder's ``keyint``, after a loss two times, and after :meth:`H264Encoder.begin_anew`
-    no time.
+    times the encoder's ``keyint``, after a loss two times, and after
+    :meth:`H264Encoder.request_key_frame` no time.
 
     Args:
         run: function that runs the work.
@@ -176,7 +176,7 @@ class H264Decoder:
         """True if the decoder has decoded a whole picture since its start or the last loss."""
         return self._frames_until_whole == 0 and self._losses == self._losses_seen
 
-    def lost(self) -> None:
+    def note_loss(self) -> None:
         """Tell the decoder that bytes were lost: it returns no picture until one is whole again.
 
         A decoder cannot detect lost bytes, and would return broken pictures.
@@ -203,7 +203,7 @@ class H264Decoder:
             try:
                 return await self._run(partial(self._decode, frame, self._losses))
             except BaseException:
-                self.lost()
+                self.note_loss()
                 raise
 
     def _decode(self, frame: Frame, losses: int) -> Frame | None:
@@ -269,7 +269,7 @@ class H264Decoder:
         pixels = from_video(picture, keep_planes=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise self._damaged_error(frame, f"a picture of {pixels.width}x{pixels.height}")
-        return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
+        return copy_with(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
 
     def _damaged_error(self, frame: Frame, actual: str) -> FrameFormatError:
         return FrameFormatError(

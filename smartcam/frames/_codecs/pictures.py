@@ -42,7 +42,7 @@ def _with_bytes(frame: Frame, data: bytes, name: str) -> Frame:
     return replace(frame, data=data, format=find_format(name), stride=0)
 
 
-def converted(frame: Frame, name: str) -> Frame:
+def convert_frame(frame: Frame, name: str) -> Frame:
     """Return the frame in grey or in colours: ``Mono8``, ``Mono16``, ``RGB8`` or ``RGB16``."""
     pixels = frame.rgb() if name.startswith("RGB") else frame.grey()
     wanted = find_format(name)
@@ -155,7 +155,7 @@ def _no_conversion_error(frame: Frame, to: str, instead: str) -> FrameFormatErro
 # decoding
 
 
-def decoded(frame: Frame, name: str) -> Frame:
+def decode_frame(frame: Frame, name: str) -> Frame:
     """Decode a JPEG, PNG or JPEG XL to pixels of a format; "": the format of its contents."""
     if frame.format.name not in _DECODERS:
         readable = ", ".join(_DECODERS)

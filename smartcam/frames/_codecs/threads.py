@@ -155,7 +155,7 @@ class Codecs:
             MissingExtraError: the extra ``frames`` is not installed.
         """
         return await self._run(
-            partial(_pictures.decoded, _checked(frame), check_text(format, "format", "frame"))
+            partial(_pictures.decode_frame, _checked(frame), check_text(format, "format", "frame"))
         )
 
     async def converted(
@@ -171,7 +171,7 @@ class Codecs:
             MissingExtraError: the decoder of its format is not installed.
         """
         return await self._run(
-            partial(_pictures.converted, _checked(frame), check_text(format, "format", "frame"))
+            partial(_pictures.convert_frame, _checked(frame), check_text(format, "format", "frame"))
         )
 
     def h264_encoder(

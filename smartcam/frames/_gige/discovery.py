@@ -89,7 +89,7 @@ def networks() -> list[Network]:
     return found
 
 
-async def find(
+async def find_cameras(
     interfaces: Iterable[Network], *, port: int = PORT, wait: float = ANSWER_WAIT
 ) -> list[AnsweringCamera]:
     """Search for cameras.

@@ -20,11 +20,11 @@ from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._gige.assembler import Assembler
 from smartcam.frames._gige.control import RequestRefusedError
 from smartcam.frames._gige.device_features import GigEFeatures
-from smartcam.frames._gige.discovery import find, networks
+from smartcam.frames._gige.discovery import find_cameras, networks
 from smartcam.frames._gige.gvcp import GvcpStatus, Register
 from smartcam.frames._gige.gvsp import IP_UDP_BYTES, ImpliedPicture, PayloadType
 from smartcam.frames._gige.messages import doubt_about_size
-from smartcam.frames._gige.places import as_source, place, wanted
+from smartcam.frames._gige.places import as_source, find_camera, read_wanted_stream
 from smartcam.frames._gige.session import GigESession
 from smartcam.frames._gige.setup import (
     MAX_NUMBER,
@@ -98,7 +98,7 @@ class GigEDriver(FrameDriver):
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        self._options = wanted(address)
+        self._options = read_wanted_stream(address)
         self._session: GigESession | None = None
         self._shape: StreamShape | None = None
         self._stream: Stream | None = None
@@ -123,7 +123,7 @@ class GigEDriver(FrameDriver):
     @classmethod
     async def discover(cls) -> list[FoundSource]:
         """Return the cameras that answer on this machine's networks, within half a second."""
-        return [as_source(camera) for camera in await find(networks())]
+        return [as_source(camera) for camera in await find_cameras(networks())]
 
     @property
     def name(self) -> str:
@@ -145,7 +145,7 @@ class GigEDriver(FrameDriver):
             if self._session is not None and self._session.lost is not None:
                 await self._close_session()
             if self._session is None or self._shape is None:
-                host, port = await place(self.address, self._options)
+                host, port = await find_camera(self.address, self._options)
                 session = await GigESession.open(host, port, self.address.shown)
                 try:
                     self._shape = await set_up(session, self._options)

@@ -23,7 +23,7 @@ from smartcam.exceptions import (
     FrameTimeoutError,
     MessageError,
 )
-from smartcam.frames._gige.discovery import find, networks
+from smartcam.frames._gige.discovery import find_cameras, networks
 from smartcam.frames._gige.gvcp import (
     ACK_REQUIRED,
     PORT,
@@ -80,7 +80,7 @@ async def force_address(
     interface = _interface(address)
     gateway_address = _ip(gateway, "gateway")
     interfaces = networks() if places is None else places
-    cameras = await find(interfaces, port=port)
+    cameras = await find_cameras(interfaces, port=port)
     camera = _camera_with_mac(cameras, checked)
     holders = [other for other in cameras if other.info.address == str(interface.ip)]
     if holders and holders[0].info.mac != checked:
@@ -201,7 +201,7 @@ async def _wait_for_camera(
     loop = asyncio.get_running_loop()
     end = loop.time() + APPEAR_TIMEOUT
     while True:
-        for camera in await find(interfaces, port=port):
+        for camera in await find_cameras(interfaces, port=port):
             if camera.info.mac == mac and camera.info.address == address:
                 return as_source(camera._replace(address=address))
         if loop.time() >= end:

@@ -7,7 +7,7 @@ from urllib.parse import parse_qsl
 
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames._driver import FoundSource
-from smartcam.frames._gige.discovery import find, networks
+from smartcam.frames._gige.discovery import find_cameras, networks
 from smartcam.frames._gige.gvcp import PORT
 from smartcam.frames._gige.setup import FEATURE_PREFIX, PACKET_SIZES, WantedStream
 
@@ -27,7 +27,7 @@ _PARAMETERS: Final = (
 )
 
 
-def wanted(address: FrameAddress) -> WantedStream:
+def read_wanted_stream(address: FrameAddress) -> WantedStream:
     """Read a URL's parameters.
 
     Raises:
@@ -59,7 +59,7 @@ def wanted(address: FrameAddress) -> WantedStream:
     )
 
 
-async def place(address: FrameAddress, stream: WantedStream) -> tuple[str, int]:
+async def find_camera(address: FrameAddress, stream: WantedStream) -> tuple[str, int]:
     """Return the address and the port of a camera.
 
     Raises:
@@ -68,7 +68,7 @@ async def place(address: FrameAddress, stream: WantedStream) -> tuple[str, int]:
     if address.host:
         return address.host, address.port or PORT
     serial = stream.parameters.get("serial")
-    cameras = await find(networks())
+    cameras = await find_cameras(networks())
     matching = [camera for camera in cameras if serial in (None, camera.info.serial)]
     if len(matching) != 1:
         known = tuple(f"{as_source(camera).url} {camera.info.label}" for camera in cameras)

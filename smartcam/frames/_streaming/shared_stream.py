@@ -208,13 +208,13 @@ class SharedH264:
 
     async def _encode(self, reader: FrameReader) -> None:
         now = asyncio.get_running_loop().time
-        self._encoder.begin_anew()
+        self._encoder.request_key_frame()
         failures = 0
         async for frame in reader:
             if not self._viewers and not self._key_frame_futures:
                 continue  # no viewers during the linger
             if self._key_frame_wanted and now() - self._last_key_frame_at >= KEY_FRAME_INTERVAL:
-                self._encoder.begin_anew()
+                self._encoder.request_key_frame()
                 self._last_key_frame_at = now()
             try:
                 unit = await self._encoder.encode(frame)

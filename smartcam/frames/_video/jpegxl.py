@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames._codecs.pictures import converted, decoded, jpegxl_size
+from smartcam.frames._codecs.pictures import convert_frame, decode_frame, jpegxl_size
 from smartcam.frames._frame import Frame, Moment, amend
 from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._video.frames import Pixels
@@ -62,7 +62,7 @@ def read_jpegxl(path: str, wanted: PixelFormat | None) -> Pixels:
             f"{path}: expected {MAX_PICTURE_PIXELS} pixels at most, got {width}x{height}",
             source=path,
         )
-    picture = decoded(amend(frame, width=width, height=height), "")
+    picture = decode_frame(amend(frame, width=width, height=height), "")
     if wanted is not None and wanted is not picture.format:
         picture = _convert_to(picture, wanted)
     return Pixels(picture.format, width, height, picture.stride, bytes(picture.data))
@@ -74,6 +74,6 @@ def _convert_to(frame: Frame, wanted: PixelFormat) -> Frame:
             f"{frame.source}: expected {wanted.name}, got JPEGXL", source=frame.source
         )
     if wanted.name == "BGR8":
-        picture = converted(frame, "RGB8")
+        picture = convert_frame(frame, "RGB8")
         return amend(picture, data=picture.array()[..., ::-1].tobytes(), format=wanted)
-    return converted(frame, wanted.name)
+    return convert_frame(frame, wanted.name)

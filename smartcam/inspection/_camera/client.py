@@ -71,7 +71,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         self._pairs = JudgedResults(
             self._device.last_sent, lambda: self.statistics().received, self._report_picture
         )
-        self._device.inspector.viewers.add(self._pairs.take)
+        self._device.inspector.viewers.add(self._pairs.record_picture)
         settings = CameraSettings.of(address, given)
         super().__init__(settings, observers=[self._pairs, *observers])
 
@@ -164,7 +164,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         return await self._encode_png(judged, limit, drawn=drawn)
 
     def _report_picture(self, result: Result[Any], judged: Judged) -> None:
-        if self._observers.see_pictures:
+        if self._observers.handles_pictures:
             self._observers.picture(result, judged.marked_frame)
 
     async def _read_last_picture(self, timeout: float, *, drawn: bool) -> bytes:

@@ -116,7 +116,7 @@ class SoftwareDevice(Server):
                 quirks=quirks,
                 seed=seed or 0,
             )
-            self.emulator.device.sight = self._last_picture
+            self.emulator.device.get_last_image = self._last_picture
         else:
             self.emulator = EmulatedCamera(
                 [self._application(program) for program in camera.programs.values()],
@@ -255,10 +255,10 @@ class _CellInspector(Inspector):
     def begin(
         self,
         order: InspectionOrder,
-        seen: Callable[[], None],
-        done: Callable[[Values | None], None],
+        on_exposed: Callable[[], None],
+        on_done: Callable[[Values | None], None],
     ) -> None:
-        """Start an inspection; ``done`` gets its values in the units of the layout."""
+        """Start an inspection; ``on_done`` gets its values in the units of the layout."""
         number = None if self._layout.sequence_field is None else order.number & 0x7FFFFFFF
 
         def convert(found_values: Values | None) -> None:
@@ -269,9 +269,9 @@ class _CellInspector(Inspector):
                     values = _as_mapping(self._unitless_layout.parse(data))
             except Exception:  # noqa: BLE001 - the run has to end
                 _log.exception("%s ! a result does not fit its cells", self._inspector.name)
-            done(values)
+            on_done(values)
 
-        self._inspector.begin(order, seen, convert)
+        self._inspector.begin(order, on_exposed, convert)
 
     def cancel(self) -> None:
         """Cancel the running inspection."""

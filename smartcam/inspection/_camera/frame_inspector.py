@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from smartcam.backoff import Backoff
 from smartcam.emulator._inside import Inspector
 from smartcam.exceptions import FrameSourceError, SmartCamError
-from smartcam.frames._inside import changed
+from smartcam.frames._inside import copy_with
 from smartcam.inspection._camera.tool_thread import ToolThread
 from smartcam.inspection._program import MAX_REASON_BYTES
 
@@ -69,7 +69,7 @@ class Judged(NamedTuple):
         """The frame, with the marks of the tools as its drawings."""
         if self.inspection is None:
             return self.frame
-        return changed(self.frame, drawings=self.inspection.drawings)
+        return copy_with(self.frame, drawings=self.inspection.drawings)
 
 
 @dataclass(eq=False, slots=True)
@@ -180,14 +180,14 @@ class FrameInspector(Inspector):
     def begin(
         self,
         order: InspectionOrder,
-        seen: Callable[[], None],
-        done: Callable[[Values | None], None],
+        on_exposed: Callable[[], None],
+        on_done: Callable[[Values | None], None],
     ) -> None:
         """Start a run, which inspects the first frame exposed from now on."""
         self.cancel()
         loop = asyncio.get_running_loop()
         deadline = loop.call_later(FRAME_WAIT, self._end_without_frame)
-        self._run = _OrderedRun(order, seen, done, time.monotonic(), deadline)
+        self._run = _OrderedRun(order, on_exposed, on_done, time.monotonic(), deadline)
         self._frame_wanted.set()
         if self.trouble:  # a restart of the device has cleared the condition there
             loop.call_soon(self._set_trouble, self.trouble)

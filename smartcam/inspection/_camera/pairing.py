@@ -65,7 +65,7 @@ class JudgedResults(Observer):
             collections.OrderedDict()
         )
 
-    def take(self, judged: Judged) -> None:
+    def record_picture(self, judged: Judged) -> None:
         """Record the picture of the container that the device has just sent."""
         session_number, report = self._get_session()
         if session_number != self._session_number:

@@ -203,7 +203,7 @@ class PartModel:
         """
         caller = "PartModel.from_outline"
         path = check_path(path, "path", caller)
-        scale = check_number(pixels_per_mm, "pixels_per_mm", 0, 1e4, caller, above=True)
+        scale = check_number(pixels_per_mm, "pixels_per_mm", 0, 1e4, caller, exclusive=True)
         name = check_text(name, "name", caller, least=1)
         bright = check_flag(bright, "bright", caller)
         if unit is not None:

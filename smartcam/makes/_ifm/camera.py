@@ -179,7 +179,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         """Seconds of an evaluation."""
         return self.application.processing_time
 
-    def evaluated(self, call: LineClient | None, part: Mapping[str, Any]) -> None:
+    def report_evaluation(self, call: LineClient | None, part: Mapping[str, Any]) -> None:
         """Answer with the result; send it to all clients that have switched results on."""
         self.values = part
         self.results += 1
@@ -220,7 +220,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     def activated(self) -> None:
         """Start evaluating, if the active application runs continuously."""
         if self.active and self.application.trigger == "continuous":
-            self.begin(None)
+            self.begin_evaluation(None)
 
     @property
     def takes_trigger(self) -> bool:
@@ -234,7 +234,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         """Start an evaluation; its result is sent to all clients that have switched results on."""
         if not self.takes_trigger:
             return "!"
-        self.begin(None)
+        self.begin_evaluation(None)
         return "*"
 
     @request(r"T\?")
@@ -242,7 +242,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         """Start an evaluation and answer with its result."""
         if not self.takes_trigger:
             return "!"
-        self.begin(call)
+        self.begin_evaluation(call)
         return None
 
     @request(r"p([0-7])")

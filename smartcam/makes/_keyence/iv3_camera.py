@@ -58,7 +58,7 @@ class EmulatedIv3(EvaluatingCamera):
         """Seconds of an inspection."""
         return self.processing_time
 
-    def evaluated(self, call: LineClient | None, part: Sequence[int]) -> None:
+    def report_evaluation(self, call: LineClient | None, part: Sequence[int]) -> None:
         """Judge a part; send the result to the client that asked for it."""
         self.count = self.count % MAX_COUNT + 1
         rates = [check_integer(rate, "a rate", 0, 9_999_999) for rate in part]
@@ -84,7 +84,7 @@ class EmulatedIv3(EvaluatingCamera):
         """Inspect, and answer with the result."""
         if self.busy:
             return "ER,T2,03"
-        self.begin(client)
+        self.begin_evaluation(client)
         return None
 
     @request("T1")
@@ -92,7 +92,7 @@ class EmulatedIv3(EvaluatingCamera):
         """Inspect; the client asks for the result later."""
         if self.busy:
             return "ER,T1,03"
-        self.begin(None)
+        self.begin_evaluation(None)
         return "T1"
 
     @request("RT")

@@ -163,7 +163,7 @@ class BagConversion:
             lenient=camera.facts.get("lenient") == "True",
             y_down=y_down,
             calibration=self.calibration,
-            own=self.interpret_as is not None,
+            strict_calibration=self.interpret_as is not None,
         )
         endian = camera.facts.get("endian", "0")
         if endian not in {"0", "1"}:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client._inside import in_pixels, localizations_of, without_poses
+from smartcam._client._inside import has_pixel_positions, localizations_of, name_without_poses
 from smartcam.exceptions import SmartCamError
 from smartcam.interpreters import resolve
 
@@ -40,12 +40,14 @@ class RecordedInterpreters:
         """
         parts, application = localizations_of(result.value), result.application
         interpreter = self._by_application.get(application, self._by_application.get(None))
-        pixels = self._pixels or in_pixels(interpreter)
+        pixels = self._pixels or has_pixel_positions(interpreter)
         if parts:
             self._with_parts.add(application)
             calibrated = parts[0].pose.header.frame_id != result.camera
             return None if pixels and not calibrated else parts
-        has_poses = interpreter is not None and without_poses(interpreter) is None and not pixels
+        has_poses = (
+            interpreter is not None and name_without_poses(interpreter) is None and not pixels
+        )
         return parts if has_poses or application in self._with_parts else None
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameAddress, FrameDriver, FrameSource, StreamFormat
-from smartcam.frames._inside import changed
+from smartcam.frames._inside import copy_with
 from smartcam.recording._replays.schedule import MAX_REPLAY_BYTES
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class ReplayedPictures:
         now = time.monotonic()
         captured = min(now, max(self._inspection_start, now - seconds / self._speed))
         duration = min(frame.duration / self._speed, captured - self._inspection_start)
-        self.current_picture = changed(frame, captured=captured, duration=duration)
+        self.current_picture = copy_with(frame, captured=captured, duration=duration)
         for sink in tuple(self.sinks):
             sink.frame(self.current_picture)
 

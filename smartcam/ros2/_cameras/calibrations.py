@@ -11,7 +11,7 @@ from smartcam._thesis_calibration import (
     CALIBRATION,
     CalibrationCall,
     checked_localizations,
-    own_localizations,
+    localization_spec,
 )
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.ros2._cameras.image_messages import stamp_fields, utc_of
@@ -57,7 +57,7 @@ class RosCalibrationCamera:
         self.name: str = camera.name
         self.y_down: bool = camera.settings.y_down
         self.unit: str
-        self._spec, self.unit = own_localizations(
+        self._spec, self.unit = localization_spec(
             interpretation_of(camera), camera.active_application
         )
 

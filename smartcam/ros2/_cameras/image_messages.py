@@ -101,7 +101,7 @@ def to_ros_format(frame: Frame) -> Frame:
         FrameFormatError: the format cannot be converted, or the frame's bytes are wrong.
         MissingExtraError: the extra that reads the format is not installed.
     """
-    from smartcam.frames._inside import converted, decoded, with_pixels
+    from smartcam.frames._inside import convert_frame, decode_frame, with_pixels
 
     name = frame.format.name
     if name in ENCODINGS:
@@ -110,8 +110,8 @@ def to_ros_format(frame: Frame) -> Frame:
         format_name = "Mono16" if name.startswith("Mono") else f"{name[:7]}16"
         return with_pixels(frame, frame.array(), format_name)
     if frame.format.compressed:
-        return to_ros_format(decoded(frame, ""))
-    return converted(frame, "RGB16" if frame.format.depth > 8 else "RGB8")
+        return to_ros_format(decode_frame(frame, ""))
+    return convert_frame(frame, "RGB16" if frame.format.depth > 8 else "RGB8")
 
 
 def image_fields(frame: Frame, frame_id: str) -> dict[str, Any]:

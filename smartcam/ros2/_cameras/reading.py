@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client._inside import in_pixels, localizations_of, own_interpreter, without_poses
+from smartcam._client._inside import (
+    camera_interpreter,
+    has_pixel_positions,
+    localizations_of,
+    name_without_poses,
+)
 from smartcam.interpreters import resolve
 
 if TYPE_CHECKING:
@@ -21,7 +26,7 @@ def interpretation_of(camera: Camera[Any]) -> Interpretation:
 
 def address_of(camera: Camera[Any]) -> Address:
     """Return the address of the camera itself, also of one that an agent of a fleet has."""
-    return camera._place  # noqa: SLF001 - smartcam's own
+    return camera._camera_address  # noqa: SLF001 - smartcam's own
 
 
 def calibrations_by_application(argument: Any) -> dict[int | None, Any]:
@@ -61,9 +66,9 @@ def localizations_in_metres(
     parts = localizations_of(result.value)
     if parts is None or is_calibrated(camera, result.application):
         return parts
-    reader = own_interpreter(camera, result.application) if spec is None else resolve(spec)
-    if in_pixels(reader):
+    reader = camera_interpreter(camera, result.application) if spec is None else resolve(spec)
+    if has_pixel_positions(reader):
         return None
     # an empty list of an interpreter without poses is a list of texts, or of records
-    is_other_list = not parts and reader is not None and without_poses(reader) is not None
+    is_other_list = not parts and reader is not None and name_without_poses(reader) is not None
     return None if is_other_list else parts

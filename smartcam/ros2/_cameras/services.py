@@ -10,7 +10,7 @@ import functools
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam._client._inside import in_pixels
+from smartcam._client._inside import has_pixel_positions
 from smartcam._json import object_text
 from smartcam._thesis import MAX_TIMEOUT, THESIS, spec_of_text
 from smartcam._thesis_calibration import CALIBRATION
@@ -20,7 +20,7 @@ from smartcam.interpreters import resolve
 from smartcam.ros2._cameras.calibrations import CalibrationServices
 from smartcam.ros2._cameras.messages import error_text
 from smartcam.ros2._cameras.reading import is_calibrated, localizations_in_metres
-from smartcam.ros2._cameras.thesis import RosThesisFace, ThesisServices
+from smartcam.ros2._cameras.thesis import RosThesisCamera, ThesisServices
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -63,7 +63,7 @@ class CameraServices:
         calibrations: ThesisCalibration | None = None,
     ) -> None:
         self._camera, self._node, self._results = camera, node, results
-        node_side = RosThesisFace(camera, node, results, lifecycle)
+        node_side = RosThesisCamera(camera, node, results, lifecycle)
         self._thesis = ThesisServices(node_side, node, results)
         self._calibration = CalibrationServices(camera, calibrations)
         self._std_services: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
@@ -221,7 +221,7 @@ class CameraServices:
         ):
             if got > most:
                 raise ConfigurationError(f"{name}: {quantity}: expected {most} at most, got {got}")
-        if spec is not None and in_pixels(resolve(spec)):
+        if spec is not None and has_pixel_positions(resolve(spec)):
             application = request.application_id or self._camera.active_application or 0
             if not is_calibrated(self._camera, application):
                 raise ConfigurationError(

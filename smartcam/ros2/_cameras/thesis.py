@@ -47,7 +47,7 @@ class ManagedCamera(Protocol):
         """Go from Inactive to Unconfigured."""
 
 
-class RosThesisFace:
+class RosThesisCamera:
     """The operations of the thesis' services on a camera's node.
 
     Args:
@@ -163,18 +163,18 @@ class ThesisServices:
     """Answers requests of the six services with messages' fields.
 
     Args:
-        face: the part of the node for these services.
+        camera: the part of the node for these services.
         node: node of the camera.
         results: results of the camera, which make messages of localizations.
     """
 
-    def __init__(self, face: RosThesisFace, node: Any, results: CameraResults) -> None:
-        self._face, self._node, self._messages = face, node, results.messages
+    def __init__(self, camera: RosThesisCamera, node: Any, results: CameraResults) -> None:
+        self._camera, self._node, self._messages = camera, node, results.messages
         self._topic_lock = asyncio.Lock()  # requests change topics one after the other
 
     async def close(self) -> None:
         """Stop publishing on topics of requests. Idempotent."""
-        await self._face.close()
+        await self._camera.close()
 
     async def answer(self, name: str, message: Any) -> dict[str, Any]:
         """Carry out a request; return the fields of its answer without ``error``.
@@ -185,14 +185,14 @@ class ThesisServices:
         self._check_name(message.camera_name)
         service = THESIS[name]
         request = self._request(name, service, message)
-        call = ThesisCall(self._face, request, request.timeout or service.timeout)
-        async with self._topic_lock if service.settles else contextlib.nullcontext():
+        call = ThesisCall(self._camera, request, request.timeout or service.timeout)
+        async with self._topic_lock if service.changes_publishing else contextlib.nullcontext():
             return self._encodable(await service.answer(call))
 
     def _request(self, name: str, service: ThesisService, message: Any) -> Any:
         known = [field for field in service.request.model_fields if hasattr(message, field)]
         fields = {field: getattr(message, field) for field in known}
-        return validated(service.request, fields, f"{self._face.name}: {name}")
+        return validated(service.request, fields, f"{self._camera.name}: {name}")
 
     def _encodable(self, reply: dict[str, Any]) -> dict[str, Any]:
         if "strings" in reply:
@@ -207,7 +207,7 @@ class ThesisServices:
         Raises:
             ConfigurationError: the request names another camera.
         """
-        camera, node = self._face.name, self._node
+        camera, node = self._camera.name, self._node
         known = {camera, node.full_name, node.name}
         if name and name.strip("/") not in {other.strip("/") for other in known}:
             raise ConfigurationError(

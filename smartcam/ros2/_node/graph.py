@@ -50,10 +50,12 @@ class RosGraph:
         put = session.engine.SampleKind.PUT
 
         def on_sample(sample: Any) -> None:
-            session.in_loop(declared.call, 0, self.update, str(sample.key_expr), sample.kind == put)
+            session.call_in_loop(
+                declared.call, 0, self.update, str(sample.key_expr), sample.kind == put
+            )
 
         self._declared = declared = ZenohDeclared(session)
-        declared.of(
+        declared.declare(
             lambda opened: opened.liveliness().declare_subscriber(
                 token_pattern(self._domain), direct(on_sample), history=True
             )

@@ -120,7 +120,7 @@ class Node(NamedNode):
         try:
             self._id = self.context.next_id()
             token = self._entity(NODE, self._id).token
-            self._token = ZenohDeclared(self.context.zenoh).of(
+            self._token = ZenohDeclared(self.context.zenoh).declare(
                 lambda session: session.liveliness().declare_token(token)
             )
         except BaseException:

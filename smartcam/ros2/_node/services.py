@@ -86,7 +86,7 @@ class RosService(RosEndpoint):
         def on_query(query: Any) -> None:
             data = b"" if query.payload is None else query.payload.to_bytes()
             attachment_bytes = None if query.attachment is None else query.attachment.to_bytes()
-            zenoh.in_loop(self._on_request, 0, query, data, attachment_bytes)
+            zenoh.call_in_loop(self._on_request, 0, query, data, attachment_bytes)
 
         self._declare(
             lambda session: session.declare_queryable(entity.key, direct(on_query), complete=True)
@@ -340,11 +340,11 @@ class RosClient(RosEndpoint):
             if self._is_reply_to(attachment, attachment_bytes):
                 has_reply = True
                 payload = answer.ok.payload.to_bytes()
-                zenoh.in_loop(set_reply, len(payload), payload)
+                zenoh.call_in_loop(set_reply, len(payload), payload)
 
         def on_end() -> None:
             if not has_reply:  # after a reply, the event loop has been woken already
-                zenoh.in_loop(set_error, 0)
+                zenoh.call_in_loop(set_error, 0)
 
         self._querier.get(
             direct(on_reply, on_end),

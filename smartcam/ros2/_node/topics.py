@@ -76,7 +76,7 @@ class RosEndpoint:
     def _declare(
         self, declare: Callable[[Any], Any], *, by_dropping: bool = False
     ) -> ZenohDeclared:
-        declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).of(declare)
+        declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).declare(declare)
         self._declared.append(declared)
         return declared
 
@@ -136,7 +136,7 @@ class RosPublisher(RosEndpoint):
         self._newest_publisher: Any = None
         self._slot: NewestSlot | None = None
         self._thread_name = "latched" if qos.latched else "short"
-        self._declared_publisher = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(
+        self._declared_publisher = ZenohDeclared(context.zenoh, by_dropping=qos.latched).declare(
             self._declare_publisher
         )
         self._declare_token()
@@ -374,7 +374,7 @@ class RosSubscription(RosEndpoint, TopicReader[_ReceivedMessage]):
             if context.full(len(data)):
                 return
             attachment_bytes = None if sample.attachment is None else sample.attachment.to_bytes()
-            context.in_loop(self._on_message, len(data), data, attachment_bytes)
+            context.call_in_loop(self._on_message, len(data), data, attachment_bytes)
 
         qos = self.entity.qos
         if not qos.latched:

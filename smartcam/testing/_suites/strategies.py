@@ -9,12 +9,12 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from smartcam._extras import missing
+from smartcam._extras import missing_extra_error
 
 try:
     from hypothesis import HealthCheck, given, settings, strategies
 except ModuleNotFoundError as _exc:
-    raise missing("hypothesis") from _exc
+    raise missing_extra_error("hypothesis") from _exc
 
 st = strategies
 

@@ -61,7 +61,7 @@ class Pipe:
             wake=self.run,
             carry=self._carry,
             end=self._end,
-            lost=lambda _: None,
+            on_dropped=lambda _: None,
         )
         self._delay_rule: tuple[DelayBytes, Random] | None = None
         self._rate_rule: Rate | None = None

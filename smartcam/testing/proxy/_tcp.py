@@ -75,11 +75,11 @@ class ProxiedConnection(Proxied):
     # ------------------------------------------------------------------ its end
 
     @property
-    def settled(self) -> bool:
+    def keeps_place(self) -> bool:
         """True once bytes have passed in both directions."""
         return len(self._carried) == len(DIRECTIONS)
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         """Log that the connection was turned away, and reset it."""
         self.note("turned away")
         self.reset()
@@ -213,7 +213,7 @@ class StreamRelay(Relay[ProxiedConnection]):
     def __init__(self, rules: Sequence[Rule], log: LinkLog) -> None:
         super().__init__(rules, log)
         places: Places[ProxiedConnection] = Places(
-            MAX_CONNECTIONS, own="a client that was answered"
+            MAX_CONNECTIONS, session_name="a client that was answered"
         )
         self._acceptor = _RawAcceptor(self, places)
 
@@ -240,9 +240,9 @@ class StreamRelay(Relay[ProxiedConnection]):
             client.close()
             return
         self.clients[self._last_number] = connection
-        refusal = self._acceptor.enter(connection, address)
+        refusal = self._acceptor.refusal_on_entry(connection, address)
         if refusal:
-            connection.turn_away(refusal)
+            connection.close_for(refusal)
         else:
             connection.connect()
 

@@ -97,22 +97,22 @@ class _Peer(Proxied):
             elif isinstance(rule, Late):
                 transmission.delay += rule.seconds + rng.random() * rule.jitter
             elif isinstance(rule, Reorder):
-                transmission.gather, transmission.behind = (rule.behind, rule.seconds), True
-        if (transmission.delay or transmission.behind) and sum(
+                transmission.gather, transmission.after_gathered = (rule.behind, rule.seconds), True
+        if (transmission.delay or transmission.after_gathered) and sum(
             map(len, self._delay_lines.values())
         ) >= MAX_WAITING_DATAGRAMS:
             self.note("full", direction)
             return
         line = self._delay_lines[direction]
-        line.put([transmission], 0 if transmission.behind else 1)
+        line.put([transmission], 0 if transmission.after_gathered else 1)
         line.run()
 
     @property
-    def settled(self) -> bool:
+    def keeps_place(self) -> bool:
         """True if the target has answered the client recently."""
         return self._loop.time() - self._answered_at < ANSWERED_GRACE
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         """Log that the client was turned away, and forget it."""
         self.note("turned away")
         self.reset()
@@ -142,7 +142,7 @@ class _Peer(Proxied):
             wake=lambda: self._delay_lines[direction].run(),
             carry=functools.partial(self._send, direction),
             end=lambda _: None,
-            lost=lambda _: None,
+            on_dropped=lambda _: None,
         )
 
     def _receive(self) -> None:
@@ -154,7 +154,7 @@ class _Peer(Proxied):
             self.note("no target", "up")
             return
         self._answered_at = self._loop.time()
-        self._relay.places.move_back(self, self._answered_at)
+        self._relay.places.restart_idle_time(self, self._answered_at)
         self.pass_datagram("down", data)
 
     def _send(self, direction: Direction, batch: list[tuple[Transmission, bytes]]) -> None:
@@ -180,7 +180,7 @@ class DatagramRelay(Relay[_Peer]):
 
     def __init__(self, rules: Sequence[Rule], log: LinkLog) -> None:
         super().__init__(rules, log)
-        self.places: Places[_Peer] = Places(MAX_CLIENTS, own="an answer")
+        self.places: Places[_Peer] = Places(MAX_CLIENTS, session_name="an answer")
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Drop everything; UDP cannot stall a single client."""
@@ -234,9 +234,11 @@ class DatagramRelay(Relay[_Peer]):
             self.log.note("not accepted", self._last_number)
             return None
         self.clients[address] = peer
-        refusal = self.places.enter(peer, str(address[0]), asyncio.get_running_loop().time())
+        refusal = self.places.refusal_on_entry(
+            peer, str(address[0]), asyncio.get_running_loop().time()
+        )
         if refusal:
-            peer.turn_away("all other clients were answered recently")
+            peer.close_for("all other clients were answered recently")
             return None
         self.log.note("connect", self._last_number)
         return peer

@@ -386,7 +386,7 @@ def test_marked_takes_the_darkest_by_a_margin(levels: list[float], origin: int |
 def test_grey_image_of_bytes_keeps_them() -> None:
     image = np.arange(20 * 30, dtype=np.uint16).reshape(20, 30).astype(np.uint8)
     grey = grey_image(image)
-    np.testing.assert_array_equal(grey.bytes, image)
+    np.testing.assert_array_equal(grey.uint8_levels, image)
     np.testing.assert_array_equal(grey.levels, image)
     assert grey.size == (30, 20)
     assert grey.levels.dtype == np.float32
@@ -397,23 +397,23 @@ def test_grey_image_of_16_bits_fills_255_with_its_brightest(brightest: int) -> N
     image = np.zeros((20, 30), dtype=np.uint16)
     image[0, :2] = (brightest, brightest // 2)
     grey = grey_image(image)
-    assert grey.bytes[0, 0] == 255
+    assert grey.uint8_levels[0, 0] == 255
     assert grey.levels[0, 1] == pytest.approx(127.5, abs=0.2)
 
 
 def test_grey_image_of_black_16_bits_is_black() -> None:
-    assert grey_image(np.zeros((20, 30), dtype=np.uint16)).bytes.max() == 0
+    assert grey_image(np.zeros((20, 30), dtype=np.uint16)).uint8_levels.max() == 0
 
 
 def test_grey_image_of_colours_weighs_blue_green_red() -> None:
     image = np.zeros((16, 16, 3), dtype=np.uint8)
     image[:, :, 2] = 200
-    assert grey_image(image).bytes[0, 0] == round(0.299 * 200)
+    assert grey_image(image).uint8_levels[0, 0] == round(0.299 * 200)
 
 
 def test_grey_image_of_a_cut_of_an_image_is_contiguous() -> None:
     image = np.zeros((64, 64), dtype=np.uint8)[::2, ::2]
-    assert grey_image(image).bytes.flags.c_contiguous
+    assert grey_image(image).uint8_levels.flags.c_contiguous
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])

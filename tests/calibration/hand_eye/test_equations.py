@@ -39,7 +39,7 @@ vectors = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(np.array)
 def problem(in_hand: bool, seed: int = 5, poses: int = 7) -> tuple[RobotPoses, Rigid, Rigid, Rigid]:
     """Return a robot, the camera, the target, and the views' poses."""
     truth = scene("eye-in-hand" if in_hand else "eye-to-hand", seed=seed, poses=poses)
-    robot = RobotPoses(Rigid.stacked(one.rigid for one in truth.robot_poses), in_hand)
+    robot = RobotPoses(Rigid.stack(one.rigid for one in truth.robot_poses), in_hand)
     camera, target = truth.camera_pose.rigid, truth.target_pose.rigid
     return robot, camera, target, predicted_views(camera, robot, target)
 
@@ -74,20 +74,22 @@ def test_derivatives_are_those_of_small_steps(
     observed: Any = pixels(seen, free=free) if kind == "pixels" else poses(seen, free)
     # away from the truth, and with corrections
     random = np.random.default_rng(1)
-    near = Solution(camera.turned_before(random.normal(scale=2e-3, size=6)), target)
+    near = Solution(camera.turned_in_source(random.normal(scale=2e-3, size=6)), target)
     start = adjust(robot, observed, near, RobotNoise(RobotSigmas(1e-2, 1e-3)))
     at = dataclasses.replace(
         start,
         corrections=random.normal(scale=1e-2, size=start.corrections.shape),
-        camera=camera.turned_before(random.normal(scale=2e-3, size=6)),
+        camera=camera.turned_in_source(random.normal(scale=2e-3, size=6)),
     )
     total = view_products(robot, observed, at)[0]
     unknown = 12 + observed.extra_count
 
     def cost(steps: Any, own: Any) -> float:
-        corrected = RobotPoses(robot.poses.turned_before(at.corrections + own), in_hand)
+        corrected = RobotPoses(robot.poses.turned_in_source(at.corrections + own), in_hand)
         moved = predicted_views(
-            at.camera.turned_before(steps[:6]), corrected, at.target.turned_before(steps[6:12])
+            at.camera.turned_in_source(steps[:6]),
+            corrected,
+            at.target.turned_in_source(steps[6:12]),
         )
         return float((observed.evaluate(moved, at.change + steps[12:])[0] ** 2).sum())
 
@@ -113,7 +115,7 @@ def test_adjust_of_exact_samples_finds_the_truth(in_hand: bool, noise: RobotNois
     observed: Observations
     for observed in (pixels(seen), poses(seen)):
         step = np.array([0.05, -0.04, 0.03, 0.01, 0.02, -0.01])
-        start = Solution(camera.turned_before(step), target.turned_before(-step))
+        start = Solution(camera.turned_in_source(step), target.turned_in_source(-step))
         found = adjust(robot, observed, start, noise)
         assert found.cost < 1e-9
         np.testing.assert_allclose(found.camera.translation, camera.translation, atol=1e-8)
@@ -152,7 +154,7 @@ def test_bends_that_points_do_not_show_are_left_out(columns: int, rows: int, cou
 
 def test_adjust_that_begins_behind_the_camera_has_no_cost() -> None:
     robot, camera, target, seen = problem(in_hand=True)
-    turned = camera.turned_before(np.array([math.pi, 0, 0, 0, 0, 0]))
+    turned = camera.turned_in_source(np.array([math.pi, 0, 0, 0, 0, 0]))
     found = adjust(robot, pixels(seen), Solution(turned, target))
     assert found.cost == math.inf
 
@@ -173,7 +175,7 @@ def test_evaluate_of_no_lens_and_no_target_is_nan(number: int) -> None:
 def test_adjust_corrects_a_robot_that_is_off() -> None:
     robot, camera, target, seen = problem(in_hand=False, poses=12)
     off = np.random.default_rng(2).normal(scale=[1e-3] * 3 + [3e-4] * 3, size=(12, 6))
-    said = RobotPoses(robot.poses.turned_before(off), in_hand=False)
+    said = RobotPoses(robot.poses.turned_in_source(off), in_hand=False)
     truth = Solution(camera, target)
     found = adjust(said, pixels(seen), truth, RobotNoise(RobotSigmas(1e-3, 3e-4)))
     plain = adjust(said, pixels(seen), truth)
@@ -187,7 +189,7 @@ def test_noise_of_the_robot_is_told() -> None:
     random = np.random.default_rng(3)
     sigmas = RobotSigmas(4e-4, 2e-4)
     off = random.normal(scale=np.repeat(sigmas, 3), size=(30, 6))
-    said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
+    said = RobotPoses(robot.poses.turned_in_source(off), in_hand=True)
     observed = pixels(seen)
     noise = 0.1 * random.normal(size=observed.pixels.shape)
     blurred = dataclasses.replace(observed, pixels=observed.pixels + noise)
@@ -205,7 +207,7 @@ def test_without_each_view_is_what_the_others_give(
     robot, camera, target, seen = problem(in_hand=True, poses=9)
     random = np.random.default_rng(6)
     off = random.normal(scale=[1e-3] * 3 + [3e-4] * 3, size=(9, 6))
-    said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
+    said = RobotPoses(robot.poses.turned_in_source(off), in_hand=True)
     observed = pixels(seen, free=free)
     whole = adjust(said, observed, Solution(camera, target), noise)
     found = leave_each_out(said, observed, whole)
@@ -222,7 +224,7 @@ def test_without_each_view_is_what_the_others_give(
 def test_closed_forms_of_many_poses_begin_with_some_of_them() -> None:
     robot, camera, _, seen = problem(in_hand=True, poses=60)
     off = np.random.default_rng(7).normal(scale=1e-4, size=(60, 6))
-    said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
+    said = RobotPoses(robot.poses.turned_in_source(off), in_hand=True)
     for name in ("park", "shah"):
         some, whole = (solve_linear(name, said, seen, use_all_views=one) for one in (False, True))
         assert some is not None
@@ -267,7 +269,7 @@ def test_closed_forms_are_the_ones_that_were_named() -> None:
     """OpenCV takes a method without its name for an output, and always solves by Tsai."""
     robot, _, _, seen = problem(in_hand=True)
     shaken = RobotPoses(
-        robot.poses.turned_before(np.random.default_rng(5).normal(scale=1e-3, size=(7, 6))), True
+        robot.poses.turned_in_source(np.random.default_rng(5).normal(scale=1e-3, size=(7, 6))), True
     )
     found = {name: solve_linear(name, shaken, seen) for name in LINEAR}
     places = {tuple(one[0].translation.round(9)) for one in found.values() if one is not None}

@@ -74,7 +74,7 @@ def test_hand_eye_that_takes_noise_for_another_error_expects_the_difference() ->
 
 
 def test_second_turns_are_those_without_each_pose() -> None:
-    robot = RobotPoses(Rigid.stacked(one.rigid for one in scene("eye-in-hand").robot_poses), True)
+    robot = RobotPoses(Rigid.stack(one.rigid for one in scene("eye-in-hand").robot_poses), True)
     found = left_out_second_axis_turns(robot)
     for number in range(len(found)):
         some = np.delete(np.arange(len(found)), number)

@@ -22,7 +22,7 @@ def pose(seconds: float, speed: float = 1.0) -> Rigid:
         *(0.4 * np.sin(0.9 * t), 0.4 * np.sin(1.3 * t + 1), 0.5 * np.sin(0.7 * t + 2)),
         *(0.2 * np.sin(1.1 * t), 0.15 * np.sin(0.8 * t + 1), 0.6 + 0.1 * np.sin(1.7 * t)),
     ]
-    return Rigid(np.eye(3), np.zeros(3)).turned_before(np.array(step))
+    return Rigid(np.eye(3), np.zeros(3)).turned_in_source(np.array(step))
 
 
 def drive(
@@ -34,13 +34,13 @@ def drive(
     for number in range(700):
         moment = NOON + timedelta(seconds=number / 50)
         history.add(Transform("base", "flange", *pose(number / 50, speed), at=moment))
-    camera = pose(3.0).turned_before(np.array([0.1, -0.2, 0.3, 0.0, 0.1, 0.0]))
+    camera = pose(3.0).turned_in_source(np.array([0.1, -0.2, 0.3, 0.0, 0.1, 0.0]))
     target, seen = pose(5.0), []
     for number in range(24):
         seconds = 1.0 + number / 2.1
         between = pose(seconds, speed)
         between = between.inverse() if setup == "eye-in-hand" else between
-        there = (camera.inverse() @ between @ target).turned_before(random.normal(0.0, sigma, 6))
+        there = (camera.inverse() @ between @ target).turned_in_source(random.normal(0.0, sigma, 6))
         moment = NOON + timedelta(seconds=seconds - offset)
         seen.append(Transform("camera", "target", *there, at=moment))
     return history, seen

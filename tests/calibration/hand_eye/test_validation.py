@@ -59,7 +59,7 @@ def problem(poses: list[Transform], setup: Setup) -> Problem:
     """Return exact poses of the target, of the scene, and poses of the robot."""
     truth = scene(setup, poses=len(poses))
     seen, said = (
-        Rigid.stacked(one.rigid for one in some)
+        Rigid.stack(one.rigid for one in some)
         for some in ([truth.seen(pose) for pose in truth.robot_poses], poses)
     )
     white = np.broadcast_to(np.eye(6), (len(poses), 6, 6))

@@ -87,7 +87,7 @@ class Bench:
         """Return the estimated lens under some noise."""
         (fx, _, cx), (_, fy, cy), _ = self.camera.matrix
         lens = np.concatenate([[fx, fy, cx, cy], self.camera.distortion])
-        poses = Rigid.stacked(one.rigid for one in self.poses)
+        poses = Rigid.stack(one.rigid for one in self.poses)
         seen = np.concatenate([one.points.reshape(-1) for one in self.views])
         seen = seen + self.sigma * np.random.default_rng(seed).normal(size=len(seen))
         camera = self.camera
@@ -100,7 +100,7 @@ class Bench:
             )
             step = self.back @ off
             lens = lens + step[: self.values]
-            poses = poses.turned_after(step[self.values :].reshape(-1, 6))
+            poses = poses.turned_in_target(step[self.values :].reshape(-1, 6))
             fx, fy, cx, cy = lens[:4]
             camera = CameraModel(
                 size=camera.size,

@@ -522,8 +522,8 @@ def _bundle(count: int, *, free: bool = True) -> Bundle:
     columns = np.eye(9) if free else np.zeros((9, 0))
     return Bundle(
         (LEFT, RIGHT),
-        Rigid.stacked([RIG.rigid]),
-        Rigid.stacked(one.rigid for one in poses(count, name="left")),
+        Rigid.stack([RIG.rigid]),
+        Rigid.stack(one.rigid for one in poses(count, name="left")),
         (columns, columns),
         is_rig_known=not free,
     )
@@ -569,7 +569,7 @@ def test_adjust_covariance_of_poses_is_that_of_their_errors() -> None:
     for seed in range(20):
         truth = poses(4, seed=seed)
         views = seen(LEFT, truth, sigma=0.1, seed=seed)
-        motions = Rigid.stacked(one.rigid for one in truth)
+        motions = Rigid.stack(one.rigid for one in truth)
         bundle = Bundle.single(LEFT, motions, np.eye(9)[:, :2])
         found = adjust(bundle, [Sight(0, n, view) for n, view in enumerate(views)], 0.0)
         turn = found.bundle.poses.rotation[0] @ truth[0].rotation.T
@@ -589,7 +589,7 @@ def test_adjust_leaves_a_pose_that_no_view_shows() -> None:
 
 def test_adjust_of_points_behind_the_camera_gives_up() -> None:
     bundle = _bundle(3)
-    behind = bundle.poses.turned_after(np.tile([0, 0, 0, 0, 0, -9.0], (3, 1)))
+    behind = bundle.poses.turned_in_target(np.tile([0, 0, 0, 0, 0, -9.0], (3, 1)))
     away = Bundle(bundle.cameras, bundle.rig, behind, bundle.basis)
     found = adjust(away, _sights(3, 0.0), 0.0)
     assert math.isinf(found.weighted_squares)

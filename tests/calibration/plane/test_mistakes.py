@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import fit_plane
-from smartcam.calibration._plane.order import better_order
+from smartcam.calibration._plane.order import find_better_order
 from smartcam.exceptions import CalibrationError
 from tests.calibration.plane.planekit import SIGMA, SPECIAL, Scene
 from tests.calibration.scenes import refused
@@ -103,7 +103,7 @@ def test_seven_marks_with_three_in_the_wrong_order_are_put_right() -> None:
     random = np.random.default_rng(3)
     marks = layout(7, random)
     order = np.array([0, 4, 2, 1, 3, 5, 6])
-    found = better_order(marks, SCENE.touched(marks, 1)[order], 3 * SIGMA)
+    found = find_better_order(marks, SCENE.touched(marks, 1)[order], 3 * SIGMA)
     assert found is not None
     assert found.sure
     assert order[found.order].tolist() == [*range(7)]
@@ -113,13 +113,13 @@ def test_seven_marks_with_three_in_the_wrong_order_are_put_right() -> None:
 def test_order_of_a_grid_that_fits_from_several_sides_is_not_sure() -> None:
     marks = np.array([(0.15 * i, 0.12 * j) for i in range(3) for j in range(3)])
     touches = SCENE.touched(marks, 1)
-    pair = better_order(marks, touches[[0, 5, 2, 3, 4, 1, 6, 7, 8]], 3 * SIGMA)
+    pair = find_better_order(marks, touches[[0, 5, 2, 3, 4, 1, 6, 7, 8]], 3 * SIGMA)
     assert pair is not None
     assert (pair.sure, pair.moved) == (True, (1, 5))
-    shifted = better_order(marks, np.roll(touches, 1, axis=0), 3 * SIGMA)
+    shifted = find_better_order(marks, np.roll(touches, 1, axis=0), 3 * SIGMA)
     assert shifted is not None
     assert not shifted.sure
-    assert better_order(marks, touches, 3 * SIGMA) is None
+    assert find_better_order(marks, touches, 3 * SIGMA) is None
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), "0.001", True, [1.0]])

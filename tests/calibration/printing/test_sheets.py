@@ -21,7 +21,7 @@ from smartcam.calibration import (
     scaled,
     target_from_data,
 )
-from smartcam.calibration._inside import Target, on_paper
+from smartcam.calibration._inside import Target, target_from_description
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
 from tests import ROOT
@@ -188,13 +188,13 @@ def test_sheet_files_carry_the_description() -> None:
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda one: make_sheet(one).id)
 def test_sheet_data_gives_back_the_target(target: Target | Rays) -> None:
-    assert on_paper(json.loads(json.dumps(make_sheet(target).data))) == target
+    assert target_from_description(json.loads(json.dumps(make_sheet(target).data))) == target
 
 
 @pytest.mark.parametrize("data", [{}, {"kind": "rays"}, {"kind": "rays", "diameter": 1, "x": 2}])
 def test_data_that_describes_no_sheet_is_refused(data: dict[str, object]) -> None:
     with pytest.raises(CalibrationError, match=r"target: expected a kind of \['charuco', "):
-        on_paper(data)
+        target_from_description(data)
 
 
 def test_sheet_takes_the_page_upright_or_lying() -> None:

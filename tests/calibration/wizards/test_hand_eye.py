@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, Folder, HandEyeCalibration, Transform
-from smartcam.calibration._inside import ROBOTS, listing
+from smartcam.calibration._inside import ROBOTS, list_calibrations
 from smartcam.calibration.formats import pose_to
 from smartcam.calibration.simulation import render
 from smartcam.calibration.wizards import WizardSession, hand_eye_wizard
@@ -95,7 +95,7 @@ async def test_views_taken_give_a_calibration_in_a_file(tmp_path: Path) -> None:
     found = HandEyeCalibration.load(tmp_path / "gripper.json")
     assert TRUTH.errors(found.camera_pose)[1] < 2e-4
     assert len(found.views) == 8
-    (row,) = listing(Folder(tmp_path))
+    (row,) = list_calibrations(Folder(tmp_path))
     assert (row["kind"], row["held_out_mm"]) == ("hand-eye", view["result"]["held_out_mm"])
     printed = printed_by(view["result"]["use"]["python"])
     assert printed.startswith("Transform(")

@@ -10,7 +10,7 @@ import pytest
 
 from smartcam.calibration import Folder, PlaneCalibration, fit_plane
 from smartcam.calibration._files.directory import MAX_NAME_LENGTH
-from smartcam.calibration._inside import listing
+from smartcam.calibration._inside import list_calibrations
 from smartcam.calibration.wizards import CalibrationService
 from smartcam.calibration.wizards._services import MAX_EARLIER_JOURNALS
 from tests import ROOT
@@ -42,7 +42,7 @@ def test_listing_has_date_error_and_last_check(tmp_path: Path) -> None:
     (tmp_path / "table.checks.jsonl").write_text('{"schema": "smartcam.checks/1"}\n')
     check(tmp_path, "table", at, stale=False)
     check(tmp_path, "table", at, stale=True)
-    (row,) = listing(Folder(tmp_path))
+    (row,) = list_calibrations(Folder(tmp_path))
     assert found.held_out_error is not None
     assert row == {
         "name": "table",
@@ -58,7 +58,7 @@ def test_listing_has_date_error_and_last_check(tmp_path: Path) -> None:
 def test_listing_takes_no_check_of_a_calibration_before_and_no_half_line(tmp_path: Path) -> None:
     saved(tmp_path, "table")
     check(tmp_path, "table", "2020-01-01T00:00:00+00:00", stale=True)
-    assert listing(Folder(tmp_path))[0]["checked_at"] is None
+    assert list_calibrations(Folder(tmp_path))[0]["checked_at"] is None
     check(tmp_path, "table", read_document(tmp_path / "table.json").written_at, stale=False)
     with (tmp_path / "table.checks.jsonl").open("a") as stream:
         stream.write('{"at": "2026-09')
@@ -68,7 +68,7 @@ def test_listing_takes_no_check_of_a_calibration_before_and_no_half_line(tmp_pat
 
 def test_listing_of_three_touches_knows_no_error(tmp_path: Path) -> None:
     saved(tmp_path, "table", points=3)
-    assert listing(Folder(tmp_path))[0]["held_out_mm"] is None
+    assert list_calibrations(Folder(tmp_path))[0]["held_out_mm"] is None
 
 
 def test_listing_names_unreadable_files_and_goes_on(tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_listing_names_unreadable_files_and_goes_on(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("{")
     write(tmp_path / "c.json", "other", {})
     (tmp_path / "c.checks.jsonl").write_text("no JSON\n")
-    rows = {row["name"]: row for row in listing(Folder(tmp_path))}
+    rows = {row["name"]: row for row in list_calibrations(Folder(tmp_path))}
     assert list(rows) == ["a", "b", "c"]
     assert "no JSON" in rows["a"]["problem"]
     assert rows["b"]["problem"] is None

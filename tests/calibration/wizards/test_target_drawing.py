@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Checkerboard, PlaneCalibration, TargetView, fit_plane
-from smartcam.calibration._inside import LOOKS
+from smartcam.calibration._inside import STANDARD_VIEWS
 from smartcam.calibration.wizards._marks import Mark, Touch
 from smartcam.calibration.wizards._target_drawing import MAX_SIDE_PX, cell_counts, draw_preview
 from smartcam.calibration.wizards._touch_previews import (
@@ -312,7 +312,7 @@ BOARD = Checkerboard(columns=9, rows=6, square=0.025)
 SIZE = (640, 480)
 
 
-@pytest.mark.parametrize("look", LOOKS, ids=lambda look: look.text[:20])
+@pytest.mark.parametrize("look", STANDARD_VIEWS, ids=lambda look: look.text[:20])
 def test_outline_fills_its_part_of_the_image(look: Look) -> None:
     found = outline(look, BOARD, SIZE)
     assert (np.ptp(found, axis=0) / SIZE).max() == pytest.approx(look.fill, abs=0.01)
@@ -322,12 +322,12 @@ def test_outline_fills_its_part_of_the_image(look: Look) -> None:
 
 
 def test_outline_from_the_front_is_upright_or_turned_by_a_quarter() -> None:
-    straight, turned = (outline(LOOKS[one], BOARD, SIZE) for one in (0, 5))
+    straight, turned = (outline(STANDARD_VIEWS[one], BOARD, SIZE) for one in (0, 5))
     assert straight[0] == pytest.approx([128, 360])
     assert straight[2] == pytest.approx([512, 120])
     assert np.ptp(turned, axis=0)[0] < np.ptp(turned, axis=0)[1]
 
 
 def test_outline_tilted_is_nearer_on_one_side() -> None:
-    widths = [np.ptp(outline(LOOKS[one], BOARD, SIZE)[:2, 0]) for one in (1, 2)]
+    widths = [np.ptp(outline(STANDARD_VIEWS[one], BOARD, SIZE)[:2, 0]) for one in (1, 2)]
     assert abs(widths[0] - widths[1]) > 30

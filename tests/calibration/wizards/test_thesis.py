@@ -191,7 +191,7 @@ async def test_error_of_a_camera_is_shown_and_keeps_the_step(tmp_path: Path) -> 
 async def test_a_calibration_that_is_left_alone_is_given_up_and_goes_on_later(
     tmp_path: Path,
 ) -> None:
-    client = Client(tmp_path, abandoned=0.2)
+    client = Client(tmp_path, abandon_timeout=0.2)
     answer = await client.to_picture()
     answer = await client.accept(await client.accept(answer))
     answer = await client.step(1.0, 2.0, 3.0)
@@ -224,7 +224,7 @@ async def test_a_run_that_was_started_in_another_way_begins_anew(tmp_path: Path)
 
 
 async def test_end_of_a_calibration_stops_its_timer(tmp_path: Path) -> None:
-    client = Client(tmp_path, abandoned=0.1)
+    client = Client(tmp_path, abandon_timeout=0.1)
     await client.to_picture()
     await client.step(abort=True)
     await asyncio.sleep(0.2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import fit_plane
-from smartcam.calibration._verdict import CURES, VIEW_CURES, Allowed, judge, refused
+from smartcam.calibration._verdict import CURES, VIEW_CURES, Allowed, judge, poor_judgement
 from smartcam.calibration.wizards._points import plane_outcome
 from smartcam.geometry._inside import Code
 
@@ -59,8 +59,8 @@ def test_verdict_is_not_good_beyond_the_allowed_error() -> None:
 def test_verdict_is_unknown_if_all_may_be_mirrored() -> None:
     judged = judge(0.1, [(Code.SIDE_UNKNOWN, "not checked")], worst=1, allowed=ALLOWED)
     assert (judged.verdict.level, judged.good_for) == ("unknown", None)
-    assert judged.chosen(["accept", "more", "redo", "side"]) == "side"
-    assert judged.chosen(["accept", "more", "redo"]) == "redo"
+    assert judged.choose_option(["accept", "more", "redo", "side"]) == "side"
+    assert judged.choose_option(["accept", "more", "redo"]) == "redo"
     assert "say where the tool points" in judged.verdict.text
 
 
@@ -84,12 +84,14 @@ def test_verdict_of_each_fault_names_the_cure(
     cures: Mapping[Code, tuple[str, str]],
 ) -> None:
     for code, (_, option) in cures.items():
-        judged = refused(code, "it is", worst=4, cures=cures)
+        judged = poor_judgement(code, "it is", worst=4, cures=cures)
         assert judged.verdict.text.startswith("Not good enough: ")
         assert "{" not in judged.verdict.text
         assert judged.option == option
-        assert judged.chosen(["accept", option]) == option
-        assert judged.chosen(["accept", "more"]) == ("more" if option != "accept" else option)
+        assert judged.choose_option(["accept", option]) == option
+        assert judged.choose_option(["accept", "more"]) == (
+            "more" if option != "accept" else option
+        )
 
 
 @pytest.mark.long

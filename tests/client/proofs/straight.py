@@ -143,7 +143,7 @@ class Client:
         self.machine = self._machine_kind(HANDBOOK, Role.CLIENT, Transport.TCP)
         self.frames = self.deliveries = 0
         self.dispatch.begin_session(HANDBOOK, ordered=True)
-        self.counters.begin(self.machine.counters)
+        self.counters.begin_session(self.machine.counters)
         self.machine.send(m.Connect())
         self.written += b"".join(self.machine.data_to_send())
 
@@ -160,7 +160,7 @@ class Client:
         number = None if numbering is None else correlation.take_number(numbering.highest)
         reading, evidence = self.results.interpretation, EvidenceByStatus()
         pending = PendingTrigger(
-            *(wanted, number, evidence, self.bell.outcome(), reading, has_input, 0.0, AT),
+            *(wanted, number, evidence, self.bell.make_outcome(), reading, has_input, 0.0, AT),
             application,
             [],
         )

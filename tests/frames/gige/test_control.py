@@ -18,7 +18,7 @@ from smartcam.frames._gige.control import RequestRefusedError
 from smartcam.frames._inside import ControlChannel, GigEDriver, checked_mac, force_address
 from tests.frames.gige.camera import camera
 from tests.frames.inside import AnsweringCamera as Found
-from tests.frames.inside import DeviceInfo, Network, find, networks
+from tests.frames.inside import DeviceInfo, Network, find_cameras, networks
 
 Answers = Callable[[int, bytes], list[bytes]]
 
@@ -149,8 +149,8 @@ async def test_memory_is_read_and_written_in_words_and_parts() -> None:
 async def test_cameras_are_found() -> None:
     async with camera() as there, camera(deaf=True):
         place = Network("127.0.0.1", ("127.0.0.1",))
-        (found,) = await find([place], port=there.port)
-        nowhere = await find([place, Network("192.0.2.1", ())], port=1)
+        (found,) = await find_cameras([place], port=there.port)
+        nowhere = await find_cameras([place, Network("192.0.2.1", ())], port=1)
     assert nowhere == []
     assert found.info.label == "Maker Tester (T1)"
     assert found.info.mac == "02:00:00:00:00:01"
@@ -169,10 +169,13 @@ async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.Monke
     async def found(_: object) -> list[Found]:
         return [info("10.0.0.8", "A"), info("10.0.0.9", "B")]
 
-    monkeypatch.setattr(_places, "find", found)
-    monkeypatch.setattr(driver, "find", found)
+    monkeypatch.setattr(_places, "find_cameras", found)
+    monkeypatch.setattr(driver, "find_cameras", found)
     address = FrameAddress.parse("gige://?serial=B")
-    assert await _places.place(address, _places.wanted(address)) == ("10.0.0.9", 3956)
+    assert await _places.find_camera(address, _places.read_wanted_stream(address)) == (
+        "10.0.0.9",
+        3956,
+    )
     for url, message in (
         ("gige://", "expected one camera, found 2"),
         ("gige://?serial=C", "found 0"),

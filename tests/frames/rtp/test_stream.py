@@ -219,7 +219,7 @@ async def test_a_key_frame_in_the_midst_of_a_refresh_is_shown_at_once(
         encoder, sent = codecs.h264_encoder(keyint=30), []
         for number in range(40):
             if number == 35:
-                encoder.begin_anew()
+                encoder.request_key_frame()
             sent.append(bytes((await encoder.encode(frame_of(stamped(number), "Mono8"))).data))
     (refresh,) = (number for number in range(1, 35) if entry_point(sent[number])[1])
     async with (
@@ -346,7 +346,7 @@ async def test_too_slow_decoder_restarts(monkeypatch: pytest.MonkeyPatch) -> Non
         encoder, sent = codecs.h264_encoder(keyint=30), []
         for number in range(24):
             if number == 20:
-                encoder.begin_anew()
+                encoder.request_key_frame()
             sent.append(bytes((await encoder.encode(frame_of(stamped(number), "Mono8"))).data))
     async with frames.open(f"rtp://{HOST}:{port}?{SIZE}", timeout=LIMIT, linger=LIMIT) as source:
         reader = source.reader()

@@ -388,7 +388,7 @@ async def test_datagrams_beyond_the_buffer_are_dropped_and_a_key_frame_follows(
             made[0].room = 1_000_000
             await asyncio.sleep(KEY_FRAME_INTERVAL)
             await stage.give(noise(4, SMALL))
-            watcher.decoder.lost()
+            watcher.decoder.note_loss()
             assert await ports.seen(watcher) == 4
             assert watcher.depacketizer.damaged == 1
             assert (stage.counts.sent, stage.counts.skipped) == (2, 2)

@@ -29,7 +29,7 @@ async def pictures() -> list[bytes]:
         encoder, made = codecs.h264_encoder(keyint=250, crf=18), []
         for number in range(COUNT):
             if number % GOP == 0:
-                encoder.begin_anew()
+                encoder.request_key_frame()
             frame = await encoder.encode(frame_of(stamped(number), "Mono8", number))
             made.append(bytes(frame.data))
     return made

@@ -200,7 +200,7 @@ class UnitDecoding:
             self._decoder = self._new_decoder()
             unit = self._with_parameters(unit) if is_restart else unit
         elif missing:
-            self._decoder.lost()
+            self._decoder.note_loss()
         self._skipped_units, self._must_restart = 0, False
         await self._decode_unit(self._decoder, unit, device_time)
 

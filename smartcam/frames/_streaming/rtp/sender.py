@@ -287,7 +287,7 @@ class RtpSender:
     def _request_key_frame(self) -> None:
         self._key_frame_wanted, self._key_frame_at = False, time.monotonic()
         self._key_frames += 1
-        self._encoder.begin_anew()
+        self._encoder.request_key_frame()
 
     def _send_frame(self, link: _RtpOutlet, encoded: Frame) -> bool:
         """Send a frame's packets; return False if the socket did not accept all of them."""

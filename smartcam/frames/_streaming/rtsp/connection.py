@@ -176,11 +176,11 @@ class RtspConnection(asyncio.Protocol):
         self.transport.abort()
 
     @property
-    def settled(self) -> bool:
+    def keeps_place(self) -> bool:
         """True if the connection has a session, or is being served."""
         return bool(self.sessions) or self._is_serving
 
-    def turn_away(self, why: str) -> None:
+    def close_for(self, why: str) -> None:
         """Abort the connection to make room for another, or since it opened no session in time."""
         _log.info("= %s: connection closed: %s", self.peer, why)
         self.abort()

@@ -6,7 +6,7 @@ import socket
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from smartcam._accepting import listening
+from smartcam._accepting import listening_socket
 from smartcam._arguments import check_flag, check_integer, check_kind, check_number, check_text
 from smartcam._finishing import finish
 from smartcam._server import Server
@@ -155,7 +155,7 @@ class RtspServer(Server):
         codecs = Codecs(threads=min(4, len(self._sources)))
         streams = self._new_streams(codecs)
         try:
-            listener = await listening(self.host, self._port)
+            listener = await listening_socket(self.host, self._port)
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
                 f"RTSP: cannot listen on {self.host} port {self._port}: {exc}"

@@ -84,7 +84,7 @@ class RtspServing:
         """Register a new connection; return the reason if there are too many, else ""."""
         if self._listener is None:
             return "the server is stopped"
-        return self._acceptor.enter(connection, peer)
+        return self._acceptor.refusal_on_entry(connection, peer)
 
     def unregister(self, connection: RtspConnection) -> None:
         """Remove a closed connection."""
@@ -92,12 +92,12 @@ class RtspServing:
 
     def mark_served(self, connection: RtspConnection) -> None:
         """Mark a connection as the most recently served: others are closed first to make room."""
-        self._acceptor.move_back(connection)
+        self._acceptor.restart_idle_time(connection)
 
     def on_last_session_end(self, connection: RtspConnection) -> None:
         """Start the time limit of a connection that has no session any more."""
-        self._acceptor.move_back(connection)
-        self._acceptor.expect(connection, IDLE_TIMEOUT, "no session")
+        self._acceptor.restart_idle_time(connection)
+        self._acceptor.set_time_limit(connection, IDLE_TIMEOUT, "no session")
 
     def stream(self, name: str) -> RtspStream:
         """Return a stream.
