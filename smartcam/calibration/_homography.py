@@ -42,7 +42,7 @@ def apply_homography(matrix: Array, points: Array) -> Array:
 def derivatives(matrix: Array, points: Array) -> Array:
     """Return the derivatives of mapped points by u and v, (N, 2, 2) or (N, 3, 2).
 
-    With ``p = q / w`` it is ``dp = (dq - p dw) / w``.
+    With ``p = q / w`` the derivative is ``dp = (dq - p dw) / w``.
     """
     projected = apply_homography(matrix, points)
     depth = points @ matrix[-1, :2] + matrix[-1, 2]
@@ -55,8 +55,8 @@ def derivatives(matrix: Array, points: Array) -> Array:
 def element_derivatives(matrix: Array, points: Array) -> Array:
     """Return the derivatives of mapped points by the matrix' elements, (N, 2, 9) or (N, 3, 12).
 
-    The same ``dp = (dq - p dw) / w``, where an element of ``q`` or ``w`` moves with its row of the
-    matrix by ``(u, v, 1)``.
+    They are ``dp = (dq - p dw) / w``, as in :func:`derivatives`; an element changes ``q`` or ``w``,
+    whichever its row computes, by ``(u, v, 1)``.
     """
     homogeneous = np.column_stack([points, np.ones(len(points))])
     scaled = homogeneous / (homogeneous @ matrix[-1])[:, None]
@@ -71,8 +71,8 @@ def element_derivatives(matrix: Array, points: Array) -> Array:
 def tangent_frames(slopes: Array, directions: Array) -> Array:
     """Return rotations (N, 3, 3) with a plane's normal as z and a direction of the camera as x.
 
-    ``slopes`` (N, 3, 2): the derivatives at each place, or multiples of them. ``directions`` (N,
-    2): in the camera's coordinates.
+    ``slopes`` (N, 3, 2): the derivatives of the mapped point at each place, or multiples of these.
+    ``directions`` (N, 2): in the camera's coordinates.
     """
     first = np.einsum("nij,nj->ni", slopes, directions)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

@@ -1,8 +1,9 @@
 """Compute the jackknife: the covariance of an estimate from the estimates without each view.
 
-An error that all residuals of a view share (a sheet that bends anew, a rolling shutter, a lens that
-does not quite follow its model) is not noise of the view's hundreds of points: it is one error per
-view. So the covariance depends on the number of views and on how far each moves the estimate.
+An error that all residuals of a view share (a sheet that bends anew for each view, a rolling
+shutter, a lens that does not quite follow its model) is one error per view, not noise of the view's
+hundreds of points. So the covariance depends on the number of views and on how much the estimate
+changes without each of them.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 def jackknife(left_out: Array) -> Array:
     """Return the covariance (K, K) of an estimate of K values.
 
-    ``left_out`` (V, K): the estimate without each of its V views, 2 or more, or its difference to
-    any fixed value. The covariance is NaN where one of these is.
+    ``left_out`` (V, K): the estimate without each of its V views, 2 or more, or the difference of
+    this estimate to any fixed value. The covariance is NaN for values of which an estimate is NaN.
     """
     # (V - 1) / V times the squares about their mean: leaving out one view changes the estimate by
     # 1 / (V - 1) of that view's difference from the mean of all views.
@@ -37,7 +38,7 @@ def jackknife(left_out: Array) -> Array:
 def weighted_jackknife(
     changes: Array, left_out_covariances: Array, covariance_of_all: Array, power: float
 ) -> Array:
-    """Return the jackknife of a least-squares estimate, with less weight for views that pull more.
+    """Return the jackknife covariance of least squares, with less weight for influential views.
 
     The plain jackknife is too large by a half and more if single views carry much of the
     information, as they do for lenses. ``changes`` (V, K): by how much the estimate changes without

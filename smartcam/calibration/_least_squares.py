@@ -1,7 +1,7 @@
-"""Solve least squares with many poses, each of which affects its own views only.
+"""Solve least squares with many poses, where each pose affects only its own views.
 
-The unknowns are those that all residuals share (lenses, a rig, the place of a camera on a robot),
-and six or none for each pose. The matrix of the normal equations then has the form of an arrow: a
+There are unknowns that all residuals share (lenses, a rig, the place of a camera on a robot), and
+six or no unknowns of each pose. The matrix of the normal equations then has the form of an arrow: a
 block for the shared unknowns, a small block for each pose, and blocks between the two, but none
 between poses. So the poses are eliminated before the shared unknowns are solved, and the time grows
 with the number of poses, not with its cube.
@@ -43,8 +43,8 @@ COVARIANCE_RANK_TOLERANCE = 1e-12
 errors."""
 
 MAX_UNKNOWNS_BY_SVD = 60
-"""Equations of more unknowns than this are solved without singular values, which would take too
-much time."""
+"""Equations of more unknowns than this are solved without a singular value decomposition, which
+would take too much time."""
 
 
 class NormalEquations(NamedTuple):
@@ -60,7 +60,7 @@ class NormalEquations(NamedTuple):
 
     @classmethod
     def zeros(cls, shared_count: int, pose_count: int, unknowns_per_pose: int) -> NormalEquations:
-        """Return the equations of no residuals."""
+        """Return equations to which no residuals were added yet."""
         return cls(
             0.0,
             np.zeros((shared_count, shared_count)),
@@ -136,7 +136,7 @@ def minimize(
     comparison ``rounding_cost`` is added to the cost, since exact samples leave only rounding
     errors to gain. ``damping`` is the part of the diagonal that is added to the diagonal at first;
     it may be small if the start is near. The best solution found is returned; its cost is infinite
-    if that of the start is.
+    if the cost of the start is.
     """
     solution, normal = start, evaluate(start)
     for _ in range(MAX_STEPS):

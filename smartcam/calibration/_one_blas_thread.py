@@ -32,7 +32,7 @@ class OneBlasThread(ContextDecorator):
     def forked(self) -> None:
         """Reset the state in a fork; its BLAS may stay limited to one thread."""
         self._lock = threading.Lock()
-        self._depths: Counter[int] = Counter()  # nested uses, by thread
+        self._depths: Counter[int] = Counter()  # number of nested uses in each thread
         self._original_limits: Any = None
 
     def __enter__(self) -> None:

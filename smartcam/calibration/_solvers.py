@@ -1,14 +1,14 @@
-"""Solvers: the parts of a transformation from the camera's coordinates to the robot's.
+"""Solvers: transformations that lead, one after the other, from camera to robot coordinates.
 
-Each does one part of the transformation and does not depend on the others; a :class:`Chain` applies
-them in order. All of them map :class:`Poses` to :class:`Poses`: arrays of points and orientations.
-A localization of the camera is a pose on its own plane: ``z`` is 0 and the orientation a turn about
-``z``.
+Each solver does one part of the transformation and does not depend on the others; a :class:`Chain`
+applies several in order. All solvers map :class:`Poses` to :class:`Poses`: arrays of points and
+orientations. A localization of the camera is a pose on its own plane: ``z`` is 0 and the
+orientation a turn about ``z``.
 
-The thesis' two solvers are :class:`CameraPosition2D` and :class:`RealWorldPosition`. The thesis'
-description differs in three points, which are corrected here: the origin is subtracted before
-turning, the origin's angle is subtracted from the part's, and the plane has a direction within
-itself in addition to its normal.
+The solvers :class:`CameraPosition2D` and :class:`RealWorldPosition` come from the thesis with which
+smartcam began. Its description is wrong in three points, which are corrected here: the origin is
+subtracted before turning, the origin's angle is subtracted from the part's, and the plane has a
+direction within itself in addition to its normal.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Poses(NamedTuple):
         return cls(points.reshape(-1, 3), quaternions.reshape(-1, 4))
 
     def moved(self, rotation: Array, translation: Array) -> Poses:
-        """Return the poses after one rigid motion, which is given in their own frame.
+        """Return the poses after one rigid motion, given in the frame of the poses.
 
         Args:
             rotation: (3, 3).
@@ -238,7 +238,7 @@ class PlaneProjection:
 class Height:
     """Solver for parts higher than the plane: from their apparent place to their true place.
 
-    The camera sees a point at ``height`` above the plane where the ray through the point meets the
+    A point at ``height`` above the plane seems to lie where the ray through the point meets the
     plane: too far from the place right below the camera. Without ``viewpoint`` the rays are taken
     as parallel to the normal, as with a telecentric lens: then only the height is added.
 

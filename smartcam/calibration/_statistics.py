@@ -1,4 +1,4 @@
-"""Test whether noise alone explains residuals, and whether offsets share one move."""
+"""Test whether noise alone explains residuals, and whether offsets are one common shift."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_MOVE_SPREAD: Final = 0.2
-"""Offsets count as one common move if none differs from their mean by more than this part of the
-mean. Without this test a sheet pushed by 3 to 50 mm before the last two to four of
-nine touches, or by 20 mm before the last three of fourteen views, was called good."""
+"""Offsets count as one common shift if none differs from their mean by more than this part of the
+mean. Without this test, calibrations were called good although the sheet was pushed by 3 to 50 mm
+before the last two to four of nine touches, or by 20 mm before the last three of fourteen views."""
 
 
 class Noise(NamedTuple):

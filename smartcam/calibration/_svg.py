@@ -1,4 +1,4 @@
-"""Write SVG elements, with the same bytes on every machine."""
+"""Write SVG elements; the same arguments give the same bytes on every machine."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Describe printed targets: the pattern on a sheet, and the place of each of its points.
 
-The frame of a target lies on the sheet as it is read: origin at a corner of its points, x to the
-right (ray A of the thesis), y up (ray B), z out of the sheet towards the reader. Points are
+The frame of a target, for a sheet held the right way up: origin at the lower left point, x to the
+right (along the printed ray A), y up (ray B), z out of the sheet towards the reader. Points are
 numbered from the origin along x, then row by row along y.
 """
 
@@ -30,8 +30,9 @@ MAX_POINTS = 10_000
 """A target has at most this many points."""
 
 MAX_LENGTH_M = 1.0
-"""Largest side of a square or marker, and largest distance of dots, metres: those of printed sheets
-are below a few hundred millimetres, so a larger number is probably in millimetres."""
+"""Largest side of a square or marker, and largest distance of dots, metres. Printed squares,
+markers and distances are below a few hundred millimetres, so a larger number is probably in
+millimetres."""
 
 AREA_DISTANCE_SQUARES = 0.3
 """Distance along x and along y from an outer corner of a checkerboard to the centre of the round
@@ -98,7 +99,7 @@ class Checkerboard:
 
 @dataclass(frozen=True, kw_only=True)
 class Charuco:
-    """A checkerboard with a marker in each white square; corners have ids, some may be hidden.
+    """A checkerboard with a marker in each white square; corners have ids, so some may be hidden.
 
     Attributes:
         columns: squares along x, at least 3.
@@ -211,7 +212,7 @@ class CircleGrid:
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerGrid:
-    """Markers in rows and columns; the points are their corners, some may be hidden.
+    """Markers in rows and columns; the points are the markers' corners, and some may be hidden.
 
     It is OpenCV's ``GridBoard``, whose numbers count from the upper left marker row by row, or
     Kalibr's AprilGrid (:meth:`april_grid`), whose numbers count from the lower left one upwards.

@@ -1,8 +1,8 @@
 """Convert units of length, which a file, its format or the user names; they are never guessed.
 
 Programs write the same files in metres and in millimetres. If neither the file nor its format names
-the unit, the user has to. Even with a unit, values that do not occur in a robot's cell are refused,
-with the question whether they are in another unit.
+the unit, the user has to. Even with a unit, values that are too large for a robot's cell are
+refused, and the error asks whether they are in another unit.
 """
 
 from __future__ import annotations

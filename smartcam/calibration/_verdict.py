@@ -1,8 +1,9 @@
 """Judge a calibration: its quality, its error in millimetres, and the next action.
 
-A calibration is "good" if no warning has a cure, if the error at left-out points is known, and if
-twice that error is at most the allowed one. The user gives the allowed error; the default is
-:data:`MAX_ERROR_SHARE` of the field. Loading a calibration that is not good logs a warning.
+A calibration is "good" if none of its warnings has a cure (is in :data:`CURES`), if the error at
+left-out points is known, and if twice that error is at most the allowed error. The user gives the
+allowed error; the default is :data:`MAX_ERROR_SHARE` of the field. Loading a calibration that is
+not good logs a warning.
 """
 
 from __future__ import annotations
@@ -75,8 +76,8 @@ CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.POOR_FIT: (_TOUCH_AGAIN, "redo"),
     Code.SCALE_MISMATCH: ("measure the print, and check the units", "more"),
 }
-"""Advice, and the option of a wizard's step that follows it, for each fault. The first fault that a
-calibration has counts."""
+"""For each fault the advice, and the option of a wizard's step that follows the advice. If a
+calibration has several faults, the first one in this table counts."""
 
 VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.REFUTED: ("touches of the sheet are off: is the tip right? Else take more views", "more"),
@@ -123,11 +124,11 @@ def judge(
 ) -> Judgement:
     """Return the judgement of a calibration.
 
-    ``held_out``: RMS error at points that were left out, mm. ``warnings``: those without
-    a cure do not count. ``worst``: number of the point to blame if a warning names none.
-    ``predicted``: RMS error that noise causes, mm; the promised error is never less. ``allowed``:
-    largest error that may be promised. ``advice``: work that would show how good the calibration
-    is. ``where``: the place for which the promised error holds, as a part of the text.
+    ``held_out``: RMS error at points that were left out, mm. ``warnings``: codes and texts;
+    warnings without a cure do not count. ``worst``: number of the point to blame if a warning names
+    none. ``predicted``: RMS error that noise causes, mm; the promised error is never less.
+    ``allowed``: largest error that may be promised. ``advice``: work that would show how good the
+    calibration is. ``where``: the place for which the promised error holds, as a part of the text.
     """
     texts = dict(reversed(list(warnings)))
     for code in cures:

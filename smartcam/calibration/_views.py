@@ -1,4 +1,4 @@
-"""Hold the points of a target that were found in one image."""
+"""The view of a target: the points of the target that were found in one image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IDS = storage.Form(
 )
 
 MAX_ROUNDING_RATIO: Final = 1e-9
-"""Elements of a covariance may be off by this part of it."""
+"""Rounding may change elements of a covariance by this part of the covariance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,7 +38,7 @@ class TargetView(storage.Stored):
         ids: (N,), numbers of the points that were found, ascending. Read-only, as are the next two.
         points: (N, 2), places of these points in the image, pixels.
         covariance: (N, 2, 2), of each point, pixels^2, from the noise of the image; 0 for points
-            that are exact.
+            without noise.
         margin: number of grey levels, of 255, by which the origin's mark, or the rim of its larger
             dot, is darker than the same place at the other corners; None if ids or colours of
             squares show the origin, or if the target looks the same when turned.
@@ -96,10 +96,10 @@ class TargetView(storage.Stored):
 
     @property
     def agreement(self) -> float:
-        """Agreement, -1 to 1, of the target's orientation with the image's; NaN on a line.
+        """Agreement, -1 to 1, of the points' places on the target and in the image; NaN on a line.
 
-        Near -1 for the sheet as it is read (y is up there, and v down), near 1 for a mirrored one,
-        near 0 if points have wrong numbers.
+        It is near -1 for the front of a sheet (y points up on the sheet, v down in the image), near
+        1 for a mirrored sheet, near 0 if points have wrong numbers.
         """
         # det(A^T B) is the sum, over all triples of points, of the products of their triangles'
         # signed areas (Cauchy and Binet), and a plane in front of a camera keeps all signs. Divided
@@ -150,7 +150,7 @@ def as_list(values: Any, types: type | tuple[type, ...], label: str) -> list[Any
     """Return values as a list; raise SHAPE unless each is of one of the types."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
         raise Code.SHAPE.unexpected(
-            f"{label}: expected a list of such", "a list", describe_type(values)
+            f"{label}: expected a list of them", "a list", describe_type(values)
         )
     return [check_type(value, types, f"{label} {number}") for number, value in enumerate(values)]
 
@@ -158,7 +158,8 @@ def as_list(values: Any, types: type | tuple[type, ...], label: str) -> list[Any
 def as_covariances(values: Any, count: int, label: str) -> Array:
     """Return covariances of points in an image, (``count``, 2, 2).
 
-    Raises SHAPE, NOT_FINITE, or NO_COVARIANCE if one is not symmetric or has a negative variance.
+    Raises SHAPE or NOT_FINITE; or NO_COVARIANCE: a matrix is not symmetric or has a negative
+    variance.
     """
     try:
         matrices = np.asarray(values, dtype=np.float64)

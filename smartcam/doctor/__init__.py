@@ -1,4 +1,4 @@
-"""Find out what is wrong with a camera or with the connection to it, and how to cure it.
+"""Find out what is wrong with a camera or with the connection to the camera, and the cure.
 
 :func:`examine` runs one check after the other, beginning with the basics: the name, the session,
 status, application, round trip, run state, triggers, layout, clock. It changes nothing on the
@@ -76,7 +76,7 @@ MAX_SECONDS = 86_400
 """Largest number of seconds for which a camera is watched: a day."""
 
 MAX_TRIGGERS = 10_000
-"""Largest number of triggers of an examination, since their times are kept."""
+"""Largest number of triggers of an examination, which keeps the time of each."""
 
 
 class _DoctorCheck(NamedTuple):
@@ -94,7 +94,7 @@ def _limit_of_requests(options: DoctorOptions) -> float:
 
 
 def _limit_of_switch(options: DoctorOptions) -> float:
-    return 2 * options.step_timeout(10.0)  # waiting for the camera to be free, and switching
+    return 2 * options.step_timeout(10.0)  # waiting for a free camera, and the switch
 
 
 def _limit_of_one_step(options: DoctorOptions) -> float:
@@ -108,7 +108,8 @@ _WIRE_CHECKS = (
     _DoctorCheck(
         "session",
         session_checks.connect,
-        # a session that fails, all other ways, a session by one of them, more sessions, their ends
+        # a session that fails, tries in all other ways, a session in one of these ways, more
+        # sessions, and the ends of sessions
         lambda options: (
             4 * options.step_timeout(10.0)
             + session_checks.MAX_CONNECTING_SECONDS
@@ -157,9 +158,9 @@ _CHECKS = (
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
     _DoctorCheck("clock", state_checks.look_at_clock, _limit_of_requests),
 )
-"""The checks in a session, in order; those of the wire or of the fleet come first. The limits only
-matter for an internal error, since each step has its own time limit. The whole examination takes at
-most the sum of all limits, and a second for the end of the session."""
+"""The checks in a session, in order, after the checks of the connection. A check's limit only
+matters after an internal error, since each step of a check has its own time limit. The whole
+examination takes at most the sum of all limits, and a second for the end of the session."""
 
 
 async def examine(
@@ -176,8 +177,8 @@ async def examine(
 ) -> AsyncGenerator[Finding]:
     """Examine a camera and yield each finding at once.
 
-    Connecting may take the camera from another client: the first finding reports it. Nothing is
-    started, stopped, switched or set, and nothing is triggered without ``trigger``.
+    Connecting may take the camera from another client: the first finding says so. Without
+    ``trigger``, nothing on the camera is started, stopped, switched, set or triggered.
 
     Args:
         url: the camera's address; for ``gige://HOST``, a source of frames, the network, the
@@ -188,7 +189,7 @@ async def examine(
         y_down: whether the camera's y axis points down.
         trigger: whether to send triggers.
         timeout: seconds for each step: connect (default 10), request (5), switch (10), trigger (5).
-        seconds: time for which a camera is watched that sends results unasked.
+        seconds: time for which a camera that sends results unasked is watched.
         count: number of triggers.
         trace: function that is called with every frame on the wire.
 
@@ -271,7 +272,7 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
         await _explain_loss(exam, exc)
         return False
     except ResponseTimeoutError as exc:
-        if not exam.connected_camera.connected:  # a missing answer ends the session
+        if not exam.connected_camera.connected:  # a request without an answer has ended the session
             await _explain_loss(exam, exc)
             return False
         exam.fail(

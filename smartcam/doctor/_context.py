@@ -1,4 +1,4 @@
-"""One examination: its options, its camera, and its observations so far."""
+"""The state of one examination of a camera, which its checks share: options, camera, findings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MAX_OBSERVED = 1000
 """Largest number of statuses and arrival times kept: 300 results per second for 3 seconds."""
 
 MAX_CONTAINERS = 32
-"""Largest number of containers kept, for the comparison with the layout: 2 MB of the largest."""
+"""Number of result containers kept for the comparison with the layout: 2 MB of the largest."""
 
 
 def application_text(application: int | None) -> str:
@@ -75,13 +75,13 @@ class DoctorOptions:
 
 
 class Witness(Observer):
-    """Observes the camera's messages and keeps the last ones.
+    """An observer of the camera's messages that keeps the last statuses, times and results.
 
     Attributes:
         statuses: the last statuses, each different from the status before.
         result_count: number of results since ``forget_arrivals``.
         arrival_times: loop times at which the last results arrived, in seconds.
-        last_results: the last results; each value is a :class:`Reading` if an interpreter was
+        last_results: the last results; their values are of :class:`Reading` if an interpreter was
             given.
         read_error: reason why the first result could not be given to an interpreter: an endian
             field that is neither little nor big, or cells that do not fit the layout.
@@ -191,7 +191,7 @@ class Examination:
     camera: Camera | None = None  # the client, None before the session
     connected_at: float = 0.0  # loop time at which the session began
     wants_trigger: bool = False  # whether triggers are still wanted
-    may_trigger: bool = False  # whether the camera waits for triggers
+    may_trigger: bool = False  # whether the camera waits for triggers, by the check of its state
     check: str = ""  # name of the check that runs
     # findings that were not handed out yet
     pending_findings: list[Finding] = field(default_factory=list[Finding])
@@ -255,7 +255,7 @@ class Examination:
         )
 
     def make_camera(self) -> Camera:
-        """Return a client that takes the camera once and never takes it back.
+        """Return a client that connects once and never takes the camera back from another client.
 
         Raises ConfigurationError: a timeout is not valid.
         """
@@ -266,7 +266,7 @@ class Examination:
             "request_timeout": exam_options.step_timeout(5.0),
             "switch_timeout": exam_options.step_timeout(10.0),
         }
-        if exam_options.y_down or not self.in_fleet:  # the agent may know the direction
+        if exam_options.y_down or not self.in_fleet:  # an agent may know y_down
             options["y_down"] = exam_options.y_down
         if exam_options.interpreter is not None:
             options["interpret_as"] = ReadingInterpreter(exam_options.interpreter)

@@ -19,7 +19,7 @@ class Exit(enum.IntEnum):
     """The exit codes that findings can have."""
 
     DONE = 0
-    """Only hints and warnings, if any."""
+    """No error: at most hints and warnings."""
     NO_SESSION = 3
     """There is no session, or it was lost."""
     TIMED_OUT = 4

@@ -1,4 +1,4 @@
-"""Checks of the connection to a camera of a fleet: host, bus, agent, and the agent's session."""
+"""Checks of the connection to a fleet's camera: bus, agent, and the agent's session with it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def fleet_camera_address(url: str) -> Address:
     if not address.camera:
         raise ConfigurationError(
             f"doctor: {url!r:.200} names no camera: expected fleet://HOST[:PORT]/CAMERA; "
-            "smartcam fleet list URL tells which there are"
+            "smartcam fleet list URL lists them"
         )
     return address.of(address.camera)
 
@@ -249,7 +249,7 @@ async def connect(exam: Examination) -> None:
 
 
 async def reserve(exam: Examination) -> None:
-    """Check ``reservation``: reserve the camera, since triggers need one that nobody else uses."""
+    """Check ``reservation``: reserve the camera, so that nobody else triggers it meanwhile."""
     if not exam.wants_trigger:
         return
     exam.wants_trigger = False  # until the camera is reserved

@@ -1,4 +1,4 @@
-"""Results of a search: the protocols of open ports, and the cameras that answered."""
+"""Results of a search for cameras: which protocols open ports may use, and what answered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Examine a GigE Vision camera and its network for reasons why its pictures do not come."""
+"""Examine a GigE Vision camera and the network for reasons why no pictures come."""
 
 from __future__ import annotations
 
@@ -31,16 +31,18 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import GenicamFeatures, GigEDriver, PacketCounts
 
 PACKET_OVERHEAD_BYTES: Final = 36 + 38
-"""Bytes of a stream's packet besides the pixels: IP, UDP, GVSP and the Ethernet frame."""
+"""Bytes of a stream's packet in addition to the pixels: headers of IP, UDP and GVSP, and the
+Ethernet frame."""
 
 STANDARD_MTU: Final = 1500
 JUMBO_MTU: Final = 9000
 
 MAX_LINK_LOAD: Final = 0.9
-"""Part of a link's speed above which a stream loses packets, here or in a switch."""
+"""A stream that uses more than this part of a link's speed loses packets, in this machine or in a
+switch."""
 
 SMALL_BUFFER_BYTES: Final = 1 << 20
-"""Receive buffer below which a busy machine loses packets of a large picture."""
+"""With a smaller receive buffer, bytes, a busy machine loses packets of a large picture."""
 
 SPEED_UNKNOWN: Final = 0.0
 
@@ -107,7 +109,8 @@ async def examine_gige(
 ) -> AsyncGenerator[Finding]:
     """Examine a camera and yield each finding at once.
 
-    The camera is taken only if no other program has it, and streams by the URL's settings.
+    The examination takes control of the camera only if no other program has it, and lets the camera
+    stream by the URL's settings.
 
     Raises:
         ConfigurationError: the URL is wrong; nothing was tried.
@@ -205,7 +208,7 @@ async def _ask_camera(exam: _GigEExamination) -> None:
         control = await ControlChannel.connect(exam.host, exam.port, exam.address.shown)
     except FrameSourceError as exc:
         raise exam.fail(
-            f"no way leads there: {exc}",
+            f"this machine has no route to the camera: {exc}",
             "Give this machine an address of the camera's network, or the camera one of this "
             "machine's.",
         ) from exc
@@ -491,12 +494,12 @@ async def _observe_stream(exam: _GigEExamination) -> _StreamObservation:
                 async with asyncio.timeout(exam.seconds):
                     async for _ in reader:
                         frames += 1
-            except FrameSourceError:  # some of them are timeouts, too
+            except FrameSourceError:  # some FrameSourceErrors are TimeoutErrors, too
                 raise
             except TimeoutError:
                 pass
             else:
-                raise FrameSourceError("it ended by itself", source=exam.label)
+                raise FrameSourceError("the stream ended by itself", source=exam.label)
             counts, seconds = driver.counts, loop.time() - start
             packet_size = await _packet_size(exam)
     return _StreamObservation(frames, counts, packet_size, seconds)

@@ -1,4 +1,4 @@
-"""Parse a text as addresses: a network, a range, one address or a host's name."""
+"""Parse the text of a network, a range, an address or a host's name, and list its addresses."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _OUTCOMES_BY_ERROR: dict[int, Outcome] = {
     errno.EHOSTDOWN: "unreachable",
     errno.ENETDOWN: "unreachable",
 }
-"""Outcomes of an opening, by error number; other errors are failures of this machine."""
+"""Outcome of opening a port, by error number; other errors are failures of this machine."""
 
 NO_SOCKET_ERRORS = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 """Error numbers that mean that this machine has no socket left."""
@@ -64,7 +64,7 @@ async def open_port(
         sock: socket of the address's family; it is closed in the end.
         address: address of the host.
         port: number of the port.
-        timeout: seconds to open the port, and as many again to read.
+        timeout: seconds to open the port, and again as many seconds to read.
         is_enough: function that is called with all bytes that came; True ends reading.
 
     Cancellation: the connection is closed.

@@ -1,8 +1,8 @@
 """Find out the protocol, transport and dialect of an address; each try has a new link.
 
 Every try is a :class:`Trial` with all sent and received bytes, as hex and, if possible, decoded. If
-a camera closes the link without a byte, the try is repeated without the Disconnect before Connect
-(see :mod:`smartcam._client.handshake`).
+a camera closes the link without sending a byte, the try is repeated without the Disconnect before
+Connect (see :mod:`smartcam._client.handshake`).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect, Protocol
 
 MAX_FRAMES = 64
-"""Largest number of entries that a trial keeps: a session takes six, and a camera may send results
-at once."""
+"""Largest number of frames that a trial keeps: a session has six, and a camera may send results at
+once."""
 
 CLOSE_TIMEOUT = 1.0
 """Seconds for the orderly end of a session."""
@@ -67,7 +67,7 @@ class Trial(Attempt):
         frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        is_other_protocol: whether the protocol differs from that of the given address.
+        is_other_protocol: whether the tried protocol differs from that of the given address.
     """
 
     address: Address

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder, Result
 
 MAX_ROWS = 40
-"""Largest number of rows of a dump: what fits on a screen."""
+"""Largest number of rows of a dump of a container: they fit on a screen."""
 
 
 # ---------------------------------------------------------------------- the layout
@@ -83,7 +83,7 @@ def dump_container(
 
 
 def _field_places(layout: Layout, size: int, shown_offset: int) -> Iterator[tuple[int, str, Field]]:
-    """Yield offset, name and field of all fields of the layout in ``size`` bytes."""
+    """Yield offset, name and field of each field that a layout has in ``size`` bytes."""
     offset = 0
     for field in layout.head:
         yield offset, field.name, field
@@ -145,7 +145,7 @@ async def look_at_results(exam: Examination) -> None:
 
 
 def _compare(exam: Examination, interpreter: Interpreter, containers: list[Result]) -> None:
-    """Report the first result that does not fit, or that all fit and how their values look."""
+    """Report the first result that does not fit the layout; if all fit, report on their values."""
     readings: list[Reading] = [result.value for result in containers]
     for result, reading in zip(containers, readings, strict=True):
         if reading.error is not None:
@@ -256,9 +256,9 @@ CONVERSION_LIMITS: dict[str, _ConversionLimit] = {
         2 * math.pi * math.pi / 180 + 1e-6, "radians", "a turn is 6.28 in radians, 360 in degrees"
     ),
 }
-"""Limits, by unit: if all values are smaller, the camera may have sent SI. Parts that lie within
-two millimetres, or are turned by less than six degrees, look the same; so the finding is only a
-hint."""
+"""Limits, by unit. If all values are smaller than the limit, the camera may have sent SI units. But
+the values of parts within two millimetres of the origin, or turned by less than six degrees, are as
+small, so the finding is only a hint."""
 
 PLAUSIBLE_REAL_RANGE = (1e-20, 1e20)
 """Range of plausible reals; others, except zero, are probably bytes of other types."""
@@ -320,7 +320,7 @@ def _look_at_values(
 
 
 def _hint_at_si_values(exam: Examination, unit: str, magnitudes: Mapping[str, float]) -> None:
-    """Report if the values of all fields with a unit look as if the camera had sent SI."""
+    """Report if all values in a unit are so small that the camera may have sent SI units."""
     rule, largest = CONVERSION_LIMITS[unit], max(magnitudes.values(), default=0.0)
     if not 0.0 < largest <= rule.largest:
         return

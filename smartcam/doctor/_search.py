@@ -1,4 +1,4 @@
-"""Find cameras: search networks for hosts that listen on the ports of cameras.
+"""Find cameras: search networks for hosts with open ports that cameras use.
 
 A search opens ports and sends nothing; it reads bytes that a port sends by itself. If the caller
 allows it, the search also speaks to the found cameras, like ``smartcam probe``.
@@ -87,8 +87,9 @@ async def find(
     """Return the open ports of networks where cameras may listen, sorted by address.
 
     The protocols' ports are opened, one opening after the other at ``rate``; nothing is sent.
-    Cameras that use UDP cannot be found in this way. No document says that a silent connection does
-    not disturb the client of a camera that serves one client: ``leave`` excludes such cameras.
+    Cameras that use UDP cannot be found in this way. A camera that serves one client may be
+    disturbed by a connection that sends nothing; no document rules this out. Exclude such cameras
+    by ``leave``.
 
     Args:
         networks: each ``192.168.0.0/24``, ``192.168.0.10-20``, an address or a host's name. An IPv6
@@ -98,7 +99,8 @@ async def find(
         leave: addresses of working cameras that the search leaves out, in the form of
             ``networks``.
         may_disturb: allows asking cameras that serve one client, such as those of ``bvs``.
-        ask: also speak to the cameras that were found, which takes such a camera from its client.
+        ask: also ask the cameras that were found; this takes a camera that serves one client from
+            its client.
         rate: largest number of openings per second.
         at_once: largest number of connections at a time.
         timeout: seconds to open a port, and again to read bytes that the port sends by itself.
@@ -136,7 +138,7 @@ class CameraSearch:
         counts: number of tried ports by outcome.
         failure: reason of the first failure of this machine.
         left_out: addresses that were left out, each with the text that named it.
-        has_begun: whether the first port was tried.
+        has_begun: whether the search has begun to try ports.
     """
 
     def __init__(

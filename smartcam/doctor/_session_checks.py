@@ -1,4 +1,4 @@
-"""Checks of the connection up to a session, and reasons for a lost session."""
+"""Checks of the connection from the name up to a session, and the reasons for a lost session."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ SESSION_COUNT = 5
 """Number of sessions made one after the other, to measure the connect time."""
 
 MAX_CONNECTING_SECONDS = 3.0
-"""Seconds after which no further session is made; on a slow link one or two are enough."""
+"""Seconds after which no further session is made, so that a slow link does not delay the
+examination."""
 
 CONNECTION_TIMEOUT = 1.0
 """Seconds to open a bare TCP connection, which shows whether the camera is still there."""
@@ -105,7 +106,7 @@ async def connect(exam: Examination) -> None:
         return
     exam.camera, exam.connected_at = camera, loop.time()
     if first is not None and len(times) > 1:
-        del times[0]  # the time includes the search for the dialect
+        del times[0]  # the first time includes the search for the dialect
     _report_session(exam, camera, first, times)
 
 
@@ -157,7 +158,7 @@ async def _diagnose_failure(exam: Examination, failure: ConnectFailedError) -> C
 
 
 async def _try_all(exam: Examination) -> list[Trial]:
-    """Return every try up to the first one with an answer."""
+    """Try every way up to the first one with an answer; return the tries."""
     timeout = exam.options.step_timeout(10.0)
     tries = trials(exam.address, timeout=timeout, trace=exam.trace, every_protocol=True)
     async with contextlib.aclosing(tries):

@@ -23,10 +23,11 @@ QUERY_COUNT = 30
 """Number of requests for the round-trip time: enough for a median, and fast."""
 
 MAX_QUERYING_SECONDS = 3.0
-"""Seconds after which no further request is sent: on a slow link fewer must suffice."""
+"""Seconds after which no further request is sent, so that a slow link gets fewer requests."""
 
 SLOW_ROUND_TRIP_TIME = 0.05
-"""A round trip of this many seconds gives a hint: on a local network it takes milliseconds."""
+"""A round trip of this many seconds or more gives a hint: on a local network one takes
+milliseconds."""
 
 MAX_WATCHED_STATUSES = 1000
 """Largest number of statuses kept while watching; the last ones stay."""
@@ -150,7 +151,8 @@ _DIAGNOSES: tuple[Diagnosis[list[Status]], ...] = (
         Exit.TIMED_OUT,
     ),
 )
-"""Diagnoses of a camera that sends no result while it is watched; the first that fits holds."""
+"""Diagnoses of a camera that sends no result while it is watched; the first that fits is
+reported."""
 
 
 async def watch(exam: Examination) -> None:
@@ -161,7 +163,7 @@ async def watch(exam: Examination) -> None:
     camera, witness, seconds = exam.connected_camera, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
-        return  # this was reported already, and explains the rest
+        return  # reported already, and the reason for a missing result
     is_decided = _is_stopped(status) or (_waits_for_trigger(status) and exam.wants_trigger)
     statuses = [status] if is_decided else await _watch_status(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
@@ -218,7 +220,7 @@ async def _watch_status(exam: Examination, seconds: float) -> list[Status]:
         return False
 
     exam.witness.forget_arrivals()
-    # open while watching, since results are made only if there is a subscriber
+    # keep a subscription open while watching, since results are made only for subscribers
     async with exam.connected_camera.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
             await exam.connected_camera.wait_status(keep, timeout=seconds)
@@ -230,7 +232,7 @@ def _interval_figures(witness: Witness) -> Figures:
 
 
 def _rate_details(witness: Witness) -> dict[str, Any]:
-    """Return rate and spread of unasked results; nothing for a single one."""
+    """Return the rate of unasked results and the spread of their intervals; {} for one result."""
     arrival_times = witness.arrival_times
     if len(arrival_times) < 2:
         return {}
@@ -254,9 +256,9 @@ def _waits_for_trigger(status: Status) -> bool:
 
 
 async def look_at_clock(exam: Examination) -> None:
-    """Check ``clock``: whether it shows this machine's time, local or UTC.
+    """Check ``clock``: whether the camera's clock shows this machine's time, local or UTC.
 
-    The clock has no time zone, and a restart loses it.
+    The clock has no time zone, and loses its time at a restart.
 
     Source: BVS ID guide p. 231 (published); for the others inferred.
     """

@@ -1,4 +1,4 @@
-"""Figures of a series of times: minimum, median, 99th percentile and jitter."""
+"""Figures of measured times: minimum, median, 99th percentile and jitter."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Figures(NamedTuple):
 
 
 def figures(times: Sequence[float]) -> Figures:
-    """Return the figures of one time or more, in the order of measurement."""
+    """Return the figures of one or more times, given in the order of measurement."""
     ordered = sorted(times)
     steps = [abs(after - before) for before, after in pairwise(times)]
     return Figures(

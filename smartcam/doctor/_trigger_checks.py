@@ -1,4 +1,4 @@
-"""Checks of the wanted application, and of triggers if they are allowed."""
+"""Checks of the expected application, and of triggers if these are allowed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 async def look_at_application(exam: Examination) -> None:
-    """Check ``application``: whether the expected one is active; load it for triggers only.
+    """Check ``application``: whether the expected one is active; if triggers are allowed, load it.
 
     The protocol cannot ask whether an application exists, only load it.
     """
@@ -104,7 +104,7 @@ async def send_triggers(exam: Examination) -> None:
             except LinkError:
                 raise
             except InterpretationError:
-                break  # the check of the layout reports it
+                break  # the result is not readable, which the check of the layout reports
             except SmartCamError as exc:
                 _report_failure(exam, exc, len(times))
                 break

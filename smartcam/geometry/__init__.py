@@ -1,4 +1,4 @@
-"""Values that several rooms share: motions between frames, and the lens of a camera.
+"""Values that several packages share: motions between frames, and the lens of a camera.
 
 Calibrations find these values; frames, depth, the fleet and ROS use them without a calibration.
 Right-handed frames, metres, Hamilton quaternions ``x, y, z, w``. :mod:`smartcam.calibration` gives

@@ -1,4 +1,4 @@
-"""A camera's lens: from directions to pixels and back.
+"""A camera's lens, which maps directions to pixels and back.
 
 The camera's frame is that of OpenCV and ROS' optical frames: x to the right of the image, y down,
 z forward. The middle of the upper left pixel has the coordinates (0, 0).
@@ -29,8 +29,8 @@ COEFFICIENT_NAMES: dict[DistortionModel, tuple[str, ...]] = {
     "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "equidistant": ("k1", "k2", "k3", "k4"),
 }
-"""Names of each model's coefficients, in order; those of ``equidistant`` belong to powers of the
-angle."""
+"""Names of each model's coefficients, in order. In ``equidistant`` they are factors of powers of
+the angle to the optical axis."""
 
 COEFFICIENT_COUNTS: dict[DistortionModel, int] = {
     model: len(names) for model, names in COEFFICIENT_NAMES.items()
@@ -159,7 +159,7 @@ class CameraModel(Stored):
             rays: Any = cv2.fisheye.undistortPoints(source, self.matrix, self.distortion)
         else:
             # no closed form: x = (x'' - tangential(x)) / g(x) is iterated from x = x''
-            # stop: 100 steps or 1e-12 of the focal length
+            # it stops after 100 steps, or when a step is below 1e-12 of the focal length
             stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
             rays = cv2.undistortPointsIter(
                 source, self.matrix, self.distortion, np.eye(3), np.eye(3), stop

@@ -1,4 +1,4 @@
-"""Check arguments: a text that must be one of a list, and the size of an image."""
+"""Check arguments: a text from a list of choices, and the size of an image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def check_choice(value: object, among: Sequence[str], label: str) -> None:
     """Raise SHAPE if an option is not in the list of known ones."""
-    word = as_plain_value(value)  # a user's class may hash and compare in any way
+    word = as_plain_value(value)  # a user's str may hash and compare otherwise
     if not isinstance(word, str) or word not in among:
         known = list(among)
         message = f"{label}: expected one of {known}, got {excerpt(value)}"

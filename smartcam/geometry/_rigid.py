@@ -71,7 +71,7 @@ class Rigid(NamedTuple):
         return moved
 
     def subset(self, index: Index) -> Rigid:
-        """Return the motions that an index selects."""
+        """Return the motions at an index, a slice, a mask or an array of indices."""
         return Rigid(self.rotation[index], self.translation[index])
 
     def scaled(self, scale: float) -> Rigid:
@@ -87,12 +87,12 @@ class Rigid(NamedTuple):
         return Rigid(exp_rotation(step[..., :3]) @ self.rotation, self.translation + step[..., 3:])
 
     def source_steps_to(self, other: Rigid) -> Array:
-        """Return the steps (..., 6) with which :meth:`turned_in_source` leads to other motions."""
+        """Return the steps (..., 6) with which :meth:`turned_in_source` gives the other motions."""
         turn = log_rotation(np.swapaxes(self.rotation, -1, -2) @ other.rotation)
         return np.concatenate([turn, other.translation - self.translation], axis=-1)
 
     def target_steps_to(self, other: Rigid) -> Array:
-        """Return the steps (..., 6) with which :meth:`turned_in_target` leads to other motions."""
+        """Return the steps (..., 6) with which :meth:`turned_in_target` gives the other motions."""
         turn = log_rotation(other.rotation @ np.swapaxes(self.rotation, -1, -2))
         return np.concatenate([turn, other.translation - self.translation], axis=-1)
 

@@ -1,4 +1,4 @@
-"""Rotations, frames and lines in space, over arrays.
+"""Compute with arrays of rotations, quaternions and points, and check such arguments.
 
 Right-handed, metres, radians. Quaternions are Hamilton's of unit length with the real part last,
 arrays of shape (..., 4) in the order x, y, z, w. ``R_a_b`` turns coordinates of b into coordinates
@@ -158,8 +158,8 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
 def frame_from_axes(x: ArrayLike, y: ArrayLike) -> Array:
     """Return the rotation (3, 3) with the columns x, n cross x, n, where n is along x cross y.
 
-    ``x`` and ``y`` (3,) have any length; ``y`` is any direction on the side of the second axis.
-    Raises COINCIDENT: a vector has length 0; COLLINEAR: they are less than 10 degrees apart.
+    ``x`` and ``y`` (3,) have any length; ``y`` need not be at a right angle to ``x``. Raises
+    COINCIDENT: a vector has length 0; COLLINEAR: they are less than 10 degrees apart.
     """
     first, second = as_vector(x, 3, "first axis"), as_vector(y, 3, "second axis")
     lengths = np.linalg.norm(first), np.linalg.norm(second)

@@ -1,4 +1,4 @@
-"""Objects as plain data: a class declares each field, and its form in a file, in one place.
+"""Convert objects to plain data for files, and back: a class declares the form of each field.
 
 The annotations of a :class:`Stored` dataclass say how pydantic checks a field's data, how the value
 is made from the data, and how the value is written as plain data. A :class:`Form` holds all three.
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from pydantic_core import CoreSchema
 
 Context: TypeAlias = MutableMapping[str, Any]
-"""Context for reading: the object's name in errors (``called``), and values that later keys
-need."""
+"""Values that are known while a file is read: the object's name in errors (``called``), and the
+values of earlier keys that later keys need."""
 
 Keys: TypeAlias = Mapping[str, str]
 """Key in a file for each field's name; the key is empty for a field made from other keys."""
@@ -58,7 +58,7 @@ object."""
 
 @dataclass(eq=False)
 class Form:
-    """The form in a file of the annotated value."""
+    """The form in which the annotated value is stored in a file."""
 
     checked: Any  # type with which pydantic checks the data
     read: Callable[[Any, Context], Any]  # makes the value from checked data and context
@@ -114,7 +114,7 @@ def _schema_of_parts(
 
 
 class Stored:
-    """A dataclass whose annotations say how its fields stand in a file."""
+    """A dataclass whose annotations say how its fields are stored in a file."""
 
     _label: ClassVar[str] = "data"
     """Name of the value in errors."""
@@ -122,13 +122,13 @@ class Stored:
     _keys: ClassVar[Keys] = {}
 
     _extra_keys: ClassVar[ExtraKeys] = {}
-    """Keys that are written before the fields."""
+    """Keys that are written before the keys of the fields."""
 
     _context_keys: ClassVar[frozenset[str]] = frozenset({"target"})
     """Keys whose values are put in the context, where the forms of later keys find them."""
 
     _optional_keys: ClassVar[frozenset[str]] = frozenset()
-    """Keys that may be missing in a file; their fields then have defaults."""
+    """Keys that may be missing in a file; the fields then get their defaults."""
 
     def to_data(self) -> dict[str, Any]:
         """Return the object as data for JSON, None for NaN; :meth:`from_data` reads these data."""

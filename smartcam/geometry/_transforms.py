@@ -1,9 +1,9 @@
-"""Transforms between coordinate frames, with the times at which they held.
+"""Transforms between coordinate frames, each with the time at which it was valid.
 
 A :class:`Transform` knows its direction: from ``source`` coordinates into ``target`` coordinates.
-Two transforms can be composed only if the frame between them is the same, so a transform of the
-wrong direction raises an error. A :class:`PoseHistory` keeps the transforms of a moving frame, and
-interpolates the pose at a moment.
+Two transforms can be composed only if one begins in the frame in which the other ends, so a
+transform of the wrong direction raises an error. A :class:`PoseHistory` keeps the transforms of a
+moving frame, and interpolates the pose at a moment.
 
 Right-handed, metres, Hamilton quaternions ``x, y, z, w``.
 """
@@ -194,8 +194,8 @@ class Transform:
         """Return ``T_a_b @ T_b_c = T_a_c``.
 
         Raises:
-            CalibrationError: ``WRONG_FRAME``: the frames between the two differ;
-                ``NOT_SIMULTANEOUS``: their times differ.
+            CalibrationError: ``WRONG_FRAME``: ``other`` does not lead into this transform's
+                ``source``; ``NOT_SIMULTANEOUS``: their times differ.
         """
         as_motion(other, f"{self.label} @", self.source, "source")
         if self.source != other.target:
@@ -224,7 +224,7 @@ class Transform:
         return quaternion_multiply(self.quaternion, _rows(quaternions, 4, "orientations"))
 
     def between(self, later: Transform, at: datetime) -> Transform:
-        """Return the transform at a moment between this one and a later one of the same frames.
+        """Interpolate between this transform and a later one of the same frames, at a moment.
 
         The position moves on a straight line, the orientation turns about one axis at one speed.
 

@@ -334,7 +334,7 @@ def test_camera_of_another_subnet_is_reported(namespace: list[str]) -> None:
     assert "198.51.100.7 is of another subnet than this machine" in found["text"]
     assert "10.9.8.1 in 10.9.8.0/24" in found["text"]
     assert "ForceIP" in found["cure"]
-    assert "no way leads there" in findings[-1]["text"]
+    assert "no route to the camera" in findings[-1]["text"]
 
 
 @pytest.mark.long

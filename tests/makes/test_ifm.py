@@ -353,8 +353,8 @@ async def test_images_come_with_their_chunks() -> None:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda data: data[:-1], "begins no image"),
-        (lambda data: b"x" + data[1:], "begins no image"),
+        (lambda data: data[:-1], "is not the beginning"),
+        (lambda data: b"x" + data[1:], "is not the beginning"),
         (lambda data: data[:13] + struct.pack("<i", 8) + data[17:], "image chunk of 8 bytes"),
         (lambda data: data[:17] + struct.pack("<i", -1) + data[21:], "header of -1"),
         (lambda data: b"000000003abc", "3 bytes are no image chunk"),

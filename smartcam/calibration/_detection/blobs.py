@@ -2,8 +2,8 @@
 
 Pixels darker than the mean of their surroundings are joined into connected pieces. A piece whose
 area is about that of the ellipse with the same second moments is a spot: letters, lines, rings and
-corners fill less of that ellipse. The size of the surroundings limits the size of the dots that are
-found; a few sizes cover all grids that an image can show.
+corners fill less of that ellipse. Dots are found only if they are smaller than these surroundings;
+a few sizes of surroundings are enough for all grids that an image can show.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ MAX_ASPECT_RATIO = 6.0
 
 
 MIN_RECTANGLE_SHARE = 0.2
-"""A dot fills at least this part of the upright rectangle around it: a slanted ellipse six times as
-long as wide, of which MIN_ELLIPSE_SHARE is filled, fills 0.22."""
+"""A dot fills at least this part of the upright rectangle around it. A slanted ellipse six times as
+long as wide fills 0.22 of its rectangle if MIN_ELLIPSE_SHARE of the ellipse is filled."""
 
 
 class Spots(NamedTuple):
@@ -111,7 +111,8 @@ def _fills_ellipse(
 ) -> NDArray[np.bool_]:
     """Return a mask of the candidates that fill an ellipse which is not too long.
 
-    ``index_of_piece``: for each of the pieces its index among ``candidates``, or -1.
+    ``index_of_piece``: index of each piece among ``candidates``, or -1 if the piece is no
+    candidate.
     """
     count = len(candidates.areas)
     dark_pixels = np.flatnonzero(pieces.dark)
@@ -129,7 +130,7 @@ def _fills_ellipse(
         np.bincount(candidate_of_pixel, product, count) / candidates.areas
         for product in (x * x, x * y, y * y)
     )
-    xx, yy = xx + 1 / 12, yy + 1 / 12  # a pixel's own: the variance of a side of 1
+    xx, yy = xx + 1 / 12, yy + 1 / 12  # a pixel's own second moment
     root_determinant = np.sqrt(np.maximum(xx * yy - xy * xy, 0))
     mean = (xx + yy) / 2
     larger_eigenvalue = mean + np.sqrt(

@@ -1,8 +1,9 @@
-"""Find checkerboards of any size in images, whole or in part.
+"""Find checkerboards with any number of squares in images, whole or in part.
 
 A corner of a board is a saddle of the grey levels, and the saddles next to it are turned by 90
-degrees. Little else in a picture is connected like that. Saddles are searched in a reduced image;
-missing corners are then fitted in the full image, at places that the found corners predict.
+degrees. Hardly anything else in a picture has such neighbours. Saddles are searched in a reduced
+image. The corners that were not found there are fitted in the full image, at the places that the
+found corners predict.
 """
 
 from __future__ import annotations
@@ -35,14 +36,16 @@ USUAL_SIDE_PX = 800
 at twice this size, unless the image is smaller."""
 
 NEIGHBOURS = 8
-"""Number of nearest saddles among which the next corners are searched: four corners and others."""
+"""The four corners next to a corner are searched among this many nearest saddles, since other
+saddles may lie between them."""
 
 FITTED_SHARE = 0.45
-"""Edges at a corner are fitted along this part of a square's side, which ends before the next
-edges."""
+"""Edges at a corner are fitted along this part of a square's side, so that the fit does not reach
+the edges at the next corner."""
 
 MIN_FITTED_SHARE = 0.6
-"""At least this part of a board's sampled corners is fitted well, with alternating colours."""
+"""A candidate is a board if at least this part of its corners is found by fits, and if the colours
+of the squares there alternate as on a board."""
 
 MIN_FILLED_SHARE = 0.5
 """An outermost row or column is left out if less than this part of its corners is found."""
@@ -51,7 +54,8 @@ MAX_OFFSET_STEPS = 0.25
 """A fitted corner may differ from its predicted place by this part of the step between corners."""
 
 MIN_SQUARE_PIXELS = 9.0
-"""A corner is fitted only where a square has a larger area than this in the image, pixels^2."""
+"""A corner is fitted only if a square next to the corner has a larger area than this in the image,
+pixels^2."""
 
 MAX_REACH_PX = 8.0
 """At most this many pixels around a corner are fitted: enough to see whether there is a corner."""
@@ -66,12 +70,12 @@ SQUARE_SAMPLES = np.array(
         for x, y in itertools.product((0.2, 0.35), repeat=2)
     ]
 )
-"""(16, 2), places in the four squares at a corner, as parts of the steps to the next corners: first
-in two opposite squares, then in the other two."""
+"""(16, 2), places in the four squares around a corner, as parts of the steps to the next corners:
+eight places in two opposite squares, then eight in the two other squares."""
 
 MAX_SAME_BOARD_OFF_PX = 3.0
-"""Boards found in two sizes of an image are the same if the median distance between their corners
-is less than this many pixels."""
+"""Boards found in two reductions of an image are the same board if the median distance between
+their corners is less than this many pixels."""
 
 MAX_ITERATIONS = 4
 """Missing corners of a board are added in at most this many rounds."""
@@ -139,32 +143,34 @@ class Board(NamedTuple):
 
 
 def colour_signs(grid_positions: NDArray[np.intp]) -> Array:
-    """Return 1 and -1, which alternate over the grid like the colours of a board."""
+    """Return 1 or -1 for each position; the signs alternate like the colours of a board."""
     return np.where(grid_positions.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
 def find_boards(image: GreyImage, wanted_count: int, *, max_count: int) -> Iterator[Board]:
-    """Yield the largest board in each size of an image, of at most about ``max_count`` corners.
+    """Reduce an image by up to three factors, and yield the largest board in each reduced image.
 
-    The search in a size ends with the first board of ``wanted_count`` corners or more.
+    No board has many more than ``max_count`` corners. The search in an image ends with the first
+    board of ``wanted_count`` corners or more.
     """
     min_factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
     for factor in dict.fromkeys((2 * min_factor, min_factor, (min_factor + 1) // 2)):
         saddles = find_saddles(reduce_levels(image.uint8_levels, factor))
         largest: Lattice = {}
-        grids = grow_grids(
+        grid_search = grow_grids(
             saddles.points,
             saddles.may_be_neighbours,
             min_count=4,
             max_count=max_count,
             neighbours=NEIGHBOURS,
         )
-        for grid in grids:
+        for grid in grid_search:
             largest = max(largest, grid, key=len)
             if len(largest) >= wanted_count:
                 break
         if largest:
-            has_twin = any(_grid_size(grid) == _grid_size(largest) for grid in grids)
+            size = _grid_size(largest)
+            has_twin = any(_grid_size(other) == size for other in grid_search)  # the rest
             points = (saddles.points[list(largest.values())] + 0.5) * factor - 0.5
             yield Board(points, np.array(list(largest), dtype=np.intp), has_twin).trim_rim()
 
@@ -175,13 +181,13 @@ def _grid_size(grid: Lattice) -> list[int]:
 
 
 def complete_board(image: GreyImage, board: Board) -> Board | None:
-    """Return the board with missing corners added; None if the fits show that it is no board."""
+    """Return the board with missing corners added; None if fits show that this is no board."""
     sampled_positions = board.grid_positions[
         :: math.ceil(len(board.grid_positions) / MAX_CORNERS_JUDGED)
     ]
     _, signs = _fit_corners(image, board, sampled_positions)
-    board_sign = float(colour_signs(sampled_positions) @ signs)
-    if abs(board_sign) < MIN_FITTED_SHARE * len(sampled_positions):
+    sign_sum = float(colour_signs(sampled_positions) @ signs)
+    if abs(sign_sum) < MIN_FITTED_SHARE * len(sampled_positions):
         return None
     new_positions = board.grid_positions
     for _ in range(MAX_ITERATIONS):
@@ -194,7 +200,7 @@ def complete_board(image: GreyImage, board: Board) -> Board | None:
         )
         missing = missing[is_beside_new]
         points, signs = _fit_corners(image, board, missing)
-        is_corner = colour_signs(missing) * signs * board_sign > 0
+        is_corner = colour_signs(missing) * signs * sign_sum > 0
         if not is_corner.any():
             break
         new_positions = missing[is_corner]
@@ -218,9 +224,10 @@ def _missing_positions(
 def _fit_corners(
     image: GreyImage, board: Board, grid_positions: NDArray[np.intp]
 ) -> tuple[Array, Array]:
-    """Return corners (N, 2) at a board's grid positions, and the signs of their gains.
+    """Return corners (N, 2) at a board's grid positions, and the signs of their colours.
 
-    The sign is 0 where the image shows no corner, and for positions outside of the image.
+    The sign of a corner's ``gain`` tells which two of its squares are black. The sign is 0 if the
+    image shows no corner there, and outside of the image.
     """
     grid_map = GridMap(board.grid_positions.astype(np.float64), board.points)
     coordinates = grid_positions.astype(np.float64)

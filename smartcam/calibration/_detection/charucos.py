@@ -1,4 +1,4 @@
-"""Find ChArUco boards in images: their corners have ids, and some may be hidden."""
+"""Find ChArUco boards in images: each corner has an id, so some corners may be hidden."""
 
 from __future__ import annotations
 
@@ -46,11 +46,12 @@ MAX_DOUBLED_PX = 2600
 """An image whose longest side is at most this many pixels is also searched at twice its size."""
 
 MIN_QUADRANGLES = 5
-"""At least this many dark quadrangles in rows and columns may be a board's markers."""
+"""Dark quadrangles in rows and columns may be a board's markers if there are at least this many."""
 
 MIN_MODULE_PIXELS, MAX_UNREAD_MODULE_PIXELS = 0.6, 2.5
-"""Limits for the side of a marker's module, pixels. Smaller ones cannot be read even at twice the
-size. Larger ones would have been read, so quadrangles of that size are no markers."""
+"""Limits for the side of a marker's module (a square of its code), pixels. Smaller modules cannot
+be read even in an image enlarged twice. Markers with larger modules would have been read, so
+quadrangles of that size are no markers."""
 
 MAX_SQUARES_OFF = 0.3
 """A corner may differ from the nearest markers' prediction by this part of a square's side."""
@@ -81,7 +82,7 @@ def _name(target: Charuco) -> str:
 def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetView:
     """Find the visible corners of a ChArUco board.
 
-    Raises TARGET_NOT_FOUND, MIRRORED, or SHAPE if the dictionary is unknown.
+    Raises TARGET_NOT_FOUND, WRONG_TARGET or MIRRORED; or SHAPE: the dictionary is unknown.
     """
     sighting = _find_board(image, target)
     ids, points = sighting.ids, sighting.points
@@ -167,21 +168,21 @@ class _Sighting(NamedTuple):
 
     ids: NDArray[np.intp]  # (N,), ascending
     points: Array  # (N, 2), pixels
-    marker_count: int  # number of markers that were read
+    marker_count: int  # number of markers that were read, whether or not they lie as on the board
     agreeing_count: int  # number of read markers that are arranged as on the board
-    contrary_count: int  # number of other markers that agree with each other
+    contrary_count: int  # number of other markers that lie as on a second board
     other_pattern_count: int  # number of markers arranged as with the other legacy_pattern
     stray_ids: tuple[int, ...]  # ids of the markers that were left out
-    # side of a marker, pixels of the given image: of those that were read, or else of quadrangles
-    # in rows and columns; 0 if there are neither
+    # side of a marker, pixels of the given image: that of the markers that were read; if none was
+    # read, that of quadrangles in rows and columns; 0 without such quadrangles
     marker_side: float
 
 
 def _search_sizes(image: GreyImage, target: Charuco) -> _Sighting:
     """Search a board in a reduced image, then in the given image, then at twice its size.
 
-    Each search ends if it shows enough of the board. The image is enlarged only if there may be
-    markers that are too small to be read.
+    No further size is searched once enough of the board was found. The image is enlarged only if it
+    may have markers that are too small to be read.
     """
     best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0, 0, 0, (), 0.0)
     factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
@@ -216,7 +217,7 @@ def _has_all_corners(sighting: _Sighting, target: Charuco, image: GreyImage) -> 
 def _search_image(
     image: NDArray[np.uint8], scale: float, target: Charuco, best: _Sighting
 ) -> _Sighting:
-    """Return the sighting in an image of ``scale`` times the size if it is better than ``best``."""
+    """Return the sighting in a resized image if it shows more than ``best``, else ``best``."""
     board = charuco_board(target)
     finder = marker_finder(image, board.getDictionary())
     quads, ids_read, rejected = finder.detectMarkers(image)
@@ -276,7 +277,7 @@ def _interpolate_corners(
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
     if hasattr(parameters, "checkMarkers"):  # OpenCV 4.11 and later
-        parameters.checkMarkers = False  # the two forms of OpenCV's result agree
+        parameters.checkMarkers = False  # results of both versions are then equal
     detector = cv2.aruco.CharucoDetector(board, parameters)
     quads = [quad[None].astype(np.float32) for quad in markers.quads]
     marker_ids = markers.ids.astype(np.int32)[:, None]

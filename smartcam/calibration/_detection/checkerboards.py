@@ -44,16 +44,16 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_CORNERS_CONNECTED = 10
-"""A part of a board has at least this many connected corners: pictures of leaves, bricks and noise
-have up to nine."""
+"""A part of a board is accepted only with at least this many connected corners: pictures of leaves,
+bricks and noise have up to nine."""
 
 MAX_STRAY_PX = 0.5
 """A corner is a stray if it is farther from its predicted place than this many pixels plus four
 times the median distance."""
 
 OUTER_AREA_RATIO = 0.8
-"""The grey level of the area outside of a corner is averaged over this part of the area's diameter,
-which leaves out its rim."""
+"""Only this part of the diameter of the area outside of a corner is averaged, which leaves out the
+area's rim."""
 
 DOT_RING_SIDES = 0.3
 """Distance from the centre of the dot at the origin to the paper around it, in sides of a
@@ -130,7 +130,7 @@ class _BoardCorners(NamedTuple):
     points: Array  # (N, 2), pixels
     # (N,), whether the corner was found; the place of any other is predicted from its neighbours
     is_seen: NDArray[np.bool_]
-    part: Checkerboard  # the target, or a board of those of its columns and rows that are seen
+    part: Checkerboard  # the target, or a smaller board with the columns and rows that are seen
     has_twin: bool = False  # whether the image has another complete board
 
 
@@ -178,7 +178,7 @@ def _find_candidates(
 
 
 def _possible_parts(target: Checkerboard, counts: tuple[int, int]) -> Iterator[Checkerboard]:
-    """Yield the target if it has these counts, else its parts of these counts with the mark."""
+    """Yield the target if it has these columns and rows, else its parts that include the mark."""
     for columns, rows in dict.fromkeys((counts, counts[::-1])):
         if (columns, rows) == (target.columns, target.rows):
             yield target
@@ -187,7 +187,7 @@ def _possible_parts(target: Checkerboard, counts: tuple[int, int]) -> Iterator[C
 
 
 def _refine(image: GreyImage, board: _BoardCorners, steps: Array) -> Corners:
-    """Return the refined corners; a corner that is not visible keeps its place, as not fitted.
+    """Return the refined corners; an invisible corner keeps its place and is not ``fitted``.
 
     ``steps`` (N, 2, 2) lead to the next corners, pixels.
     """
@@ -217,10 +217,11 @@ def _grid_steps(points: Array, target: Checkerboard) -> Array:
 def _refit_strays(
     image: GreyImage, corners: Corners, is_seen: NDArray[np.bool_], target: Checkerboard
 ) -> Corners:
-    """Return the corners after fitting strays again, at the places that the others predict.
+    """Return the corners after fitting strays again from the places that other corners predict.
 
-    A stray is a corner that was not fitted, or is far from its predicted place. If it is a stray
-    again, its distance from the predicted place is added to its covariance.
+    A stray is a corner that was not fitted, or is far from its predicted place. If a corner is a
+    stray again after the second fit, its distance from the predicted place is added to its
+    covariance.
     """
     grid_positions = positions_row_by_row(target.columns, target.rows).astype(np.float64)
     is_good = corners.fitted
@@ -284,7 +285,7 @@ def _number_board(
         )
 
         def level(order: NDArray[np.intp]) -> float:
-            """Return the grey level of the area, corrected for the light on the board there."""
+            """Return the grey level outside of the origin, corrected for uneven light."""
             black, white, area_level = levels_by_origin[int(order[0, 0])]
             share = 1.0 if area_level is None else (area_level - black) / max(white - black, 1.0)
             return float(mean_black + (mean_white - mean_black) * share)
@@ -304,8 +305,8 @@ def _number_board(
 def _white_origin_error(target: Checkerboard, label: str) -> CalibrationError:
     """Return the error for a board whose black corners are where the target has white ones.
 
-    If columns and rows are both odd and differ, two opposite corners are black, and turning the
-    sheet exchanges no black corner with a white one.
+    If columns and rows are both odd and differ, two opposite outer corners are black, and no turn
+    of the sheet brings a white corner to the place of a black one.
     """
     return Code.MIRRORED.refusal(
         f"{label}: expected a black square outside of the corner at the origin, got a white one: "
@@ -344,7 +345,7 @@ def _number_part(
 def _paper_levels(image: GreyImage, grid: Array) -> Iterator[float]:
     """Yield the levels of the paper around the dot, and along the two edges that meet there.
 
-    Places outside of the image have the level 0.
+    The level of a place outside of the image is 0.
     """
     rows, columns, _ = grid.shape
     low = -(1 + AREA_DISTANCE_SQUARES)
@@ -388,10 +389,10 @@ def _origin_levels(
 
 
 def _black_origin_score(target: Checkerboard, corners: Corners, arrangement: Arrangement) -> float:
-    """Return the number of corners that fit a black square at the origin, minus the others."""
+    """Return the number of corners whose colours fit a black origin, minus all other corners."""
     order = arrangement.order
-    # gains refer to the found grid's columns and rows, whose directions may differ from the
-    # target's
+    # the sign of a gain depends on the directions of the found grid's columns and rows, which may
+    # differ from those of the target
     direction = float(np.sign(order[0, 1] - order[0, 0]) * np.sign(order[1, 0] - order[0, 0]))
     signs = np.sign(corners.gains[order.ravel()])
     return direction * float(

@@ -45,28 +45,31 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO = 1.0, 0.3
-"""Side of the square with whose mean a pixel is compared, in distances between dots of a grid that
-fills the image: of a wide and of a narrow square."""
+"""Sides of the wide and of the narrow square around a pixel, with whose mean the pixel is compared;
+in distances between the dots of a grid that fills the image."""
 
 SMALL_SIDE_PX = 800
 """A grid is searched first in an image whose longest side has at most this many pixels."""
 
 MIN_DOT_SHARE = 0.4
 """The image is searched at twice its size only if at least this part of a grid's dots is found in
-rows and columns among dots of a few pixels: as many are separated if all are at twice the size."""
+rows and columns among dots of a few pixels. (Doubling the size separates dots that touch each other
+at the given size.)"""
 
 NEIGHBOURS = 8
-"""The next dots of a grid of dots of a few pixels are searched among this many neighbours."""
+"""In a grid whose dots have only a few pixels, the next dots are searched among this many
+neighbours."""
 
 EXTRA_SPOTS = 1000
-"""Number of spots that are examined, in addition to twice the number of the target's dots; in an
-image with more spots, the largest."""
+"""Number of spots that are examined in addition to twice the number of the target's dots. If an
+image has more spots, only the largest are examined."""
 
 MIN_DOTS_REPORTED = 9
-"""An error reports dots in rows and columns only if there are at least this many."""
+"""An error reports that dots in rows and columns were found only if at least this many were."""
 
 MAX_OFFSET_RATIO = 0.15
-"""A dot may lie off the place that the others predict by this part of the distance between dots."""
+"""A dot may be this far from the place that the other dots predict, as a part of the distance
+between dots."""
 
 RING_DIRECTIONS = np.column_stack(
     [np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)]
@@ -89,7 +92,7 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
 
 @dataclass
 class _SearchCounts:
-    """The counts of a search, for the text of its error."""
+    """The numbers of spots and dots that a search has found, for the error if the search fails."""
 
     spot_count: int | None = None  # count of dark spots, in the first search
     # largest number of dots in rows and columns; growing stops above the target's number
@@ -164,7 +167,7 @@ def _find_pieces(
 
 
 def _contain_grid(specks: Spots, target: CircleGrid) -> bool:
-    """Return True if a good part of the grid is among dots of a few pixels."""
+    """Return True if many dots of the grid are found among the dots of a few pixels."""
     min_count = max(4, round(MIN_DOT_SHARE * len(target.points)))
     may_be_neighbours = area_test(specks.areas)
     return any(
@@ -181,7 +184,7 @@ def _contain_grid(specks: Spots, target: CircleGrid) -> bool:
 def _find_layouts(
     spots: Spots, target: CircleGrid, counts: _SearchCounts
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-    """Yield grids of the target's number of dots: dots (N, 2) and their grid positions (N, 2)."""
+    """Yield grids with as many dots as the target: dots (N, 2) and their grid positions (N, 2)."""
     count = target.columns * target.rows
     if counts.spot_count is None:
         counts.spot_count = len(spots.areas)
@@ -239,7 +242,7 @@ def _min_distance(target: CircleGrid) -> float:
 def _dot_and_gap_levels(
     image: GreyImage, target: CircleGrid, grid_map: GridMap
 ) -> tuple[float, float]:
-    """Return the mean grey level in the dots, and that in the gaps around them."""
+    """Return the mean grey level in the dots, and the mean grey level in the gaps around them."""
     flat_points = target.points[:, None, :2]
     gap = (_min_distance(target) + target.diameter) / 4
     inner_level, outer_level = (
@@ -332,7 +335,7 @@ def _number_dots(
     )
 
     def level(order: NDArray[np.intp]) -> float:
-        """Return the level of the rim, corrected for the brightness of the paper there."""
+        """Return the grey level at the larger dot's rim, corrected for uneven light."""
         rim_level, paper_level = levels_by_origin[int(order[0, 0])]
         return rim_level * mean_paper / max(paper_level, 1.0)
 

@@ -1,4 +1,4 @@
-r"""Refine the corners of a checkerboard.
+r"""Refine the places of a checkerboard's corners to a fraction of a pixel.
 
 Two edges cross at a corner. Behind a lens that blurs by a Gaussian of width ``s`` the grey levels
 around it are ``offset + gain * erf(d1 / s') * erf(d2 / s')``, where ``d`` is the distance from an
@@ -37,13 +37,15 @@ MAX_REACH_PX = 13
 time."""
 
 MAX_RESIDUAL_RATIO = 0.35
-"""Largest RMS of a good fit's residuals, as a part of the gain; where there is no edge it is 1."""
+"""Largest RMS of a good fit's residuals, as a part of the gain; without an edge the RMS is as large
+as the gain."""
 
 MIN_SINE = 0.17
 """The two edges of a corner must cross at an angle whose sine is larger than this: 10 degrees."""
 
 UNREFINED_SIGMA_PX = 0.25
-"""Standard deviation, pixels, of a corner that could not be refined: that of common detectors."""
+"""Standard deviation, pixels, that is assumed for a corner that could not be refined: it is usual
+for other detectors."""
 
 ROUNDED_RADIUS_PX = 2.0
 """Pixels within this radius of a single square's corner are not fitted: the blur rounds the corner,
@@ -77,12 +79,12 @@ def refine_corners(
     A corner whose fit does not converge near its start, or does not look like a corner, stays where
     OpenCV's ``cornerSubPix`` puts it.
 
-    ``points`` (N, 2) are known to a pixel or two. ``edge_steps`` (N, 2, 2), pixels, lead along the
-    two edges; with their opposites they span the part of the four squares that is fitted.
-    ``arm_widths`` (N, 2): only pixels within this part of ``edge_steps`` from an edge are fitted,
-    since the squares are printed beyond; None: all. ``is_single_square``: the corner is that of one
-    square, which lies between the first step and the opposite of the second one; these two are in
-    counter-clockwise order in the image's u and v.
+    The places ``points`` (N, 2) may be off by a pixel or two. ``edge_steps`` (N, 2, 2), pixels,
+    lead along the two edges; with their opposites they span the part of the four squares that is
+    fitted. ``arm_widths`` (N, 2): only pixels within this part of ``edge_steps`` from an edge are
+    fitted, since something else is printed beyond; None: all pixels are fitted.
+    ``is_single_square``: the corner is that of one square, which lies between the first step and
+    the opposite of the second one; these two are in counter-clockwise order in the image's u and v.
     """
     reach = np.linalg.norm(edge_steps, axis=2).min(axis=1)
     start = _refine_by_opencv(
@@ -110,7 +112,7 @@ def refine_corners(
 
 
 def _refine_by_opencv(image: GreyImage, points: Array, reach: Array) -> Array:
-    """Refine points by OpenCV's ``cornerSubPix``, with a window for the smallest squares."""
+    """Refine points by OpenCV's ``cornerSubPix``, with a window that fits the smallest squares."""
     cv2 = load("cv2")
     half_window = int(np.clip(0.8 * reach.min(), 2, 5))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-2)

@@ -1,4 +1,4 @@
-"""Refine the dots of a circle grid.
+"""Refine the centres of a circle grid's dots to a fraction of a pixel.
 
 A round dot is seen as an ellipse. Behind a lens that blurs by a Gaussian of width ``s`` the grey
 levels around its rim are ``offset + gain * erf(d / s')``, where ``d`` is the distance from the rim
@@ -39,15 +39,18 @@ MAX_REACH_PX = 20
 image."""
 
 MAX_RESIDUAL_RATIO = 0.5
-"""Largest RMS of a good fit's residuals, as a part of the gain; where there is no dot it is 1."""
+"""Largest RMS of a good fit's residuals, as a part of the gain; without a dot the RMS is as large
+as the gain."""
 
 UNREFINED_SIGMA_PX = 0.5
-"""Standard deviation, pixels, of a dot that could not be refined: that of common detectors."""
+"""Standard deviation, pixels, that is assumed for a dot that could not be refined: it is usual for
+other detectors."""
 
 CENTRE, ELLIPSE = slice(0, 2), slice(2, 5)
 
 MIN_DOTS_FOR_LENS = 20
-"""The bend by the lens, ten values for each axis, is fitted to grids of at least this many dots."""
+"""The distortion of the grid by the lens, ten values for each axis, is fitted only to grids of at
+least this many dots."""
 
 # The points of a regular polygon with n corners at distance R are on average, squared,
 # R^2 / 2 (1 - 2/3 sin^2(pi / n)) from its middle; those of the unit disc 1/2.
@@ -69,7 +72,7 @@ class Dots(NamedTuple):
 
 
 class GridMap:
-    """The map from a flat grid to pixels: a homography, and a cubic for the bend by the lens.
+    """The map from a flat grid to pixels: a homography, and a cubic for the lens' distortion.
 
     Args:
         sheet_points: (N, 2), places of the dots on the sheet, in any unit.
@@ -116,9 +119,9 @@ class GridMap:
 def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -> Dots:
     """Return the fitted ellipses of dots.
 
-    ``points`` (N, 2): centres, known to a fraction of the radius. ``radii`` (N, 2, 2): from the
-    centre to the rim along the sheet's x and y. ``reaches`` (N, 2, 2): in the same directions, to
-    where the next print begins. All are in pixels.
+    ``points`` (N, 2): centres, which may be off by a fraction of the radius. ``radii`` (N, 2, 2):
+    from the centre to the rim along the sheet's x and y. ``reaches`` (N, 2, 2): in the same
+    directions, to where the next print begins. All are in pixels.
     """
     longest_reach = float(np.hypot(reaches[:, 0], reaches[:, 1]).max())
     if longest_reach > MAX_REACH_PX:

@@ -23,16 +23,16 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     Corners of squares are found where two fitted edges cross, dots by an ellipse fitted to their
     rim, whose centre is corrected for perspective by the map of the whole grid. All dots of a grid
     must be visible. Of a checkerboard some corners in each row and column must be visible, and most
-    of those in the outermost ones; covered corners are left out. Any part of a checkerboard is
-    enough if it has the origin's mark. Of a ChArUco board at least four corners must be visible.
-    The places of its markers are compared with the board: those that lie elsewhere than their ids
-    say are left out and named in the view's ``warnings``. Dots may be dark on light or light on
-    dark; a grid with more dots than the target is refused.
+    corners of the outermost rows and columns; covered corners are left out. Any part of a
+    checkerboard is enough if it includes the mark at the origin. Of a ChArUco board at least four
+    corners must be visible. The places of its markers are compared with the board: markers that are
+    not where their ids belong are left out and named in the view's ``warnings``. Dots may be dark
+    on light or light on dark; a grid with more dots than the target is refused.
 
-    Points are numbered as in the target. Its origin is known by its mark, its larger dot or its
-    ids; without these by the black outermost square at the origin, if only one of the possible
-    corners has a black one. Otherwise the target's x points to the right of the image rather than
-    to the left.
+    Points are numbered as in the target. The target's origin is known by its mark, its larger dot
+    or its ids. A target without these has its origin at the corner with a black outermost square,
+    if only one of the possible corners has one. Otherwise the target's x points to the right of the
+    image rather than to the left.
 
     A mirrored image is refused if the print shows that it is mirrored: of a ChArUco board; of a
     checkerboard or a grid of dots with a mark or a larger dot at its origin, unless it is square
@@ -42,8 +42,8 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     target itself after a turn: the view then has mirrored points, which nothing in a single image
     can show.
 
-    The time spent on an image without a target is bounded: by the number of saddles, dark spots or
-    quadrangles that are examined, and of those that a grid is grown from.
+    The time spent on an image without a target is bounded, since only a limited number of saddles,
+    dark spots or quadrangles is examined, and grids are grown from only a few of them.
 
     Args:
         image: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; 16 to 20,000 pixels wide
@@ -52,10 +52,9 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
         name: name of the image, for messages.
 
     Returns:
-        Points with a covariance that follows from the noise in the image alone: errors that
-        compression, the print or the lens add to an edge come on top. A corner that cannot be
-        fitted stays where it was found first, with a standard deviation of a quarter of a pixel or
-        more.
+        Points with a covariance that follows from the noise in the image alone; it does not include
+        errors that compression, the print or the lens add. A corner that cannot be fitted stays
+        where it was found first, with a standard deviation of a quarter of a pixel or more.
 
     Raises:
         CalibrationError: SHAPE: the array is no such image, or the ChArUco board has an unknown

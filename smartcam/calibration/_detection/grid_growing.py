@@ -37,25 +37,27 @@ this: 30 degrees. The two shortest steps of a lattice enclose 60 degrees or more
 
 MAX_STEP_OFFSET, MAX_FIRST_STEP_OFFSET = 0.3, 0.2
 """A dot is the grid's next dot if its distance from the end of the step is less than this part of
-the step. The second value is for the first wave of steps, where steps change less."""
+the step. The second value is for the steps from the grid's first dot, near which steps change
+less."""
 
 MAX_AREA_RATIO = 1.8
 """A dot has at most this many times the area of its neighbour."""
 
 MAX_MEDIAN_OFFSET = 0.08
 """The median distance of a flat grid's dots from their predicted places is less than this part of a
-step: lenses bend a grid of fewer than 20 dots by less."""
+step: a lens distorts a grid of fewer than 20 dots by less than that."""
 
 MAX_SEEDS_RANKED = 128
-"""A second pair of opposite neighbours is searched at this many dots, those with the best first
-pair."""
+"""A second pair of opposite neighbours is searched only at this many dots: the dots whose first
+pair is most exactly opposite."""
 
 MAX_SEEDS_TRIED = 4
 """A grid is grown from at most this many dots. The neighbours of a grid's dot are more exactly
 opposite than those of other dots, so the first dot that is tried is usually one of the grid."""
 
 MIN_DOTS_REACHED = 8
-"""At least this many dots of a grid lie within two steps of its first dot, that dot included."""
+"""Within two steps of a grid's first dot there are at least this many of its dots, including the
+first dot."""
 
 Place = tuple[int, int]
 
@@ -65,7 +67,8 @@ Lattice = dict[Place, int]
 """The dot at each column and row; the origin and directions of these are arbitrary."""
 
 PairTest: TypeAlias = "Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]"
-"""Function that returns a mask of the pairs, given by the indices of dots, that fit together."""
+"""Function of the indices of the first and second dots of pairs; it returns a mask of the pairs
+that fit together."""
 
 
 def grow_grids(
@@ -80,10 +83,10 @@ def grow_grids(
     """Yield grids of connected dots.
 
     ``may_be_neighbours`` tells which of the ``points`` (N, 2), pixels, may be neighbours,
-    ``may_follow`` which others may come after a dot (None: the same). A grid has at least
-    ``min_count`` dots, four or more. Growing stops soon after ``max_count`` dots. A grid is grown
-    from a dot that has two pairs of opposite dots among its nearest ``neighbours``; at most
-    MAX_SEEDS_TRIED of these are tried.
+    ``may_follow`` which dot may come after another one (None: as ``may_be_neighbours``). A grid has
+    at least ``min_count`` dots, four or more. Growing stops soon after ``max_count`` dots. A grid
+    is grown from a dot that has two pairs of opposite dots among its nearest ``neighbours``; at
+    most MAX_SEEDS_TRIED of these are tried.
     """
     if len(points) < 5:
         return
@@ -104,7 +107,7 @@ def grow_grids(
 
 
 def area_test(areas: Array, ratio: float = 1.0) -> PairTest:
-    """Return a test whether the first of two dots has about ``ratio`` times the second's area."""
+    """Return a test for pairs whose first dot has about ``ratio`` times the second dot's area."""
 
     def has_ratio(first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.bool_]:
         quotient = areas[first] / (ratio * areas[second])
@@ -115,7 +118,7 @@ def area_test(areas: Array, ratio: float = 1.0) -> PairTest:
 
 @dataclass(eq=False)
 class _GridGrower:
-    """Grows grids among dots, from one of the dots."""
+    """Finds a grid among dots, beginning at one of its dots."""
 
     _points: Array
     _may_be_neighbours: PairTest
@@ -161,11 +164,11 @@ class _GridGrower:
                     break
 
     def grow(self, start: int, steps: Array, max_count: int) -> Lattice:
-        """Return the dots reached step by step from a dot; stop soon after ``max_count``."""
+        """Return the dots that are reached from a dot, hardly more than ``max_count``."""
         grid: Lattice = {(0, 0): start}
         used = {start}
-        # place, dot, steps to its neighbours, and the dot with which the neighbours' area is
-        # compared
+        # column and row, index of the dot, steps to its neighbours, and index of the dot with whose
+        # area the neighbours' areas are compared
         front = [((0, 0), start, steps, start)]
         wave_count = 0
         while front and len(grid) <= max_count:
@@ -256,7 +259,7 @@ class _GridGrower:
 
 
 def _second_deviation(vectors: Array, deviations: Array) -> Array:
-    """Return the least deviation (N,) of pairs in another direction than the best pair.
+    """Return the least deviation (N,) of a pair whose direction differs from the best pair's.
 
     ``vectors`` (N, K, 2): to the K neighbours. ``deviations`` (N, K, K): how far each two
     neighbours are from being opposite.

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 BLUR, GAIN, OFFSET = -3, -2, -1
 
 MIN_BLUR_PIXELS = 0.25
-"""Least blur of a fit, pixels, about the width of a pixel: no fit can measure less."""
+"""Least blur of a fit, pixels: a fit cannot measure a blur that is far below a pixel's width."""
 
 MAX_BLUR_PIXELS = 6.0
-"""Largest blur of a good fit, pixels: with more, the pixels show no edge."""
+"""Largest blur of a good fit, pixels: pixels with a larger blur show no edge."""
 
 MIN_HALF_STEP = 4.0
-"""Half the step from black to white of a good fit is more than this many grey levels of 255."""
+"""The gain of a good fit, half the step from black to white, is above this, grey levels of 255."""
 
 MAX_STEPS = 20
 """A fit takes at most this many steps; most fits take four to seven."""
@@ -44,7 +44,7 @@ DIAGONAL_OFFSET = 1e-6
 
 
 class Fits(NamedTuple):
-    """A model with M values at each of N points."""
+    """The M fitted values at each of N points, with their normal equations."""
 
     values: Array  # (N, M)
     cost: Array  # (N,), sum of the squared residuals
@@ -87,14 +87,13 @@ def fit_windows(
 ) -> tuple[Fits, NDArray[np.bool_]]:
     """Return the best fits, and a mask (N,) of the good ones.
 
-    A good fit converged, with a blur and a gain that an edge may have.
-
-    A fit starts from ``values`` (N, M), but with the best gain and offset. ``pixel_values``:
-    indices of the values in pixels, by whose steps convergence is judged. ``max_residual_ratio``:
-    largest RMS of a good fit's residuals, as a part of its gain.
+    A fit is good if it converged, and if an edge may have its blur and gain. Fits start from
+    ``values`` (N, M), but with the best gain and offset for these values. ``pixel_values``: indices
+    of the values in pixels, by whose steps convergence is judged. ``max_residual_ratio``: largest
+    RMS of a good fit's residuals, as a part of its gain.
     """
     values[:, BLUR], values[:, GAIN:] = 1.0, 0.0
-    # The model is linear in gain and offset, so one solution of their normal equations is the best.
+    # The model is linear in gain and offset, so solving their normal equations once gives the best.
     level_fits = evaluate(windows, values)
     linear = level_fits.hessian[:, GAIN:, GAIN:] + DIAGONAL_OFFSET * np.eye(2)
     values[:, GAIN:] = np.linalg.solve(linear, level_fits.gradient[:, GAIN:, None])[:, :, 0]

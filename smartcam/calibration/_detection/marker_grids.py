@@ -46,7 +46,7 @@ MAX_DOUBLED_PX = 2600
 def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> TargetView:
     """Find the corners of the visible markers.
 
-    Raises TARGET_NOT_FOUND, WRONG_TARGET, or SHAPE if the dictionary is unknown.
+    Raises TARGET_NOT_FOUND or WRONG_TARGET; or SHAPE: the dictionary is unknown.
     """
     label = f"grid of {target.columns} x {target.rows} markers"
     board_corners = target.points[target.corners, :2]
@@ -73,7 +73,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
     check_one_board(len(best.ids), contrary_count, label)
     if len(best.ids) < MIN_AGREEING_MARKERS:
         raise Code.TARGET_NOT_FOUND.refusal(
-            f"{label}: expected at least {MIN_AGREEING_MARKERS} that stand to each other as "
+            f"{label}: expected at least {MIN_AGREEING_MARKERS} markers arranged as "
             f"on the board, found {len(best.ids)} of {read_count} markers of its dictionary",
             MIN_AGREEING_MARKERS,
             len(best.ids),
@@ -95,7 +95,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
 
 
 def _read_markers(image: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Markers:
-    """Return the markers in an image of ``scale`` times the size, numbered from the first one."""
+    """Return the markers in a resized image; ids count from ``first_id``, pixels are unscaled."""
     cv2: Any = load("cv2")
     count = target.columns * target.rows
     dictionary = marker_dictionary(target.dictionary, target.first_id + count, target.kind)
@@ -109,7 +109,7 @@ def _read_markers(image: NDArray[np.uint8], target: MarkerGrid, scale: float) ->
 
 
 def _refine(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points: Array) -> Corners:
-    """Return the refined corners of markers: on Kalibr's grid four squares meet at each."""
+    """Return the refined corners of markers; on Kalibr's grid each is a corner of four squares."""
     board_points = target.points[ids, :2]
     matrix = fit_homography(board_points, points)
     if matrix is None:
@@ -130,7 +130,7 @@ def _refine(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points:
 
 
 def marker_patterns(target: MarkerGrid) -> NDArray[np.bool_]:
-    """Return the black modules of each marker (M, H, H), the upper row first, as printed."""
+    """Return a mask (M, H, H) of the black modules of each of M markers, its upper row first."""
     count = target.columns * target.rows
     dictionary = marker_dictionary(target.dictionary, target.first_id + count, target.kind)
     modules = int(dictionary.markerSize) + 2 * target.border

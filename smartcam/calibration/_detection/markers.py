@@ -1,9 +1,10 @@
 """Read square markers in images, and compare their places with those on the board.
 
-A marker that was misread, or that belongs to another board, lies elsewhere than its number says,
-which its neighbours show. The corners of a marker tell how the board is turned and scaled there.
-Two markers agree if the vector between their centres, so turned and scaled, is that on the board.
-Markers that agree form a group; if the board is as described, all markers are in one group.
+The number of a marker tells its place on the board. A marker that was misread, or that belongs to
+another board, is not at this place, as its neighbours show. The corners of a marker tell how the
+board is turned and scaled at the marker. Two markers agree if the vector between their centres is
+that on the board, turned and scaled in this way. Markers that agree form a group; if the board is
+as described, all markers are in one group.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_NEIGHBOUR_PITCHES = 2.9
-"""Two markers are compared if they are at most this far apart on the board, in distances of next
-neighbours."""
+"""Two markers are compared if they are at most this far apart on the board, in pitches. The pitch
+is the distance between two neighbouring markers."""
 
 MAX_VECTOR_DIFFERENCE = 0.15
 """The vector between two markers may differ from the board's by this part of its length. A number
@@ -35,13 +36,12 @@ MAX_SLOPE_DIFFERENCE = 0.5
 """The turns and scales of two neighbouring markers may differ by this part."""
 
 MAX_PITCHES_OFF = 0.35
-"""A marker without neighbours may lie this many distances of next neighbours from its predicted
-place."""
+"""A marker without neighbours may lie this many pitches from its predicted place."""
 
 MIN_PITCHES_AGAINST = 0.6
-"""A group of markers contradicts the board's description if its distance from the place that the
-others predict is more than this many distances of next neighbours, plus MAX_VECTOR_DIFFERENCE times
-its distance from the others."""
+"""A group of markers contradicts the board's description if it is more than this many pitches, plus
+MAX_VECTOR_DIFFERENCE times its distance from the others, away from the place that the others
+predict."""
 
 MIN_CONTRARY_MARKERS = 3
 """A group that contradicts the description of the target has at least this many markers."""
@@ -77,7 +77,7 @@ class MarkerAgreement(NamedTuple):
     """The result of comparing markers with a board."""
 
     mask: NDArray[np.bool_]  # True for each marker that lies as on the board
-    contrary_count: int  # size of the largest group that agrees on other places
+    contrary_count: int  # size of the largest group that contradicts the board's description
 
 
 def marker_dictionary(name: str, min_count: int, label: str) -> Any:
@@ -139,7 +139,7 @@ def _outlines(image: NDArray[np.uint8], window: int, options: Any) -> NDArray[np
 
 
 def compare_with_board(markers: Markers, board: Array) -> MarkerAgreement:
-    """Find the markers that are arranged as on a board; each number counts once.
+    """Find the markers that are arranged as on a board; a number that was read twice counts once.
 
     ``board`` (M, 4, 2): the corners of the markers by their numbers, in any unit. If fewer than
     MIN_AGREEING_MARKERS markers agree, the mask is False for all.
@@ -190,9 +190,9 @@ def check_one_board(agreeing_count: int, contrary_count: int, label: str) -> Non
     """
     if contrary_count >= MIN_CONTRARY_MARKERS and 2 * contrary_count >= agreeing_count:
         raise Code.WRONG_TARGET.refusal(
-            f"{label}: expected markers of one such board, got {agreeing_count} that stand to each "
-            f"other as on it and {contrary_count} others that do so elsewhere: columns and rows "
-            "are others, or several boards with the same numbers are in the picture",
+            f"{label}: expected markers of one such board, got {agreeing_count} arranged as "
+            f"on it and {contrary_count} arranged as on another one: columns and rows are others, "
+            "or several boards with the same numbers are in the picture",
             f"{agreeing_count + contrary_count} markers of one board",
             agreeing_count,
         )
@@ -221,7 +221,7 @@ def predict_pixels(quads: Array, board_corners: Array, places: Array) -> tuple[A
 
 
 def stray_remarks(marker_ids: Sequence[int]) -> tuple[Remark, ...]:
-    """Return the remark that names the markers that were left out, if there are any."""
+    """Return a remark that names the markers that were left out; none without such markers."""
     if not marker_ids:
         return ()
     shown = ", ".join(map(str, marker_ids[:MAX_NUMBERS_IN_MESSAGE])) + (
@@ -235,7 +235,7 @@ def _slopes(quads: Array, board_corners: Array) -> Array:
     """Return the derivatives of the pixels by the board's x and y at each marker, (N, 2, 2)."""
     board_offsets = board_corners - board_corners.mean(axis=1, keepdims=True)
     pixel_offsets = quads - quads.mean(axis=1, keepdims=True)
-    squares = (board_offsets**2).sum(axis=(1, 2)) / 2  # sums over the corners, equal along x and y
+    squares = (board_offsets**2).sum(axis=(1, 2)) / 2  # equal along x and y
     slopes: Array = pixel_offsets.transpose(0, 2, 1) @ board_offsets / squares[:, None, None]
     return slopes
 

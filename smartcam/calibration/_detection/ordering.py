@@ -1,4 +1,4 @@
-"""Number the points that were found as the target numbers them.
+"""Number the points that were found in an image as the target numbers them.
 
 A detector returns a grid whose first point may be any of its corners. There are only a few ways to
 number its points by the target's rows and columns. In some of them the sheet's front faces the
@@ -31,8 +31,9 @@ _STEP_CHANGES: Final = [
     for entries in itertools.product((-1, 0, 1), repeat=4)
     if abs(entries[0] * entries[3] - entries[1] * entries[2]) == 1
 ]
-"""Matrices from the steps by which a grid was found to the steps to the next column and row: turns,
-mirrored or not, and shears, since a tilted sheet's diagonals may look shorter than its sides."""
+"""Matrices from the steps of a found grid to the steps of the target's columns and rows: turns,
+with or without a reflection, and shears, since a tilted sheet's diagonals may look shorter than its
+sides."""
 
 
 class Arrangement(NamedTuple):
@@ -91,7 +92,7 @@ def positions_row_by_row(columns: int, rows: int) -> NDArray[np.intp]:
 def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:
     origin, x_end, y_end = points[order[0, 0]], points[order[0, -1]], points[order[-1, 0]]
     x, y = x_end - origin, y_end - origin
-    # v points down, so the cross product is negative if y is counter-clockwise of x
+    # v points down, so the cross product of x and y is negative if the sheet's front is seen
     cross_product = float(x[0] * y[1] - x[1] * y[0])
     return Arrangement(order, cross_product < 0, float(x[0] / np.hypot(*x)))
 
@@ -117,7 +118,7 @@ def choose_marked(
     """Return the arrangement with a dark mark at its origin, and the mark's margin in grey levels.
 
     ``level`` returns the grey level, of 255, at the place where an arrangement would have its mark.
-    ``label``: the target and its mark, for messages. Raises MIRRORED, or AMBIGUOUS_ORIGIN if the
+    ``label``: the target and its mark, for messages. Raises MIRRORED; or AMBIGUOUS_ORIGIN: the
     darkest corner is not MIN_ORIGIN_CONTRAST darker than the next one.
     """
     levels = {int(arrangement.order[0, 0]): level(arrangement.order) for arrangement in numberings}

@@ -1,4 +1,4 @@
-"""Cut out the pixels around points, and compute the levels of a blurred edge."""
+"""Cut out the pixels around points, and compute the grey levels of a blurred edge, for fits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Windows(NamedTuple):
 
     @property
     def counts(self) -> Array:
-        """Number of the pixels that count in each window, (N,)."""
+        """Number of pixels with the weight 1 in each window, (N,)."""
         counts: Array = self.weights.sum(axis=1, dtype=np.float64)
         return counts
 
@@ -65,8 +65,9 @@ def cut_windows(
 
     ``half_sides`` (N, 2, 2): half sides of the parallelogram around each point whose pixels count,
     or the half axes of an ellipse (``round_``). A window reaches at most
-    ``max_reach`` pixels to each side. ``arm_widths`` (N, 2): count only a cross whose arms lie
-    along the half sides; half widths of the arms, as parts of the half sides. None: count all.
+    ``max_reach`` pixels to each side. ``arm_widths`` (N, 2): half widths of the arms of a cross
+    along the half sides, as parts of the half sides; only pixels in the cross count. None: all
+    pixels count.
     """
     reach = (
         np.hypot(half_sides[:, 0], half_sides[:, 1]) if round_ else np.abs(half_sides).sum(axis=1)

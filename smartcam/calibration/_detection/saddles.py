@@ -30,8 +30,8 @@ MIN_CURVATURE = 0.3
 than this; a sharp corner with a step of 15 grey levels has 1."""
 
 CIRCLE_RADIUS_PX = 3.0
-"""Radius, pixels, of the circle around a saddle whose grey levels are tested; it fits squares of
-seven pixels."""
+"""Radius, pixels, of the circle around a saddle along which grey levels are tested; the circle fits
+into squares of seven pixels."""
 
 MIN_SWING = 1.0
 """Along the circle, the grey levels of a corner swing by at least this many."""
@@ -105,7 +105,7 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
 
 
 def _steps_to_saddles(smooth: Floats, pixels: NDArray[np.intp], second_derivatives: Array) -> Array:
-    """Return the steps (N, 2) from pixels to the saddles beside them; limited to a pixel.
+    """Return the steps (N, 2) from pixels to the saddles next to them, at most one pixel long.
 
     ``second_derivatives`` (N, 4): of the grey levels at the pixels.
     """

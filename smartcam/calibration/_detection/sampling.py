@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def mean_level(image: GreyImage, points: Array) -> float:
-    """Return the mean grey level at points (N, 2); the rim's level is used outside of the image."""
+    """Return the mean grey level at points (N, 2); the image's rim is continued outside."""
     cv2 = load("cv2")
     coordinates = points.astype(np.float32)[None]
     levels = cv2.remap(

@@ -1,4 +1,4 @@
-"""Draw charts with one or two bars for each view, and lines at the values of all views together."""
+"""Draw charts with one or two bars for each view, and a line at the overall value of a series."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_BAR_RATIO: Final = 3.0
 value."""
 
 MAX_LINES: Final = 5
-"""A chart has at most this many horizontal lines."""
+"""A chart has at most about this many horizontal grid lines."""
 
 DIGITS: Final = "0123456789"
 
@@ -34,11 +34,11 @@ SERIES_CLASSES: Final = ("first", "second")
 
 
 class Series(NamedTuple):
-    """The values of one bar of each view."""
+    """The values of one kind of bar: one value for each view, and the overall value."""
 
     name: str
     values: Sequence[float]  # NaN for a view without a value
-    level: float = math.nan  # value of all views together; NaN if there is none
+    level: float = math.nan  # overall value of all views; NaN if there is none
 
 
 class Chart(NamedTuple):
@@ -98,7 +98,7 @@ def _chart(chart: Chart, top: float) -> Iterator[str]:
 
 
 def _largest(chart: Chart) -> float:
-    """Return the upper end of a chart, from the views that were used."""
+    """Return the upper end of a chart's axis; bars of left-out views may be longer."""
     used_values = [
         value
         for series in chart.series
@@ -153,8 +153,9 @@ def _legend(chart: Chart, y: float) -> Iterator[str]:
     entries = [
         (
             css_class,
-            series.name
-            + (f" ({series.level:.3g} {chart.unit} in all)" if math.isfinite(series.level) else ""),
+            f"{series.name} ({series.level:.3g} {chart.unit} overall)"
+            if math.isfinite(series.level)
+            else series.name,
         )
         for series, css_class in zip(chart.series, SERIES_CLASSES, strict=False)
     ]

@@ -41,10 +41,10 @@ def draw_views(calibration: FromImages, *, title: str = "") -> str:
     """Return a picture of each view's errors as bars, SVG.
 
     For a lens the bars are the RMS of the residuals and the held-out error, in pixels; for a pair
-    the RMS of each side in pixels and the held-out error of lengths in millimetres; for a camera on
-    a robot the errors on the target, fitted and held out, in millimetres. Dashed lines are the
-    values of all views together; grey bars are views that were left out. ``title`` is a line on
-    top. The document has a fixed size, loads no other files, and adapts to a dark page.
+    of cameras the RMS of each side in pixels and the held-out error of lengths in millimetres; for
+    a camera on a robot the fitted and the held-out error on the target, in millimetres. Dashed
+    lines are the overall values of all views; grey bars are views that were left out. ``title`` is
+    a line on top. The document has a fixed size, loads no other files, and adapts to a dark page.
 
     Raises:
         CalibrationError: ``WRONG_KIND``: this is no calibration from images.
@@ -56,9 +56,9 @@ def draw_views(calibration: FromImages, *, title: str = "") -> str:
 def draw_scene(calibration: FromImages, *, title: str = "") -> str:
     """Return a picture of targets and cameras in space, SVG, otherwise as :func:`draw_views`.
 
-    For a lens or a pair the cameras are fixed, and the targets lie around them; for a robot its
-    base is fixed. Targets are blue, with the views' names; dashed ones were left out. Cameras are
-    orange.
+    For a lens or a pair the picture is drawn in the camera's frame, for a robot in the frame of its
+    base. Targets are blue, with the views' names; targets that were left out are dashed. Cameras
+    are orange.
     """
     return _draw_scene(_choose_drawing(calibration, _SCENES, "draw_scene")(calibration), title)
 
@@ -73,9 +73,10 @@ def draw_uncertainty(
     """Return a map of the uncertainty of a lens, SVG, otherwise as :func:`draw_views`.
 
     A comparison of two lenses gives two maps: their difference, and the difference that noise alone
-    causes. Colours follow the logarithm, from dark to light; numbers are pixels of one coordinate.
-    A white cross marks the largest value; white dots are the points in the views of a calibration.
-    ``distance`` is as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
+    causes. Colours follow the logarithm of the uncertainty, from dark (small) to light (large).
+    Numbers are the RMS of one coordinate, pixels. A white cross marks the largest value; white dots
+    are the points in the views of a calibration. ``distance`` is as in
+    :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     if isinstance(shown, LensComparison):
         maps = [

@@ -1,4 +1,4 @@
-"""Draw pictures of the calibration in a file."""
+"""Draw a picture of a calibration that is stored in a file."""
 
 from __future__ import annotations
 

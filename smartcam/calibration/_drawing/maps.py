@@ -24,7 +24,7 @@ COLOURS: Final = (
     *((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132)),
     *((122, 209, 81), (253, 231, 37)),
 )
-"""Colours from small to large values: each is lighter than the one before, for the colour-blind.
+"""Colours from small to large values, dark to light, so that colour-blind people can read them.
 
 Source: S. van der Walt and N. Smith, viridis (public domain).
 """
@@ -33,45 +33,46 @@ COLOUR_COUNT: Final = 24
 """Number of colours of a map; neighbouring cells of one colour become one rectangle."""
 
 MAX_DECADES: Final = 3.0
-"""Largest number of powers of ten in a map's colours; smaller values have the first colour."""
+"""A map's colours span at most this many powers of ten below its largest value; still smaller
+values have the first colour."""
 
 TICK_COUNT: Final = 5
 
 
 class Map(NamedTuple):
-    """The values of one map, with the texts and points drawn on it."""
+    """The values of one map, with the texts and points on it."""
 
     title: str
     size: tuple[int, int]  # size of the image, pixels
-    values: Array  # (h, w), from corner to corner; NaN where there is no value
+    values: Array  # (h, w), a grid of places up to the image's corners; NaN: no value
     caption: str = ""  # text below the map
     points: Array = np.zeros((0, 2))  # pixels that are marked by dots
 
 
 def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
     """Return an SVG document with maps side by side, which share one legend."""
-    values = np.concatenate([drawn.values[np.isfinite(drawn.values)] for drawn in maps])
+    values = np.concatenate([shown_map.values[np.isfinite(shown_map.values)] for shown_map in maps])
     positive_values = values[values > 0.0]
     largest = float(positive_values.max()) if len(positive_values) else 1.0
     smallest = float(positive_values.min()) if len(positive_values) else 0.1
     smallest = max(min(smallest, 0.999 * largest), largest / 10.0**MAX_DECADES)
-    height = max(WIDTH * drawn.size[1] / drawn.size[0] for drawn in maps)
+    height = max(WIDTH * shown_map.size[1] / shown_map.size[0] for shown_map in maps)
     shapes = [text((BORDER, 28), title, "title")] if title else []
-    for number, drawn in enumerate(maps):
-        shapes += _map_shapes(drawn, BORDER + number * (WIDTH + BORDER), smallest, largest)
+    for number, shown_map in enumerate(maps):
+        shapes += _map_shapes(shown_map, BORDER + number * (WIDTH + BORDER), smallest, largest)
     shapes += _legend(HEAD + height + 44, smallest, largest, unit)
     return document(len(maps) * (WIDTH + BORDER) + BORDER, HEAD + height + FOOT, shapes)
 
 
-def _map_shapes(drawn: Map, left: float, smallest: float, largest: float) -> Iterator[str]:
-    height = WIDTH * drawn.size[1] / drawn.size[0]
-    rows, columns = drawn.values.shape
+def _map_shapes(shown_map: Map, left: float, smallest: float, largest: float) -> Iterator[str]:
+    height = WIDTH * shown_map.size[1] / shown_map.size[0]
+    rows, columns = shown_map.values.shape
     cell = np.array([WIDTH / columns, height / rows])
-    yield text((left, HEAD - 12), drawn.title)
-    colour_indices = _colour_indices(drawn.values, smallest, largest)
+    yield text((left, HEAD - 12), shown_map.title)
+    colour_indices = _colour_indices(shown_map.values, smallest, largest)
     yield '<g shape-rendering="crispEdges">'
     for row in range(rows):
-        # one rectangle for each run of one colour
+        # neighbouring cells of one colour become one rectangle
         starts = np.flatnonzero(np.diff(colour_indices[row], prepend=-2))
         for start, end in zip(starts, [*starts[1:], columns], strict=True):
             colour_index = int(colour_indices[row, start])
@@ -83,17 +84,17 @@ def _map_shapes(drawn: Map, left: float, smallest: float, largest: float) -> Ite
             corner = (left + start * cell[0], HEAD + row * cell[1])
             yield rectangle(corner, ((end - start) * cell[0], cell[1]), fill)
     yield "</g>"
-    point_places = [left, HEAD] + (drawn.points + 0.5) * WIDTH / drawn.size[0]
+    point_places = [left, HEAD] + (shown_map.points + 0.5) * WIDTH / shown_map.size[0]
     dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in point_places.tolist())
     yield f'<path d="{dots}" class="seen"/>'
     yield rectangle((left, HEAD), (WIDTH, height), 'class="axis"')
-    yield from _value_labels(drawn.values, left, height)
-    if drawn.caption:
-        yield text((left, HEAD + height + 20), drawn.caption)
+    yield from _value_labels(shown_map.values, left, height)
+    if shown_map.caption:
+        yield text((left, HEAD + height + 20), shown_map.caption)
 
 
 def _value_labels(values: Array, left: float, height: float) -> Iterator[str]:
-    """Yield the values at the corners and the centre, and a cross at the largest value."""
+    """Yield texts with the values at corners and centre, and a cross at the largest value."""
     rows, columns = values.shape
     for row, y in ((0, 20.0), (rows // 2, height / 2 + 5), (rows - 1, height - 10)):
         outer_columns = [(0, 8.0, "start"), (columns - 1, WIDTH - 8, "end")]
@@ -101,7 +102,7 @@ def _value_labels(values: Array, left: float, height: float) -> Iterator[str]:
             outer_columns if row != rows // 2 else [(columns // 2, WIDTH / 2, "middle")]
         ):
             value = values[row, column]
-            label = f"{value:.2g}" if math.isfinite(value) else "beyond the model"
+            label = f"{value:.2g}" if math.isfinite(value) else "beyond the lens model"
             yield text((left + x, HEAD + y), label, "on-map", f' text-anchor="{anchor}"')
     if np.isfinite(values).any():
         row, column = np.unravel_index(np.nanargmax(values), values.shape)

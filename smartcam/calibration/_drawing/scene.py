@@ -1,4 +1,4 @@
-"""Draw boards and cameras in space, seen from a corner of the room.
+"""Draw targets and cameras in space, as seen from a corner of the room.
 
 The projection is parallel: far objects are as large as near ones, so one scale holds for the whole
 picture.

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
-"""Pattern of a name: no dot, no slash, and no other character with a meaning to a file system."""
+"""Pattern of a name, which has no dot, slash or other character with a meaning to file systems."""
 
 MAX_NAME_LENGTH = 64
 """A name has at most this many characters."""
 
 EXPORTS = "exports"
-"""Name of the folder, inside of the given one, for exported files."""
+"""Name of the subfolder for exported files."""
 
 _SUFFIXES = (".json", ".yaml", ".txt", ".calib")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])", re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""Load a calibration of any kind that maps localizations to the robot."""
+"""Load a calibration that maps localizations to the robot: that of a plane or of a sheet."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def load_calibration(path: str | os.PathLike[str]) -> AnyCalibration:
 def calibration_from_document(document: Document, name: str) -> AnyCalibration:
     """Return the calibration that a document holds; ``name``, of the file, is for messages.
 
-    Raises WRONG_KIND, or SHAPE if the data are no calibration.
+    Raises WRONG_KIND: another kind of calibration; SHAPE: the data are no calibration.
     """
     if document.kind in KINDS:
         calibration = KINDS[document.kind].from_data(document.data)

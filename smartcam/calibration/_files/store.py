@@ -1,10 +1,9 @@
 """Write files of calibrations whole or not at all, and never misread one.
 
 A file is JSON: ``schema``, ``schema_version``, ``kind``, ``written_at``, ``units``, ``software``,
-``context``, ``data`` and ``sha256``, the hash of all the rest. Floats are written with so
-many digits that reading gives the same bits; NaN and infinity, which JSON lacks, are refused.
-
-:mod:`smartcam._whole_files` replaces files and keeps earlier ones.
+``context``, ``data`` and ``sha256``, the hash of all other entries. Floats are written with so many
+digits that reading gives the same bits; NaN and infinity, which JSON lacks, are refused. Files are
+replaced, and earlier versions kept, by :mod:`smartcam._whole_files`.
 """
 
 from __future__ import annotations
@@ -32,10 +31,11 @@ SCHEMA = "smartcam.calibration"
 """Value of ``schema`` in every file."""
 
 SCHEMA_VERSION = (1, 0)
-"""Major and minor version: files of a newer major version are refused, newer minor ones read."""
+"""Major and minor version: files of a newer major version are refused, files of a newer minor
+version are read."""
 
 UNITS: Mapping[str, str] = {"length": "m", "angle": "rad", "time": "s"}
-"""Units of the numbers in a file, unless the name of a field ends in another unit."""
+"""Units of the numbers in a file; a field in another unit has a name that ends in the unit."""
 
 BACKUPS = 3
 """Number of earlier versions of a file that are kept."""
@@ -44,7 +44,7 @@ MAX_FILE_BYTES = 1 << 24
 """A file has at most this many bytes: a calibration of 10,000 touches needs a quarter of them."""
 
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
-"""Functions that convert a file's content to the next major version, by major version."""
+"""For each earlier major version, the function that converts a file's content to the next one."""
 
 _PACKAGES = ("smartcam", "numpy", "scipy", "opencv-python-headless")
 
@@ -205,10 +205,10 @@ def _software() -> dict[str, str]:
 
 
 def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
-    """Write a file, in place of one of that name, whole or not at all; replace a symbolic link.
+    """Write a file whole or not at all; replace an earlier file or symbolic link of that name.
 
-    Raises ``NOT_WRITTEN`` if the file cannot be written, or ``IN_USE`` if another process keeps
-    writing in the folder. Either leaves the previous file in place.
+    Raises ``NOT_WRITTEN``: the file cannot be written; ``IN_USE``: another process keeps writing in
+    the folder. Both leave the previous file in place.
     """
     with _calibration_errors(path):
         _whole_files.replace_file(path, body, backups=backups)

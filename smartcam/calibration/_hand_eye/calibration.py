@@ -83,31 +83,32 @@ if TYPE_CHECKING:
     from smartcam.models import Pose
 
 POSES_PER_EXTRA_REMOVAL = 100
-"""Before each new solution one bad pose is left out, and one more for each of this many poses."""
+"""Before each new solution one bad pose is left out; with many poses, one more for each of this
+many poses."""
 
 MIN_ADVISED_POSES = 8
-"""With fewer poses than this, the residuals say little about the error."""
+"""With fewer poses than this, a remark says that the residuals tell little about the error."""
 
 MIN_ADVISED_TURN_RADIANS = math.radians(8.0)
-"""A smaller RMS turn of the poses about the second of their axes is remarked on; leaving out some
-of eight poses changes it by two or three degrees."""
+"""A remark says if the RMS turn of the poses about their second axis is smaller. Leaving out some
+of eight poses changes this turn by two or three degrees."""
 
 MAX_SCALE_ERROR = 0.2
-"""Default of the part by which a target's size may be off."""
+"""Default of ``most_scale``: part by which a target's size may differ from the nominal size."""
 
 REMARKED_SCALE_ERROR = 0.005
-"""A target's size that differs from the nominal one by more than this part is remarked on."""
+"""A remark says if a target's size differs from the nominal size by more than this part."""
 
 REMARKED_SCALE_SIGMAS = 5.0
-"""A target's size that is not adjusted is remarked on if it differs by this many standard
+"""If the target's size is not adjusted, a remark says if it differs by more than this many standard
 deviations."""
 
 BAD_POSE_RATIO = 4.0
-"""A pose is bad if its held-out error is more than this many times the median, as one in 60000
-normal errors along two axes is."""
+"""A pose is bad if its held-out error is more than this many times the median. Of normal errors
+along two axes, one in 60000 is as large."""
 
 ROUNDING_ERROR_M = 1e-7
-"""Errors below this length, metres, may be rounding errors."""
+"""No pose is bad with an error below this length, metres, which may be a rounding error."""
 
 MAX_BAD_POSE_SHARE = 1 / 3
 """At most this part of the poses may be left out."""
@@ -122,11 +123,12 @@ WEIGHT_POWER = 1 / 2
 """Power of a pose's weight in the covariance: errors of poses are independent of each other."""
 
 POOR_ROBOT = RobotSigmas(math.radians(0.25), 2e-3)
-"""Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm: a held-out error
-that is larger than they cause is remarked on."""
+"""Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm. A remark says if
+the held-out error is larger than such a robot causes."""
 
 ASSUMED_POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
-"""Standard deviations (rad, m) of target poses without a covariance: only their ratio counts."""
+"""Standard deviations (rad, m) that are assumed for target poses without a covariance; only their
+ratio matters."""
 
 
 @check_arguments(
@@ -173,8 +175,8 @@ def calibrate_hand_eye(
             it), the ``camera``, or ``nothing``; ``auto`` chooses by the held-out error.
         robot_sigmas: standard deviations of each axis of the robot's poses; None: estimated.
         drop_bad: whether poses that are far from the others' prediction are left out and named, at
-            most a third of them, and only while 8 are left; else they are only named. After leaving
-            out poses that are much farther off, as those of other views, 5 must be left.
+            most a third of them, and only while 8 are left; else they are only named. Poses that
+            belong to other views are left out as long as 5 poses remain.
         allowed_error: largest error, metres, that 95 of 100 points on the target may have; None: a
             hundredth of the target's distance. See :attr:`HandEyeCalibration.verdict`.
         most_scale: part by which the target's size may be off. The robot's motions show how large
@@ -440,7 +442,7 @@ def _calibrate_without_bad(
     transforms: Sequence[Transform],
     views: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
-    """Return the calibration from the poses that are not bad, with the errors of all poses.
+    """Return the calibration from the good poses; its errors include those of the bad poses.
 
     ``transforms`` are the robot's poses as given; all other arguments are in ``options.order``.
     Raises ``SCALE_MISMATCH``, and the errors of poses that do not fit.
@@ -496,7 +498,7 @@ def _calibrate_without_bad(
 def _move_remarks(
     unused: Problem, result: HandEyeCalibration, names: Sequence[str]
 ) -> Iterator[Remark]:
-    """Yield a remark if the left-out poses agree on another place of the camera or the target."""
+    """Yield a remark if the left-out poses agree on another place: something was moved."""
     if not names:
         return
     motion, target_poses = (
@@ -724,7 +726,7 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
             f"expected {MIN_ADVISED_POSES} poses or more for an error that can be relied on, got "
             f"{place_count}{suffix}"
         )
-    # the largest value without any one pose, so that no single pose decides
+    # each turn is without one pose; the largest is taken, so that no single pose decides
     turn = float(left_out_second_axis_turns(problem.robot).max())
     if turn < MIN_ADVISED_TURN_RADIANS:
         yield Code.INSUFFICIENT_ROTATION.remark(

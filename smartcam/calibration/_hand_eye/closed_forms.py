@@ -1,4 +1,4 @@
-"""Solve hand-eye by OpenCV's closed forms, and refuse motions that no method can solve."""
+"""Find the camera's pose by OpenCV's closed forms; refuse robot poses that do not determine it."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ SAME_PLACE_M = 0.001
 SAME_TURN_RADIANS."""
 
 MAX_POSES_PAIRED = 40
-"""OpenCV's methods that use each pair of poses get at most this many poses: the time grows with the
-square of their number."""
+"""Methods of OpenCV that use all pairs of poses get at most this many poses, since their time grows
+with the square of the number of poses."""
 
 MAX_POSES_COMPARED = 200
-"""At most this many poses are compared with each other; if there are more, a part of them is."""
+"""At most this many poses are compared with each other; of more poses, only a part is compared."""
 
 MIN_TURN_RADIANS = math.radians(2.0)
-"""Least RMS turn of the poses about the second of their axes; turns about a single axis do not
-determine the camera."""
+"""Least RMS turn of the poses about the second of their principal axes; turns about a single axis
+do not determine the camera."""
 
 # A motion of the robot between two poses, A, and the motion that the camera sees, B, are the same:
 # A X = X B, so R_A R_X = R_X R_B and (R_A - I) t_X = R_X t_B - t_A. Each pair of poses gives one
@@ -115,7 +115,7 @@ def check_motion(robot: RobotPoses) -> None:
 def same_place_indices(poses: Rigid) -> NDArray[np.intp]:
     """Return for each pose (V,) the index of the first pose that is about the same.
 
-    A robot has the same error at each visit of a place, so several views there tell no more than
+    A robot has the same error each time it is at a place, so several views there tell no more than
     one.
     """
     indices = np.arange(poses.size)

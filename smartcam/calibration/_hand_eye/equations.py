@@ -1,10 +1,11 @@
-"""Set up and solve the equations of a camera and a robot: ``T_camera_target = X^-1 A Z``.
+"""Find a camera's pose on a robot by least squares, from ``T_camera_target = X^-1 A Z``.
 
 ``X`` is the pose of the camera on its carrier, ``Z`` the pose of the target on its carrier, and
 ``A`` the motion of the robot between the carriers: ``T_flange_base`` for a camera on the hand,
-``T_base_flange`` for a camera that looks at the hand. A view's pose changes by a turn w and a shift
-d in the camera's frame, R becomes ``exp([w]x) R`` and t ``t + d``; all derivatives are expressed by
-these, so points in an image and poses without an image are adjusted by the same steps.
+``T_base_flange`` for a camera that looks at the hand. A small change of a view's pose is a turn w
+and a shift d in the camera's frame: R becomes ``exp([w]x) R``, and t becomes ``t + d``. All
+derivatives are by w and d, so points in an image and poses without an image are adjusted by the
+same steps.
 
 If the robot's poses have noise, each gets a correction; the corrections are eliminated from the
 normal equations, see :mod:`smartcam.calibration._least_squares`.
@@ -55,16 +56,16 @@ ROUGH_GAIN = 1e-7
 it is then a hundredth of a standard deviation from the minimum."""
 
 FIRST_DAMPING = 1e-6
-"""Part of the diagonal that is added to the diagonal at first: closed forms are so near to the
-minimum that hardly any damping is needed."""
+"""Damping of the first step, as a part of the diagonal: closed forms are so near to the minimum
+that hardly any damping is needed."""
 
 MIN_UNEXPLAINED_BEND_SHARE = 1e-3
-"""A bend is adjusted only if at least this share of its heights at the points is neither a tilt of
-the target nor an earlier bend."""
+"""A bend of the target is adjusted only if at least this share of the points' heights under the
+bend is neither a tilt of the target nor an earlier bend."""
 
 ROUNDING_COST = 100.0
-"""Added to the cost, in squared standard deviations, when a gain is compared with it: smaller gains
-are rounding errors."""
+"""Constant that is added to the cost, in squared standard deviations, before a gain is compared
+with a part of it, so that rounding errors do not count as a gain."""
 
 
 class RobotSigmas(NamedTuple):
@@ -83,8 +84,8 @@ class RobotNoise(NamedTuple):
     """Noise of the robot's poses and of the camera's views."""
 
     robot: RobotSigmas  # standard deviations of the robot's poses
-    # factor by which the errors of the views' poses are larger than the noise of the points causes:
-    # errors that all points of a view share, such as those of the lens, do not average out
+    # factor by which the errors of the views' poses exceed those that the noise of the points
+    # causes: errors that all points of a view share, such as errors of the lens, do not average out
     shared: float = 1.0
 
 
@@ -377,16 +378,17 @@ def view_products(
     J has 6 + P + 1 columns: derivatives by the correction of the robot's pose (6), derivatives by
     ``X``, ``Z`` and the other parameters (P), and the residuals without the corrections (1). The
     sum is that of the squared residuals with the corrections. The derivatives are taken at
-    ``solution``. ``poses_only`` leaves out the part of the residuals that no pose of the view
-    changes.
+    ``solution``. ``poses_only`` leaves out the part of the residuals that no change of the view's
+    pose can reduce.
     """
     corrected = dataclasses.replace(robot, poses=robot.poses.turned_in_source(solution.corrections))
     residuals, slopes = observations.evaluate(
         predicted_views(solution.camera, corrected, solution.target), solution.change
     )
     by_motions, by_robot = _pose_derivatives(solution.camera, corrected, solution.target)
-    # A correction v stands in R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x). With
-    # it the equations are linearised at v; the residuals at v = 0 are, to first order, r - J v.
+    # A correction v changes R to R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x).
+    # With it the equations are linearised at v; the residuals at v = 0 are, to first order, r - J
+    # v.
     by_robot[:, :, :3] = by_robot[:, :, :3] @ right_jacobian(solution.corrections[:, :3])
     by_correction = slopes[:, :, :6] @ by_robot
     uncorrected = residuals[..., None] - by_correction @ solution.corrections[..., None]
@@ -415,8 +417,8 @@ def _view_equations(
     right = -products[:, :-1, -1] - (products[:, :-1, :6] @ solution.corrections[..., None])[..., 0]
     if solution.noise is None:
         return cost, matrix, right
-    # A correction is also a residual, measured as 0 with the robot's variance, since the controller
-    # states the mean.
+    # Each correction is also a residual: its expected value is 0, with the robot's variance, since
+    # the controller reports the mean pose.
     weights = 1.0 / np.repeat(solution.noise.robot, 3) ** 2
     matrix[:, range(6), range(6)] += weights
     right[:, :6] -= weights * solution.corrections
@@ -471,7 +473,7 @@ def adjust(
         return solution
     try:
         information = normal.eliminate_poses()[0]
-    except np.linalg.LinAlgError:  # poses and views so wrong that a target is in the camera
+    except np.linalg.LinAlgError:  # some pose puts the target into the camera
         return dataclasses.replace(solution, cost=math.inf)
     return dataclasses.replace(solution, cost=normal.cost, information=information)
 

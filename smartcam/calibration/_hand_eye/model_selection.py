@@ -64,8 +64,8 @@ SIGNIFICANCE_LEVEL = 1e-4
 this value: an unneeded scale makes the camera's error up to eight times as large."""
 
 SURE_GAIN = 2.0
-"""A choice is sure if it predicts poses better by this many standard errors: simulated robots whose
-only error is noise reach 1.9 by chance."""
+"""A method is surely better if it predicts poses better by this many standard errors: simulated
+robots whose only error is noise reach 1.9 by chance."""
 
 MAX_SIZE_ERROR_RATIO = 0.05
 """Largest error of a target's stated size, as a part of it, from which the fit still converges."""
@@ -92,7 +92,7 @@ class Problem:
     robot: RobotPoses  # V poses
     observations: AnyObservations  # V views, or poses of the target without views
     target_poses: Rigid  # V times ``T_camera_target``, each from its own view
-    # (V, N), True for points that exist, False for padding; None without views
+    # (V, N), False for the padding after the points of a view; None without views
     point_mask: NDArray[np.bool_] | None = None
     robot_sigmas: RobotSigmas | None = None  # noise of the robot's poses; None: to be estimated
     # (4 + K, 4 + K), covariance of a lens from the same views; None for an exact one
@@ -105,7 +105,7 @@ class Problem:
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """(V, N), True for points with an error; without views (V, 1), for the target's origin."""
+        """(V, N), True for points, False for padding; (V, 1) without views."""
         return np.ones((self.count, 1), dtype=bool) if self.point_mask is None else self.point_mask
 
     def subset(self, index: NDArray[np.intp]) -> Problem:
@@ -206,7 +206,7 @@ class Candidate:
     left_out_solutions: Solution | None = None
     # (V, N, 3), held-out errors on the target, metres
     held_out_vectors: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    # other solutions that are as likely
+    # solutions of other candidates that are as likely
     rivals: list[Solution] = field(default_factory=list[Solution])
 
     @property
@@ -236,7 +236,8 @@ class Candidate:
     def chance_of_change(self, always_free_count: int) -> float:
         """Return the probability that noise alone changes the additional parameters by as much.
 
-        ``always_free_count``: number of the last parameters, which are adjusted in any case.
+        ``always_free_count``: this many of the last parameters are adjusted in any case, and not
+            tested.
         """
         change, information = self.solution.change, self.solution.information
         count = len(change) - always_free_count
@@ -259,7 +260,7 @@ class Candidate:
         squares = float(change[:count] @ reduced @ change[:count])
         if not math.isfinite(squares):
             return 1.0
-        # half of the equations each determine one of the robot's two sigmas
+        # half of the equations determine the robot's sigma of rotation, half that of translation
         freedom = None if self.problem.robot_sigmas else max(1, 3 * self.problem.count - 6)
         return Noise(1.0, freedom).chance(max(squares, 0.0), count)
 
@@ -331,7 +332,7 @@ def _reprojection_like(robot: Candidate) -> Candidate | None:
         dataclasses.replace(reprojection.solution, change=change),
     )
     if reprojection.left_out_solutions is not None and robot.left_out_solutions is not None:
-        # without a view, scale and lens differ as well, and so do camera and target
+        # leaving out a view also changes scale and lens, which move camera and target
         steps = (robot.left_out_solutions.change - change) @ slopes.T
         reprojection.left_out_solutions = dataclasses.replace(
             reprojection.left_out_solutions,
@@ -377,7 +378,7 @@ def _robot_candidates(
 
 
 def _choose_values(candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the candidate that adjusts the right values.
+    """Return the candidate that adjusts as many values as the poses justify.
 
     If adjusted values are significant but hardly predict better, the choice stays open, and the
     other solution becomes a rival. Random halves of the poses of a recorded robot that hardly
@@ -482,7 +483,7 @@ def _make_candidate(
         candidate.left_out_solutions = leave_each_out(problem.robot, problem.observations, solution)
         try:
             candidate.held_out_vectors = problem.error_vectors(candidate.left_out_solutions)
-        except CalibrationError:  # without one of the views no lens is left
+        except CalibrationError:  # the views that remain determine no lens
             return None
     return candidate
 

@@ -1,4 +1,4 @@
-"""Use the result of a hand-eye calibration: map pixels to the robot's base."""
+"""The result of a hand-eye calibration, which maps pixels to the robot's base."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """Estimate a robot's pose noise from the views of a camera on it.
 
-The sums of an adjustment are computed once. For any two standard deviations of the robot they give
-the restricted likelihood of the observations, from which the unknown poses of camera and target and
-the corrections of the robot's poses are eliminated. That likelihood is maximized.
+The noise of a robot is two standard deviations, of rotation and of translation. They are chosen so
+that the restricted likelihood of the observations is largest: the likelihood from which the unknown
+poses of camera and target and the corrections of the robot's poses are eliminated. Sums that are
+computed once give this likelihood for any standard deviations.
 
 Source: Patterson and Thompson, Biometrika 58 (1971).
 """
@@ -42,8 +43,8 @@ FIRST_SHARED_FACTOR = 5.0
 estimated."""
 
 MAX_SHARED_FACTOR = 300.0
-"""Largest factor of the views' shared errors: 100 points known to 0.1 pixels would then carry no
-information."""
+"""Largest factor of the views' shared errors; with a larger factor, 100 points with a noise of 0.1
+pixels would tell nothing."""
 
 COARSE_VALUES = 5
 """Each standard deviation is first tried at this many values."""
@@ -58,8 +59,8 @@ CONVERGED_RATIO = 0.02
 def adjust_with_noise(robot: RobotPoses, observations: Observations, start: Solution) -> Solution:
     """Return the adjustment with the noise that makes the observations most likely.
 
-    ``observations`` is whitened. The adjustment begins at ``start``, and with its noise if it has
-    one.
+    ``observations`` is whitened. The adjustment begins at ``start`` and, if ``start`` has a noise,
+    with this noise.
     """
     noise = start.noise or RobotNoise(FIRST_SIGMAS, FIRST_SHARED_FACTOR)
     adjusted = adjust(robot, observations, start, noise, min_gain=ROUGH_GAIN)

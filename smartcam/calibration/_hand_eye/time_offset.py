@@ -1,4 +1,4 @@
-"""Estimate the offset between the clocks of a robot and a camera from a robot that moves.
+"""Estimate the offset between the clocks of a robot and a camera, while the robot moves.
 
 A robot at 250 mm/s whose pose is taken 20 ms late is 5 mm off. A camera on the robot, or one
 that watches the target on its hand, sees where the robot really was. With the right offset, poses
@@ -34,7 +34,7 @@ COARSE_STEPS = 41
 """The whole range is first searched at this many offsets."""
 
 MAX_FOLDS = 20
-"""For its sigma, the offset is estimated again without each of this many groups of views."""
+"""The sigma of the offset is found by leaving out each of up to this many groups of views."""
 
 MIN_VIEWS_FOR_OFFSET = 10
 """An offset needs at least this many views, since each view says little about it."""
@@ -148,8 +148,8 @@ class _OffsetFit:
         return math.sqrt(float(squares.mean()))
 
     def noise_sigma(self, offset: float, index: NDArray[np.intp]) -> float:
-        """Return the sigma of an offset if all errors are noise; infinite if it is not the best."""
-        # The minimum x of a mean square m + c x^2 of n values with noise m has the variance m/cn.
+        """Return the sigma of an offset if all errors are noise; infinite if it is no minimum."""
+        # If the mean square of n values is m + c x^2, its minimum x has the variance m / (c n).
         step = math.copysign(4.0 * self._max_offset / (COARSE_STEPS - 1), -offset)
         square, next_square = (self.error(tried, index) ** 2 for tried in (offset, offset + step))
         curvature = (next_square - square) / step**2

@@ -1,7 +1,7 @@
 """Check whether a robot's poses and the views belong together, and find those that do not.
 
 A closed form finds camera and target from each of many small groups of poses. The result that fits
-most of the poses is used, so a few poses that belong to other views do not spoil it.
+most of the poses is used, so a few poses that belong to other views have no influence.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ fit this many times better."""
 
 MIN_OTHER_FIT_RATIO: Final = 20.0
 """Poses are taken as transposed, mirrored or in another unit of length only if they then fit this
-many times better: such mistakes are rarer than a pose of another view."""
+many times better: such mistakes are rarer than a single pose that belongs to another view."""
 
 WORST_USABLE_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
 """Largest noise of a usable robot: 2 degrees and 10 mm."""
@@ -126,13 +126,13 @@ def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
 
 
 def max_plausible_error(problem: Problem) -> float:
-    """Return the error above which poses and views do not belong together, metres."""
+    """Return the largest error, metres, with which poses and views may belong together."""
     return min(meaningless_error(problem), expected_error(problem, WORST_USABLE_ROBOT))
 
 
 def find_agreement(problem: Problem) -> AgreedMotion | None:
     """Return the poses of camera and target that fit most of the views; None if there are none."""
-    # Least median over proposals of small groups: right as long as most of the poses are.
+    # The proposal with the least median error is chosen; it is right if most of the poses are.
     # Source: Rousseeuw, Least Median of Squares Regression (1984).
     lever = (
         _target_extent(problem.observations)
@@ -205,10 +205,10 @@ def find_other_numbering(
 
 
 def _other_readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
-    """Yield the poses as they are after undoing each of some common mistakes.
+    """Yield the poses after undoing each of some common mistakes.
 
-    Each item has the changed poses, the factor by which they must fit better, the error's code, and
-    words for the mistake.
+    An item has the changed poses, the factor by which they must fit better than the given poses,
+    the error's code, and words for the mistake.
     """
     poses, in_hand = robot.poses, robot.in_hand
     reading = "the other way round: they are inverted, or the camera is on the other side"
@@ -268,8 +268,8 @@ def check_poses(problem: Problem) -> AgreedMotion:
 def poor_fit_error(actual: str, error: float | None) -> CalibrationError:
     """Return the error for poses and views that do not belong together.
 
-    ``actual``: what was got instead. ``error``: error of the target, metres; None if
-    it is not known.
+    ``actual``: description of the actual misfit. ``error``: error on the target, metres; None if it
+    is not known.
     """
     return Code.POOR_FIT.refusal(
         f"hand-eye: expected a camera that sees the target where it is, got {actual}: are the "

@@ -42,25 +42,26 @@ MIN_COST_GAIN_RATIO: Final = 1e-7
 the fit is then a hundredth of a standard deviation from the minimum."""
 
 LOOSE_SIGMA_RATIO: Final = 0.01
-"""Assumed standard deviation of a sheet's points, as a part of the distance between neighbours.
-With six recorded views, 0.1 makes the held-out error 1.7 times as large as an exact sheet does,
-0.01 makes it 1.1 times as large; with many views both give the same (measured)."""
+"""Assumed standard deviation of a sheet's points, as a part of the distance between neighbouring
+points. With six recorded views, a value of 0.1 gives 1.7 times the held-out error of an exact
+sheet, a value of 0.01 gives 1.1 times; with many views both give the same (measured)."""
 
 TIGHT_SIGMA_RATIO: Final = 1e-4
 """Assumed standard deviation of the common place, direction and size of a sheet's points, which no
 view shows, as a part of the distance between neighbouring points."""
 
 WEIGHT_POWER: Final = 1 / 3
-"""Power of a view's weight in the covariance of a lens. With 1/2, lenses from the two halves of
-recorded sets differ by 1.2 times as much as expected; with 0 by 0.8 times as much, and simulated
-lenses by 0.7 times (measured)."""
+"""Power of a view's weight in the covariance of a lens. With a power of 1/2, lenses from the two
+halves of recorded sets differ by 1.2 times as much as expected; with a power of 0 they differ by
+0.8 times as much, and simulated lenses by 0.7 times (measured)."""
 
 MIN_REFIT_GAIN_RATIO: Final = 1e-5
 """A fit without one of the poses ends when a step lowers the weighted squares by less than this
 part."""
 
 MAX_FEW_POSES: Final = 5
-"""With at most this many poses, leaving one out changes the fit too much for a single step."""
+"""With at most this many poses, leaving one out changes the fit too much for a single step, so the
+fit is repeated."""
 
 MAX_ONE_STEP_COST_RATIO: Final = 1.2
 """A single step is not enough if the cost without a pose is more than this many times the cost that
@@ -71,7 +72,7 @@ Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 class Sight(NamedTuple):
-    """A view, with its camera and pose; a camera has at most one view of each pose."""
+    """A view with its camera and pose; of each pose, a camera has one view at most."""
 
     camera: int  # index of the camera
     pose: int  # index of the target's pose
@@ -196,8 +197,8 @@ class AdjustedBundle:
     def noise_covariance(self) -> Array:
         """Covariance of the cameras' unknowns if the errors of all points were independent.
 
-        If the points of a view share errors, it is far too small, but it still shows which values
-        the views do not determine. NaN if ``weighted_squares`` is infinite.
+        If the points of a view share errors, this covariance is far too small, but it still shows
+        which values the views do not determine. NaN if ``weighted_squares`` is infinite.
         """
         count = self.bundle.camera_unknown_count
         if not math.isfinite(self.weighted_squares):
@@ -284,7 +285,7 @@ class LeftOut(NamedTuple):
 
 
 def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut]:
-    """Leave out each observed pose in turn, by a single step or, if needed, a new fit."""
+    """Return the fit without each observed pose, from a single step or, if needed, a new fit."""
     # At the solution, the normal equations without a pose are all equations minus those of the
     # pose, both with the poses eliminated. Their solution is the Gauss-Newton step from the fit to
     # all poses to the fit without the pose. The error of this step is of second order.
@@ -347,7 +348,7 @@ def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> 
 
 
 def _free_point_unknowns(sights: Sequence[Sight]) -> int:
-    """Return the number of unknowns of the seen points, minus 7 for their common pose and size."""
+    """Return the number of unknowns of the seen points, without the 7 of their pose and size."""
     return 3 * len(np.unique(np.concatenate([sight.view.ids for sight in sights]))) - 7
 
 
@@ -380,7 +381,7 @@ def _collect_points(camera: int, sights: Sequence[Sight], extra_variance: float)
 class BundleEquations:
     """The normal equations of a bundle, for given views.
 
-    ``prior``: whether free points are held at their nominal places, within
+    ``prior``: whether free points are held near their nominal places, with the standard deviations
     LOOSE_SIGMA_RATIO and TIGHT_SIGMA_RATIO.
     """
 

@@ -32,8 +32,8 @@ CELLS: Final = (6, 8)
 have seen the target."""
 
 SIGNIFICANCE_LEVEL: Final = 0.01
-"""Two calibrations differ if the probability that noise alone makes them differ as much is below
-this value."""
+"""Two calibrations count as different if noise alone makes them differ as much with a lower
+probability than this."""
 
 MIN_CHANCE: Final = 1e-9
 """Smallest probability that is reported: the noise is not exactly normal, so smaller values mean
@@ -46,7 +46,7 @@ MAX_FINAL_STEP_PX: Final = 1e-9
 """The fit of the motion ends when a step moves no point by more than this many pixels."""
 
 MIN_DIFFERENCE_PX: Final = 1e-3
-"""Differences below this many pixels count as none."""
+"""Differences below this many pixels are taken as 0."""
 
 
 class Lens(NamedTuple):
@@ -114,12 +114,12 @@ class LensComparison:
 
     @property
     def observed(self) -> MapFigures:
-        """The differences in four numbers, of a coordinate, pixels."""
+        """Four numbers that sum up the differences, RMS of a coordinate, pixels."""
         return figures(self.lengths)
 
     @property
     def predicted(self) -> MapFigures | None:
-        """Differences that noise would cause, in the same four numbers; None if unknown."""
+        """Four numbers that sum up the differences by noise alone; None if the noise is unknown."""
         if self.expected is None:
             return None
         return figures(np.sqrt(np.trace(self.expected, axis1=2, axis2=3) / 2))
@@ -149,7 +149,7 @@ def compare(
     distance: float | None = None,
     shape: tuple[int, int] = DEFAULT_MAP_SHAPE,
 ) -> LensComparison:
-    """Compare where two calibrations of one lens project the same points.
+    """Compare the pixels to which two calibrations of one lens project the same points.
 
     A small motion of the camera is removed from the difference first: the motion that fits best to
     the target's points in the area that both calibrations have seen. For lenses without views it is
@@ -221,7 +221,7 @@ def rig_difference(
 ) -> tuple[float, float]:
     """Return the difference between two calibrations of a pair in the pose of its cameras.
 
-    The motions that were removed in comparing the lenses are added again.
+    Comparing the lenses removed a small motion from each difference; these motions are added again.
 
     Args:
         a: ``T_second_first`` of the one calibration.
@@ -329,7 +329,7 @@ def _test_differences(difference: Array, deviations: Array, views: int) -> tuple
     squares = float(np.einsum("ni,nij,nj->", residuals, inverse, residuals)) / (2 * len(residuals))
     gram = np.einsum("nip,nij,njq->pq", finite_deviations, inverse, finite_deviations)
     total, trace_of_square = float(np.trace(gram)), float((gram**2).sum())
-    if trace_of_square <= 0.0:  # nothing of either lens was fitted
+    if trace_of_square <= 0.0:  # no value of either lens was fitted
         return math.sqrt(squares), float(squares <= 1.0)
     noise = Noise(1.0, max(views // 2, 1))
     freedom = total**2 / trace_of_square

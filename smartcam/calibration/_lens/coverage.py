@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 SUFFICIENT_RANGES: Final[dict[str, float]] = {"x": 0.7, "y": 0.7, "size": 0.4, "skew": 0.5}
-"""Range of each quantity that counts as enough.
+"""Range, over all views, that is enough of each quantity of :class:`Coverage`.
 
 Source: ROS' camera_calibration, calibrator.py (published).
 """

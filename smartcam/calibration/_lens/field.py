@@ -1,11 +1,12 @@
-"""Compute how the error of a lens moves points over the field, beyond what a pose compensates.
+"""Compute how errors of a lens move points in the image, without the part that poses compensate.
 
 Two calibrations of one lens may differ without disagreeing: if the principal point of one is off,
 the camera seems turned by as much, and every pose that is found with that lens is turned equally.
 So the small motion of the camera that fits an error over the field best is subtracted from the
 error. The points to which this motion is fitted, the gauge, can be chosen: best are the target's
-points where the calibration saw them. Points that are much nearer or farther are then less certain,
-as in a program that finds the camera's pose at one distance and uses it at another.
+points where the calibration saw them. Points that are much nearer or farther than the gauge are
+then less certain. A program that finds the camera's pose at one distance and uses it at another has
+the same uncertainty.
 
 Source: the idea is mrcal's (D. Kogan), which calls that motion the implied transformation; the
 formulas here are written anew.

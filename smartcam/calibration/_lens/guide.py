@@ -41,17 +41,17 @@ if TYPE_CHECKING:
 
 COLUMNS: Final = {0.0: "left", 0.5: "middle", 1.0: "right"}
 ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
-"""Rows that the target may be brought to, as parts of its range in the image."""
+"""Names of the rows of places for the target, by the part of its possible range in the image."""
 
 SIZES: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
-"""Parts of the image's width or height that the target may fill."""
+"""Names of distances, by the part of the image's width or height that the target then fills."""
 
 MAX_TILT_DEG: Final = 35.0
 """Tilt of the suggested tilted views, degrees: a larger one adds little and is hard to detect."""
 
 SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
-"""Side of the target that is farther away, and the camera's axis that the target is tilted
-about."""
+"""For each tilt: the side of the target that is then farther away, and the tilt's axis in the
+camera's x and y."""
 
 MARGIN_RATIO: Final = 0.02
 """Margin that stays free between the target and each side of the image, as a part of that side."""
@@ -63,8 +63,8 @@ MAP_SHAPE: Final = (9, 12)
 """Rows and columns of the map over which the uncertainty is averaged."""
 
 MAX_SAME_RAY_RADIANS: Final = 1e-3
-"""The lens' model is not valid at a point that is off the ray of its own pixel by more than this
-angle, radians."""
+"""A point is projected, and its pixel is mapped back to a ray. If the ray misses the point by more
+than this angle, radians, the lens' model is not valid there."""
 
 
 class NextView(NamedTuple):
@@ -86,7 +86,7 @@ class NextView(NamedTuple):
 
 
 class CandidateViews(NamedTuple):
-    """C views that could be taken; all points of the target would be inside of the image."""
+    """C possible views, in which all points of the target would be inside of the image."""
 
     texts: list[str]
     poses: Rigid  # ``T_camera_target`` of each
@@ -154,7 +154,7 @@ def _point_variance(calibration: IntrinsicCalibration) -> float:
 def _fitted_basis(covariance: Array) -> Array:
     """Return the derivatives (4 + K, F) of the lens' values by the F that were fitted."""
     columns, fixed = np.eye(len(covariance)), np.diag(covariance) <= 0.0
-    # fx and fy are one unknown
+    # fx and fy were fitted as one unknown
     if not fixed[0] and np.allclose(covariance[0], covariance[1], rtol=1e-9):
         columns[1, 0], fixed[1] = 1.0, True
     fitted: Array = columns[:, ~fixed]

@@ -56,7 +56,8 @@ MIN_TILT_RADIANS: Final = math.radians(5.0)
 not determine the focal length."""
 
 MIN_MOTION_SHARE: Final = 0.02
-"""Views count as the same view unless a point moves by this part of the image's longer side."""
+"""Two views count as the same if no point moves between them by this part of the image's longer
+side."""
 
 MAX_FOCAL_SIGMA_RATIO: Final = 0.1
 """The focal length is not determined if its standard deviation is more than this part of it."""
@@ -69,8 +70,8 @@ MAX_BAD_VIEW_SHARE: Final = 1 / 3
 """At most this part of the views may be left out."""
 
 MIN_REACHED_SHARE: Final = 0.9
-"""A warning says if the lens' model describes less than this part of the image: models of wide
-lenses may not reach the corners."""
+"""If the lens' model is valid in less than this part of the image, a warning says so: models of
+wide lenses may not be valid in the corners."""
 
 POOR_FIT_RMS_PX: Final = 1.0
 """Residual RMS, pixels, above which the model of the lens, or the sheet, may be wrong."""
@@ -80,8 +81,8 @@ MAX_ITERATIONS: Final = 10
 turned, take four."""
 
 MAX_RENUMBERED_RMS_SHARE: Final = 0.7
-"""Views are renumbered only if the RMS of the residuals is then less than this part of that before:
-for a sheet that bends by 0.6 mm to one side it is 0.4 or less (simulated)."""
+"""Views are renumbered only if that reduces the RMS of the residuals to less than this part: for a
+sheet that bends by 0.6 mm to one side the ratio is 0.4 or less (simulated)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,9 +119,9 @@ class IntrinsicCalibration(storage.SavedCalibration):
             changes them (a jackknife). It includes errors that all points of a view share, such as
             a sheet that bends anew. It is 0 for values that were not fitted. From V views its rank
             is at most V, and from few views it is rough: from ten it is known to a quarter.
-        views: fit of each given view, in their order.
+        views: fit of each given view, in the order of the views.
         rms: RMS of a coordinate of the residuals of the used views, pixels, corrected for their
-            degrees of freedom. It is not the accuracy: see ``held_out``.
+            degrees of freedom. It is not the accuracy of the lens: see ``held_out``.
         sigma: standard deviation of a coordinate, pixels, that the points' covariance does not
             explain: the lens or the sheet is not quite as modelled, or the points have more noise
             than their covariance says.

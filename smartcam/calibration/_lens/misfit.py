@@ -1,7 +1,7 @@
-"""Explain views that fit worse than noise would: flipped pictures, a changed camera, or others.
+"""Explain why views fit worse than noise alone would: flipped pictures, a changed camera, ...
 
-The likeliest explanation is not proven. So it is given as a warning, which names the other
-explanations: sheets that bend anew, a rolling shutter, a lens of another model. The pose of each
+The likeliest explanation is not proven, so a warning gives this explanation together with others:
+sheets that bend anew for each view, a rolling shutter, a lens of another model. The pose of each
 view is eliminated first, from the residuals and from the changes that each cause would make, so
 only the parts that no pose can compensate are compared.
 """
@@ -61,9 +61,9 @@ MIN_VIEWS_TO_EXPLAIN: Final = 4
 """The misfit of fewer views than this is not explained."""
 
 MIN_CHANGE_EVIDENCE: Final = 40.0
-"""A change from one view on is reported if the information criterion prefers it by this much to all
-other causes: 170 random parts of recorded sets reach 32, pictures resized by 1 % 48 to 350
-(measured)."""
+"""A change of the camera from one view on is reported if the information criterion prefers this
+cause to all others by this much. 170 random parts of recorded sets reach 32; pictures resized by 1
+% reach 48 to 350 (measured)."""
 
 RANDOM_ORDERS: Final = 100
 """A change from one view on is reported only if it explains more than the best change of this many
@@ -76,9 +76,9 @@ pairs reduce the squares by this factor: OpenCV's recorded pairs reach 1.6, two 
 hand-held board 8 to 19, a board that moves by 0.2 mm between the two views 8 (measured)."""
 
 FITTED_COST_RATIO: Final = 1.2
-"""A known lens is wrong if one fitted to the views reduces the squares by this factor: lenses from
-other views reach 1.04 on recorded pairs; a focal length that is 1 % off reaches 2 with a noise of
-0.05 pixels."""
+"""A known lens is wrong if fitting a lens to the views reduces the squares by this factor. Lenses
+from other views reach 1.04 on recorded pairs; a focal length that is 1 % off reaches 2 with a noise
+of 0.05 pixels."""
 
 MIN_VIEWS_FOR_LENS: Final = 3
 """A lens is fitted to at least this many views to test a known lens."""
@@ -135,7 +135,7 @@ def _deformations(points: Array) -> Array:
 
 
 class Equations(NamedTuple):
-    """The linear equations of one view, or of a pair's two, in standard deviations."""
+    """The linear equations of one view, or of a pair's two views, in standard deviations."""
 
     by_pose: Array  # (N, 2, 6), derivatives by the pose
     by_shared: Array  # (N, 2, UNKNOWN_COUNT), derivatives by the shared unknowns
@@ -180,7 +180,7 @@ class SharedEquations(NamedTuple):
 
         The unknowns at the indices ``per_view`` may differ between the views.
         """
-        # Schur's complement eliminates those of each view: x_v = M_vv^-1 (b_v - M_v x)
+        # Schur's complement eliminates the unknowns of each view: x_v = M_vv^-1 (b_v - M_v x)
         matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
         for sums_matrix, sums_right in (
             zip(self.matrix, self.right, strict=True) if per_view else ()
@@ -198,7 +198,7 @@ class SharedEquations(NamedTuple):
 
 
 class _FlippedLens(NamedTuple):
-    """The lens that a flipped picture shows: values ``v + shift``, changes times ``mirror``."""
+    """The lens of a flipped picture: values ``v + shift``, with changes times ``mirror``."""
 
     mirror: Array  # (L,), 1 or -1 for each value
     shift: Array  # (L,), in the unit of each value
@@ -245,7 +245,7 @@ class _FlippedLens(NamedTuple):
 
 
 class _Misfit:
-    """The misfit of views, and how far ordinary causes, which are no blunder, explain it."""
+    """The misfit of views, and how much of it ordinary causes explain, which are no blunders."""
 
     def __init__(self, equations: Sequence[Equations], free: Mask) -> None:
         """``free`` (UNKNOWN_COUNT,): mask of the values that were fitted."""
@@ -286,7 +286,7 @@ class _Misfit:
     def accept_cause(
         self, squares: float, unknowns: float, ratio: float = 1.0, evidence: float = 0.0
     ) -> bool:
-        """Compare a cause with all causes before; return whether it is the best, and good enough.
+        """Compare a cause with all causes before; return True if it explains the misfit best.
 
         ``squares``: the squares that the cause leaves. ``ratio``: least factor by which the cause
         must reduce the squares. ``evidence``: least difference of the information criterion to all
@@ -299,9 +299,9 @@ class _Misfit:
     def comparison(self, squares: float) -> str:
         """Return a sentence that compares a cause that leaves these squares with the others."""
         return (
-            "The squares of all are "
-            f"{self._unexplained / max(squares, 1e-300):.3g} times smaller so; "
-            f"what else was tried explains less for what it takes: {self._other_causes}"
+            "With this cause the squared residuals of all views are "
+            f"{self._unexplained / max(squares, 1e-300):.3g} times smaller; "
+            f"other causes that were tried explain less: {self._other_causes}"
         )
 
     def _change_fits(
@@ -360,13 +360,12 @@ MOVE_QUESTION: Final = "did the cameras move against each other"
 def misfit_remarks(
     fitted: Sequence[Sequence[FittedView]], extra_variance: float, free: Mask, names: Sequence[str]
 ) -> Iterator[Remark]:
-    """Yield a remark if a blunder explains the views better than all else.
+    """Yield a remark if a blunder explains the misfit of views better than all other causes.
 
-    Blunders are a change of the camera from one view on and flipped pictures; of a pair also
-    cameras that move against each other, and views of different moments. A board
-    that looks the same in a mirror is also found in a flipped picture, as if the lens was mirrored.
-    A large misfit may have other causes, so each cause is fitted, and only the best one is
-    reported.
+    Blunders are flipped pictures, and a camera that was changed from one view on. For a pair they
+    are also cameras that move against each other, and views of different moments. A board that
+    looks the same in a mirror is also found in a flipped picture, as if the lens was mirrored. A
+    large misfit may have other causes, so each cause is fitted, and only the best one is reported.
 
     ``fitted``: the view, or the left and the right view of a pair, of each moment.
     ``extra_variance``, pixels^2, is added to the points' covariance. ``free`` (UNKNOWN_COUNT,):

@@ -42,9 +42,9 @@ MAX_OUTSIDE_RATIO: Final = 0.1
 """A point may lie outside of the image by this part of the image's sides."""
 
 MIN_AGREEMENT: Final = 0.5
-"""The agreement of a view with its target, from -1 to 1, must be below minus this value. Above plus
-this value, the view shows the sheet in a mirror. Views of steep sheets and of fisheyes have
--0.8."""
+"""The agreement of a view with its target, from -1 to 1, is near -1 in a correct view and must be
+below minus this value. If it is above this value, the view shows the sheet in a mirror. Views of
+steep sheets and of fisheyes have -0.8."""
 
 MAX_RAY_SHIFT_RATIO: Final = 1e-9
 """Rays are shifted by at most this part of the focal length, to avoid rounding errors in OpenCV."""
@@ -209,7 +209,7 @@ def _check_numbering(view: TargetView, label: str) -> None:
 
 
 def half_turn(target: Target) -> Rigid:
-    """Return the half turn, in the target's frame, after which the target looks the same."""
+    """Return the half turn, in a target's frame, after which the target looks the same."""
     return Rigid(np.diag([-1.0, -1.0, 1.0]), target.points[0] + target.points[-1])
 
 
@@ -234,7 +234,7 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     """
     rays = camera.directions(view.points)
     poses = _solve_ippe(view.object_points, rays)
-    if not poses:  # OpenCV takes the root of a difference, which may be negative for exact rays
+    if not poses:  # exact rays: OpenCV took the root of a negative rounding error
         poses = _solve_ippe(
             view.object_points, rays + MAX_RAY_SHIFT_RATIO * np.sin(np.arange(len(rays)))[:, None]
         )

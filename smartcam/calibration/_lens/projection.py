@@ -1,4 +1,4 @@
-"""Project points with derivatives, and scale residuals by their noise, for all fits.
+"""Project points with derivatives, and divide residuals by their noise; all fits use this.
 
 A pose is a rotation R (3, 3) and a translation t (3,) that lead from the target to the camera. Its
 six small changes are a turn w and a shift d in the camera's frame: R becomes exp([w]x) R, and t
@@ -28,7 +28,7 @@ than this probability."""
 
 
 MAX_DEGREE = 5
-"""Any smooth error of a lens is approximated by polynomials of the place in the image up to this
+"""Smooth errors of a lens are approximated by polynomials of the place in the image, up to this
 degree."""
 
 SMOOTH_TERM_COUNT = (MAX_DEGREE + 1) * (MAX_DEGREE + 2)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 SheetOption: TypeAlias = Literal["auto", "exact", "free"]
-"""Choice of a sheet's points: nominal (``exact``), adjusted (``free``), or chosen by the fit."""
+"""Choice between nominal (``exact``) and adjusted points (``free``); ``auto``: the fit decides."""
 
 MIN_POSES: Final = 4
 """At least this many left-out views show whether adjusted points predict better by more than

@@ -34,7 +34,7 @@ MAX_VIEWS_OF_OPENCV: Final = 20
 """OpenCV gets at most this many views; then the fit is adjusted to all views."""
 
 MAX_GOOD_RMS_PX: Final = 0.5
-"""No further focal length is tried once the RMS is at most this many pixels."""
+"""No further focal length is tried once one has led to an RMS of at most this many pixels."""
 
 
 def parameter_names(model: DistortionModel) -> tuple[str, ...]:

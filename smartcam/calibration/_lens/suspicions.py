@@ -63,10 +63,10 @@ MAX_RMS_PX: Final = 10.0
 the lens causes a smaller RMS."""
 
 MAX_RMS_SHARE: Final = 0.015
-"""The limit MAX_RMS_PX as a part of the longer side of the image; the largest limit holds."""
+"""MAX_RMS_PX is raised to this part of the longer side of the image if that is larger."""
 
 MAX_RMS_SIGMAS: Final = 20.0
-"""The limit MAX_RMS_PX as a multiple of the points' standard deviation; the largest limit holds."""
+"""MAX_RMS_PX is raised to this many standard deviations of the points if that is larger."""
 
 DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
 """A principal point is doubted if it is farther from the centre than this part of the image's

@@ -68,7 +68,7 @@ class ProjectionUncertainty:
 
     @property
     def across(self) -> Array:
-        """Standard deviation at the distance, across the line of sight, (h, w), metres.
+        """Standard deviation across the line of sight, at ``distance``, (h, w), metres.
 
         For points at infinity it is an angle, radians.
         """
@@ -112,7 +112,7 @@ def uncertainty(
     distance: float | None = None,
     shape: tuple[int, int] = DEFAULT_MAP_SHAPE,
 ) -> ProjectionUncertainty:
-    """Return the map of a lens, from the covariance of its values (fx, fy, cx, cy, coefficients).
+    """Return the map of a lens' uncertainty, from the covariance of the lens' values.
 
     ``gauge``: (N, 3), points in the camera's frame that the motion is fitted to. Other arguments
     and errors: as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.

@@ -76,22 +76,22 @@ POINTS_PER_BLOCK = 16_384
 """Covariances are computed for this many points at a time, which takes 5 MB."""
 
 MIN_POINTS_FOR_VERDICT: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
-"""A verdict needs this many points: fewer may fit the model although two of them are wrong in the
-same way (simulated)."""
+"""A verdict needs at least this many points: fewer points may fit the model although two of them
+are wrong in the same way (simulated)."""
 
 MAX_TOUCH_SIGMAS = 4.0
-"""A touch farther than this many sigmas from the mean of its point's touches is remarked on: noise
-alone causes that once in a thousand touches."""
+"""A remark names a touch that is farther than this many sigmas from the mean of all touches of its
+point: noise alone causes that once in a thousand touches."""
 
 MIN_DIRECTION_LENGTH = 1e-9
 """A vector shorter than this has no direction."""
 
 STALE_LEVEL = 0.01
-"""Probability with which a calibration that still holds may be called stale."""
+"""Default of the probability with which a calibration that still holds may be called stale."""
 
 
 class Drift(NamedTuple):
-    """Result of comparing points that were touched again with the calibration.
+    """Result of touching points again and comparing them with the calibration.
 
     Attributes:
         offsets: touched minus expected (K, 3), metres.
@@ -124,8 +124,8 @@ class PlaneCalibration(storage.SavedCalibration):
         place: centre and size of the points, in both spaces.
         unit_covariance: (12, 12), of the elements of the matrix between the centred and scaled
             points, row by row, for touches with a variance of 1 m^2.
-        residuals: (N, 3), robot minus mapped, metres. They are smaller than the error, except those
-            of points left out.
+        residuals: (N, 3), robot minus mapped, metres. They are smaller than the true errors, except
+            for points that were left out.
         leave_one_out: (N, 3), robot minus the place mapped by a calibration from the other points,
             metres; NaN if these give no fit. It includes the error of the point's own touch. For a
             point left out it is the residual.
@@ -318,8 +318,8 @@ class PlaneCalibration(storage.SavedCalibration):
         """Return localizations with their poses in the robot's space.
 
         Their z axis is the plane's normal, their x axis the part's. The header is in the robot's
-        frame; number and time do not change. Where a pose has a ``sigma``, and the touches' sigma
-        is known, the robot's has one, too, with the calibration's own error in it.
+        frame; number and time do not change. If a pose has a ``sigma``, and the touches' sigma is
+        known, its robot pose has a ``sigma`` that includes the calibration's own error.
 
         Args:
             localizations: localizations of the camera, one or many.
@@ -364,7 +364,7 @@ class PlaneCalibration(storage.SavedCalibration):
 
         Returns:
             (K, 3, 3), m^2, along the robot's axes. The noise of the camera when it sees the point
-            comes on top.
+            is not included.
 
         Raises:
             CalibrationError: SHAPE or NOT_FINITE; UNVERIFIED: the touches' sigma is not known.
@@ -399,13 +399,13 @@ class PlaneCalibration(storage.SavedCalibration):
         if self.touch_sigma is None:
             raise Code.UNVERIFIED.refusal(
                 "predicted error: expected touch_sigma, or more points than the "
-                f"{np.count_nonzero(self.weights)} that {self.model} has need of",
+                f"{np.count_nonzero(self.weights)} that {self.model} needs",
                 "touch_sigma",
             )
         return self.touch_sigma**2
 
     def predicted_error(self, points: ArrayLike) -> Array:
-        """Return the RMS error to expect of mapped points if touches have no errors but noise.
+        """Return the RMS error to expect of mapped points if touches err by noise alone.
 
         Args:
             points: (K, 2), of the camera.
@@ -422,7 +422,7 @@ class PlaneCalibration(storage.SavedCalibration):
     def check(
         self, camera_points: ArrayLike, robot_points: ArrayLike, *, level: float = STALE_LEVEL
     ) -> Drift:
-        """Compare points that were touched again with their places by the calibration.
+        """Compare points that were touched again with the places that the calibration predicts.
 
         Offsets are compared with the covariance of the new touches plus that of the calibration,
         which all points share. With several points two tests are made, each at half the level: of
@@ -513,7 +513,7 @@ class PlaneCalibration(storage.SavedCalibration):
             )
         if self.unit_covariance.shape != (12, 12):
             raise storage.invalid_data_error(called, "unit_covariance: expected rows of 12", None)
-        _ = self._map  # raises now for an invalid matrix, not only when the first part comes
+        _ = self._map  # an invalid matrix raises here, not only when the first part is mapped
 
 
 @check_arguments(
@@ -711,7 +711,7 @@ def _move_remarks(offsets: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]
 
 
 def _left_out_remark(calibration: PlaneCalibration, index: int, weight: float) -> Remark:
-    """Return the remark on a point that was left out, with the distance that noise explains."""
+    """Return the remark that a point was left out, with its distance and the expected noise."""
     distance = float(np.linalg.norm(calibration.residuals[index]))
     variance = 3.0 / weight * (calibration.touch_sigma or 0.0) ** 2
     variance += (
@@ -733,7 +733,7 @@ def _estimate_touch_sigma(fitted: Fit, weights: Array, typical: float) -> float 
 def mean_axis(tool_z: ArrayLike, count: int) -> Array:
     """Return the mean direction (3,) of a tool's axis, of length 1.
 
-    ``tool_z``: (3,), or (``count``, 3), of each touch. Raises SHAPE, NOT_FINITE, or COINCIDENT if
+    ``tool_z``: (3,), or (``count``, 3), of each touch. Raises SHAPE or NOT_FINITE; or COINCIDENT:
     the mean has no length.
     """
     values = np.asarray(tool_z, dtype=np.float64)

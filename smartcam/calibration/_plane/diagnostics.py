@@ -30,20 +30,20 @@ SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may cause a warning."""
 
 SCALE_TOLERANCE = 0.005
-"""A scale may differ from the nominal one by this part: printers, and heights of parts, change it
-by as much."""
+"""A scale may differ from the nominal one by this part: printers, and the heights of parts, change
+the scale by as much."""
 
 MAX_SCALE_ERROR = 0.1
-"""A scale that differs from the nominal one by more than this part is that of other units or
-another sheet."""
+"""If a scale differs from the nominal one by more than this part, the units or the sheet are
+wrong."""
 
 MIN_TOOL_COSINE = 0.17
 """If the cosine between tool and normal is smaller than this, the tool's axis does not show from
 which side the plane is touched."""
 
 MAX_POINTS_FOR_PAIRS = 25
-"""With at most this many points, each pair of points is left out in turn; with more, two points
-hardly change the map."""
+"""With at most this many points, each pair of points is left out in turn; with more points, leaving
+out two hardly changes the map."""
 
 MIN_POINTS_LEFT = 3
 """More points than this must remain when some are left out: three points nearly always fit a
@@ -233,7 +233,7 @@ def _test_wrong_touches(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _residual_chance(evidence: Evidence, squared: float, total: float) -> float:
-    """Return a residual's p-value; the noise is estimated from the others if these suffice."""
+    """Return a residual's p-value; the noise is estimated from the other residuals if possible."""
     freedom = evidence.fitted.freedom - 3
     sigma = evidence.sigma if freedom < MIN_DEGREES_OF_FREEDOM else None
     noise = touch_noise(sigma, max(total - squared, 0.0), freedom)

@@ -1,4 +1,4 @@
-"""Fit the map between pairs of points, with its covariance; without any I/O.
+"""Fit the map from a camera's points to a robot's points, and compute the map's covariance.
 
 A camera that looks at a plane maps it to its image by a homography. Together with the pose of the
 plane in the robot's space that is one matrix: ``w (x, y, z, 1) = matrix (u, v, 1)``, with 11
@@ -32,16 +32,16 @@ ModelName: TypeAlias = Literal["rigid", "similarity", "affine", "homography"]
 MIN_CONDITION = 1e-4
 """Smallest over largest singular value of a fit's column-scaled Jacobian.
 
-Healthy layouts have 0.03 and more; if a parameter is not determined, the ratio is a rounding error
-below 1e-10 (measured).
+Well-placed points have 0.03 and more; if the points leave a parameter open, the ratio is a rounding
+error below 1e-10 (measured).
 """
 
 MAX_STEPS = 50
 """The refinement of a homography takes at most this many steps; it usually takes 3 to 8."""
 
 MAX_HALVINGS = 20
-"""A step that increases the sum of squares is halved at most this many times; then rounding errors
-prevent a smaller sum."""
+"""A step that increases the sum of squares is halved at most this many times; if the sum is still
+not smaller, only rounding errors are left."""
 
 MIN_STEP = 1e-13
 """The refinement ends when a step changes the matrix' elements, which are about 1, by less than
@@ -181,10 +181,10 @@ def _scaled_jacobian(name: ModelName, matrix: Array, pairs: Pairs) -> tuple[Arra
 
 
 def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
-    """Return each point minus the place that a fit of all others predicts, (N, 3).
+    """Return each point minus the place that a fit of all other points predicts, (N, 3).
 
-    NaN if the others alone determine no map. ``affine`` uses leverages, ``rigid`` and
-    ``similarity`` subtract the point from the sums, and only a ``homography`` is fitted again.
+    The difference is NaN if the other points determine no map. ``affine`` uses leverages, ``rigid``
+    and ``similarity`` subtract the point from the sums, and only a ``homography`` is fitted again.
     """
     if len(pairs.camera) <= MODELS[fitted.model].min_points:
         return np.full_like(pairs.robot, np.nan)
@@ -220,7 +220,7 @@ def _held_out_by_refit(fitted: Fit, pairs: Pairs, index: int) -> Array:
 
 
 def _held_out_by_sums(pairs: Pairs, scale: float | None) -> Array:
-    """Fit all points but each, from the sums over all points minus the part of that point."""
+    """Return the held-out residuals (N, 3), from sums over all points minus one point's part."""
     u, p, w = pairs.camera, pairs.robot, pairs.weights[:, None]
     # sum w (p - p') (u - u')^T = sum w p u^T - W p' u'^T, with the means p' and u' and W = sum w;
     # without a point these are the sums over all points minus the part of that point.
@@ -320,7 +320,7 @@ def _linear_homography(pairs: Pairs, scale: float) -> Array:
     solution = np.linalg.svd(equations, full_matrices=False)[2][-1].reshape(3, 3)
     w = pairs.homogeneous @ solution[2]
     if abs(solution[2, 2]) < MIN_CONDITION or w.min() * w.max() <= 0:
-        return _solve_affine(pairs, scale)  # a point beyond the horizon comes from noise
+        return _solve_affine(pairs, scale)  # noise has put a point beyond the horizon
     solution = solution / solution[2, 2]
     upper_rows = axes @ solution[:2] + np.outer(mean, solution[2])
     return np.concatenate([upper_rows, solution[2:]])

@@ -1,8 +1,8 @@
 """Map points between a camera's plane and the robot's space, and poses to the robot's space.
 
 The heading of a part in the plane is its direction in the image, mapped at that place. For a
-similarity that is the frame of the plane times the turn about z; a tilted camera changes angles a
-little, by the derivative of the map.
+similarity the pose is the frame of the plane times the turn about z. A tilted camera changes angles
+a little, so the derivative of the map is used.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ POINTS_PER_BLOCK = 65_536
 and calls are few (blocks of 16,384 points take 1.5 times as long, of 10^6 points 1.25 times;
 measured)."""
 
-# takes half the time of the NamedTuples' own; the cast is needed since a bare tuple is generic
+# takes half the time of the NamedTuples' own constructor; a bare tuple is generic, hence the cast
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 

@@ -1,4 +1,4 @@
-"""Choose the model that the points justify.
+"""Choose the model of a plane's map (rigid to homography) that the touched points justify.
 
 The rule, from the simplest model upwards: a more general model is chosen if its held-out error is
 smaller, and if noise alone would reduce the sum of squared residuals by as much in fewer than three

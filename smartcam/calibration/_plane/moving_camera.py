@@ -2,11 +2,11 @@
 
 The calibration holds for the robot's pose at which it was made, ``T_cal``. At another pose,
 ``T_now``, the camera and everything that it sees have moved by the rigid motion ``T_now T_cal^-1``
-in the robot's frame. So this motion is applied *after* the static chain (derived). The thesis,
-3.2.5.2, applies it before, which would be right only with the camera's place on the robot, and a
-plane's calibration does not know that.
+in the robot's frame. So this motion is applied *after* the static chain (derived). The thesis with
+which smartcam began, 3.2.5.2, applies the motion before the chain. That would be right only if the
+camera's place on the robot were known, which a plane's calibration does not determine.
 
-That holds as long as the camera sees the plane of the parts at its calibrated place: the motion
+This is right as long as the camera sees the plane of the parts at its calibrated place: the motion
 must map the plane onto itself, as shifts within the plane and turns about its normal do. After a
 camera is raised or tilted, the same pixels show other places, so such poses are refused.
 """

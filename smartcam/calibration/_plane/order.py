@@ -1,10 +1,10 @@
 """Find touches that were given for the wrong marks, because they were exchanged or shifted.
 
 If the touches of two marks are exchanged, or all of them are shifted by one, least squares spread
-the mistake over all points. This module searches for the right order. It starts from the order as
-given, from each shift of it, and from each of these reversed. Each step exchanges the two touches
-that lower the sum of squares most, until no exchange lowers it. An order is reported only if a
-simple map explains it and explains the order as given far worse.
+the mistake over all points. This module searches for the right order. The search starts from the
+order as given, from each shift of this order, and from the reverse of each. Each step exchanges the
+two touches that lower the sum of squares most, until no exchange lowers it. An order is reported
+only if a simple map explains it and explains the order as given far worse.
 """
 
 from __future__ import annotations

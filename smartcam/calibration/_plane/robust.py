@@ -7,8 +7,8 @@ fitted again to the points that agree with them, until those no longer change. A
 if noise alone would move any point so far from the others in only one of 100 calibrations.
 
 The maps are similarities, or homographies if noise does not explain the higher cost of a
-similarity. So the corners do not become outliers under a tilted camera, even if the final model is
-a similarity.
+similarity. So the corner points of a field under a tilted camera do not become outliers, even if
+the final model is a similarity.
 
 The points are sorted first, and random subsets are drawn with a fixed seed, so the same points give
 the same answer in any order.
@@ -47,12 +47,14 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 MIN_POINTS = 6
-"""At least this many points are needed: with fewer, hardly more agree than determine a map."""
+"""At least this many points are needed: of fewer points, hardly more would agree than are needed to
+determine a map."""
 
 MAX_SUBSETS_TRIED = 500
 """At most this many subsets propose a map; for up to 12 points these are all subsets.
 
-If half of the points are wrong, each of 500 subsets of four has a wrong one in 1 of 10^14 cases.
+If half of the points are wrong, all of 500 subsets of four include a wrong point in 1 of 10^14
+cases.
 """
 
 MAX_FITTED_PROPOSALS = 5
@@ -65,9 +67,9 @@ SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone leads to leaving out a point, or to a homography."""
 
 LEFT_OUT_COST_RATIO = 0.5
-"""Cost of a left-out point, as a part of the threshold, if similarity and homography are compared.
-A homography that only goes through one more wrong point is not chosen: with 1 instead of this
-value it was chosen in 7 of 400 cases with two wrong points of six (measured)."""
+"""Cost of a left-out point, as a part of the threshold, for comparing similarity and homography. A
+homography that only goes through one more wrong point is not chosen: with 1 instead of this value
+it was chosen in 7 of 400 cases with two wrong points of six (measured)."""
 
 SEED = 7
 """Subsets are drawn by random numbers from this seed, so that results repeat."""
@@ -196,7 +198,7 @@ def _search_model(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreem
 def _refit_until_stable(
     name: ModelName, pairs: Pairs, mask: Mask, sigma: float | None, threshold: float
 ) -> _Agreement | None:
-    """Fit a map and find the points that agree, in turn, until these are the fitted points."""
+    """Fit a map and find the points that agree, in turn, until these points stay the same."""
     fitted = None
     for _ in range(MAX_ITERATIONS):
         if int(mask.sum()) < MODELS[name].min_points:

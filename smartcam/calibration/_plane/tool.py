@@ -1,8 +1,8 @@
 """Compute the position of a tool's tip from touches of one point.
 
-A wrong tip moves every touch by the same vector *in the flange's frame*. That cancels only as long
-as the flange always has the same orientation: an error of 1 mm is 2 mm between two touches that are
-half a turn apart (derived).
+A wrong tip moves every touch by the same vector *in the flange's frame*. This error cancels only if
+the flange has the same orientation at all touches: between two touches that are half a turn apart,
+an error of 1 mm becomes 2 mm (derived).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_ORIENTATION_SPREAD: Final = 0.17
-"""Least singular value of the rotations' differences: that of two touches 20 degrees apart."""
+"""Least singular value of the differences of rotations; two touches 20 degrees apart have it."""
 
 
 class ToolTip(NamedTuple):

@@ -1,9 +1,9 @@
 """Fit a plane from the origin mark that the camera localizes, and touches of the sheet's rays.
 
 The sheet has an origin and two rays at right angles, A along its x and B along its y. The camera
-localizes the origin with its angle; the robot touches the origin, and each ray at any place. This
-place is not known, so the scale comes from the user, and three touches leave only one number to
-check: the angle between the rays. If the camera sees more than one mark,
+localizes the origin with its angle; the robot touches the origin, and each ray at any place. The
+touched places along the rays are not known, so the user gives the scale, and three touches allow
+only one check: of the angle between the rays. If the camera sees more than one mark,
 :func:`~smartcam.calibration.fit_plane` gives a better calibration from as many touches.
 """
 
@@ -202,8 +202,8 @@ def _linearize(
     """Return the touches' positions along their rays, the residuals, and the Jacobian (3N, 6)."""
     axes: Array = np.concatenate([np.zeros((1, 3)), frame[:, :2].T])
     directions = axes[ray_index]
-    # Off its ray with direction d a touch q is (I - d d^T) (q - o). A shift s of the origin and a
-    # turn w move the ray's point beneath it, o + l d, by s + l w x d.
+    # A touch q is off its ray with direction d by (I - d d^T) (q - o). A shift s of the origin and
+    # a turn w move the ray's point beneath it, o + l d, by s + l w x d.
     offsets = touches - origin
     positions = (offsets * directions).sum(axis=1)
     projections = np.eye(3) - directions[:, :, None] * directions[:, None, :]

@@ -1,4 +1,4 @@
-"""Check whether points determine a calibration at all, before it is computed."""
+"""Check whether touched points determine a plane's calibration, before it is computed."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ MAX_THICKNESS_RATIO = 0.2
 RMS."""
 
 SAME_MARK_RATIO = 0.01
-"""Camera points with the same touch show one mark if they are closer together than this part of all
-points' extent."""
+"""Camera points with the same touch are taken as one mark if they are closer together than this
+part of the extent of all points."""
 
 SAME_POINT_RATIO = 1e-9
 """Points that are closer together than this part of the extent of all points count as the same."""
@@ -74,7 +74,7 @@ class DistinctPoints(NamedTuple):
 
     camera: Array  # (M, 2), camera's points
     robot: Array  # (M, 3), robot's points
-    # (M,), each that of a single touch, since an error of the point is in all of its touches
+    # (M,), largest weight of a point's touches: all touches share the error of their point
     weights: Array
     point_index: NDArray[np.intp]  # (N,), index of the distinct point of each given point
     first_index: NDArray[np.intp]  # (M,), index of the first given point of each distinct point
@@ -139,8 +139,9 @@ def check_samples(
 
     ``camera`` (N, 2); ``robot`` (N, 3), metres. ``min_count``: number of points that the model
     needs. ``touch_sigma``: standard deviation of one coordinate, metres; None: not known. Raises
-    TOO_FEW, UNIT_UNKNOWN, COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER. ``allow_strays``: some
-    touches may be far off, so a large field does not mean other units.
+    TOO_FEW, UNIT_UNKNOWN, COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER. ``allow_strays``:
+    whether some touches may be far off, so that a large field does not prove that the units are
+    wrong.
     """
     if len(camera) < min_count:
         raise Code.TOO_FEW.unexpected(

@@ -1,4 +1,4 @@
-"""Write a page of black shapes to scale, as SVG and as PDF.
+"""Write a page of black shapes in true size, as SVG and as PDF.
 
 A page's coordinates are millimetres from its lower left corner, y up. Shapes are filled and have no
 stroke, so the printed outline is exactly that of the coordinates. The same shapes always give the

@@ -25,7 +25,7 @@ BORDER_MM: Final = 5.0
 """Width of the page's border that many printers cannot print on, mm."""
 
 MAX_MOVE_MM: Final = 5.0
-"""Largest extra distance of a target from the border, mm; the other free space is for the rays."""
+"""Free space moves a target by at most this far from the border, mm; the rays get the rest."""
 
 MARGIN_RATIO: Final = 0.2
 """Width of the white margin around a target, as a part of a square's side or of the distance

@@ -178,7 +178,7 @@ def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
 def origin_mark_shapes(radius: float) -> tuple[tuple[Polygon | Disc, ...], Box]:
     """Return an origin mark: a disc with two black quarters, the first with a white dot.
 
-    The quarters meet in the point to touch; the dot shows how the sheet is turned.
+    The robot touches the point where the quarters meet; the dot shows how the sheet is turned.
     """
     dot_radius = 0.18 * radius
     dot_offset = 0.6 * radius * math.sqrt(0.5)

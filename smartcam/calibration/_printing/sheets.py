@@ -1,4 +1,4 @@
-"""Make sheets to print: a target, the thesis' rays A and B from its origin, and rulers.
+"""Make sheets to print: a target, two rays A and B from its origin along x and y, and rulers.
 
 ::
 
@@ -232,7 +232,7 @@ def target_from_description(data: Mapping[str, Any]) -> Target | Rays:
 
 
 def page_size(page: str) -> tuple[float, float]:
-    """Return a page's width and height, mm; raise SHAPE if it has none."""
+    """Return width and height, mm, of the page that a text names; raise SHAPE for another text."""
     if page in PAGES_MM:
         return PAGES_MM[page]
     sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)

@@ -57,8 +57,8 @@ KIND = "sheet"
 """Kind of these calibrations, as their files name it."""
 
 MAX_UNEXPLAINED_PX = {True: 0.3, False: 0.1}
-"""A larger residual in addition to the points' noise, pixels, is remarked on. With a lens (True)
-the limit allows for errors of print, edges and lens; without a lens it is a tenth of usual
+"""A remark says if residuals exceed the points' noise by more than this, pixels. With a lens (True)
+the limit allows for errors of print, edges and lens; without a lens the limit is a tenth of usual
 distortion."""
 
 ONE_SCALE_MODELS = frozenset({"rigid", "similarity", "touches"})
@@ -237,8 +237,8 @@ class SheetCalibration(storage.SavedCalibration):
             localizations: localizations of the camera, one or many: pixels, with y turned up.
             tool_flip: as in :meth:`PlaneCalibration.to_robot`.
 
-        Where a pose has a ``sigma``, and the touches' sigma is known, the robot's has one, too,
-        with the errors of view, touches and lens in it.
+        If a pose has a ``sigma``, and the touches' sigma is known, its robot pose has a ``sigma``
+        that includes the errors of view, touches and lens.
 
         Raises:
             CalibrationError: WRONG_FRAME, OUT_OF_PLANE, OUT_OF_FIELD.
@@ -290,8 +290,8 @@ class SheetCalibration(storage.SavedCalibration):
 
         Returns:
             (K, 3, 3), m^2, along the robot's axes. It includes errors of the lens if
-            ``lens_covariance`` is given; the noise of the camera when it sees the point comes on
-            top.
+            ``lens_covariance`` is given; the noise of the camera when it sees the point is not
+            included.
 
         Raises:
             CalibrationError: as :meth:`transform`; UNVERIFIED: the touches' sigma is not known.

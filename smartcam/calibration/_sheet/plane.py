@@ -1,4 +1,4 @@
-"""Map pixels to the metres of a sheet in front of a camera.
+"""Map a camera's pixels to places on a sheet that the camera sees, in metres.
 
 With a lens, pixels are corrected for its distortion, and their rays are intersected with the plane
 in which the target was located. Without a lens, a homography is fitted to all points of the target:
@@ -273,8 +273,8 @@ def _fit_homography(
     matrix: Array, source: Array, pixels: Array, noise: Array
 ) -> tuple[Array, Array]:
     """Return the homography and the covariance of its elements (9, 9); the last element is 1."""
-    # Gauss and Newton's steps. From the linear solution, the second or third is the last; with 54
-    # points they take 1.8 ms, SciPy's least_squares 2.2 ms (measured), in no fewer lines.
+    # Gauss and Newton's steps, two or three from the linear solution. With 54 points they take 1.8
+    # ms, SciPy's least_squares takes 2.2 ms (measured) and as many lines of code.
     weights, normal = whitening(noise, 0.0), np.eye(8)
     for _ in range(MAX_STEPS):
         residuals = weights @ (pixels - apply_homography(matrix, source))[..., None]

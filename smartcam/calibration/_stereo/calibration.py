@@ -55,7 +55,7 @@ PoseInLeft = Annotated[Transform, storage.motion(lambda _: (LEFT, TARGET))]
 LeftInRight = Annotated[Transform, storage.motion(lambda _: (RIGHT, LEFT))]
 
 MIN_PAIRS: Final = 2
-"""Known lenses need this many pairs: one determines the transform, another confirms it."""
+"""Cameras with known lenses need this many pairs: one gives the transform, another confirms it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,9 +99,9 @@ class StereoCalibration(storage.SavedCalibration):
         covariance: (6, 6), of a small turn (rad) and shift (m) of the left camera in the right
             one's frame, from how much each pair changes it (a jackknife), so it includes errors
             that all points of a pair share.
-        pairs: fit of each given pair, in their order.
+        pairs: fit of each given pair, in the order of the pairs.
         rms: RMS of a coordinate of the residuals of all used views, pixels, corrected for their
-            degrees of freedom. It is not the accuracy: see ``held_out``.
+            degrees of freedom. It is not the accuracy of the cameras: see ``held_out``.
         sigma: standard deviation of a coordinate, pixels, that the points' covariance does not
             explain.
         epipolar: rms distance of the used points from their epipolar lines, pixels.
@@ -264,7 +264,7 @@ class StereoCalibration(storage.SavedCalibration):
         """Return the maps that make the rows of both images show the same points.
 
         Args:
-            alpha: 0 to 1, from no invalid pixels in the output to no lost ones of the source.
+            alpha: 0: all pixels of the output are valid; 1: all source pixels are kept; or between.
             size: size of the output, width and height in pixels; None: the source's.
 
         Raises:

@@ -45,7 +45,7 @@ MAX_RMS_PX: Final = 5.0
 """Residual RMS, pixels, above which the views of pairs do not belong together."""
 
 MAX_RMS_SHARE: Final = 0.005
-"""The limit MAX_RMS_PX as a part of the longer side of the image; the larger of both holds."""
+"""MAX_RMS_PX is raised to this part of the longer side of the image if that is larger."""
 
 EXCHANGED_RESIDUAL_RATIO: Final = 1.05
 """Lenses were given in the wrong order if exchanging them makes the residuals this many times
@@ -56,8 +56,8 @@ MIN_SWAPPED_SHARE: Final = 0.75
 """Lenses are swapped only if at least this part of the pairs fits better with them exchanged."""
 
 MIN_APART_CHI2: Final = 30.0
-"""The cameras stand apart if their distance, squared and in standard deviations, is more than this:
-chance alone exceeds it, over three axes, once in a million."""
+"""The cameras stand apart if the square of their distance, in standard deviations, is more than
+this. For two cameras at one place, noise exceeds this value once in a million calibrations."""
 
 RIGHT_ANGLE_TRACE: Final = 1.0
 """Trace of a rotation by a right angle."""
@@ -122,8 +122,8 @@ def check_cameras_apart(transform: Transform, covariance: Array) -> None:
 
     ``covariance`` (6, 6) is that of ``T_right_left``.
     """
-    # the variance along the shift is used, which few views determine even if they do not determine
-    # the whole covariance
+    # only the variance along the shift is used: few views determine this variance, though not the
+    # whole covariance
     shift, shift_covariance = transform.translation, covariance[3:, 3:]
     if float(shift @ shift) ** 2 <= MIN_APART_CHI2 * float(shift @ shift_covariance @ shift):
         raise Code.COINCIDENT.refusal(

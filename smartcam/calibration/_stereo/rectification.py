@@ -28,7 +28,7 @@ MAX_PIXELS: Final = 100_000_000
 """A rectified image has at most this many pixels; its two maps have 8 bytes for each pixel."""
 
 MAX_SAMPLES: Final = 50_000
-"""The part of source pixels that is kept is computed from at most this many of them."""
+"""The share of source pixels that are kept is computed from at most this many source pixels."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,7 +89,7 @@ def rectify(
         left: lens of the left camera.
         right: lens of the right camera, of the same model and image size.
         transform: ``T_right_left``.
-        alpha: 0 to 1, from no invalid pixels to no lost ones.
+        alpha: 0: all pixels of the output are valid; 1: all source pixels are kept; or between.
         size: size of the output, width and height in pixels; None: the source's.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Guess lenses, poses and transform of two cameras, from which their calibration starts."""
+"""Guess two cameras' lenses, poses and transform, with which their calibration starts."""
 
 from __future__ import annotations
 
@@ -66,9 +66,8 @@ def as_moments(
 ) -> list[Moment]:
     """Return the views as pairs.
 
-    Raises ``SHAPE`` if the lists have different lengths; ``DIFFERENT_TARGETS``, ``WRONG_SIZE``,
-    ``TOO_FEW``, ``COLLINEAR`` or ``NOT_FINITE`` if views do not belong together, or if one is
-    unusable.
+    Raises ``SHAPE``: the lists have different lengths; ``DIFFERENT_TARGETS`` or ``WRONG_SIZE``:
+    views do not belong together; ``TOO_FEW``, ``COLLINEAR`` or ``NOT_FINITE``: a view is unusable.
     """
     left_views, right_views = (
         as_list(views, (TargetView, type(None)), f"{side} view")

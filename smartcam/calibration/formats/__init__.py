@@ -10,8 +10,8 @@
 
 ``TRANSFORMS``, ``SAMPLES`` and ``TRAJECTORIES`` are the tables of formats; ``_cameras.py`` has the
 table of cameras' formats, for :func:`read_cameras`. To add a format, add a row with a function
-that parses and one that composes. Nothing that is read is trusted until it has been checked: size,
-depth, every number and every rotation.
+that parses and one that composes. Files are not trusted: their size and depth, every number and
+every rotation are checked.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
         max_bytes=MAX_YAML_BYTES,
     ),
 }
-"""Formats of samples of a hand-eye calibration; these formats have no names of frames."""
+"""Formats of samples of a hand-eye calibration; their files do not name the frames."""
 
 TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
     "asl": Format(

@@ -1,4 +1,4 @@
-"""Read and write lenses and pairs: ROS' ``camera_info``, Kalibr's camchain, OpenCV's files.
+"""Read and write files of lenses and camera pairs: ROS' ``camera_info``, Kalibr's, OpenCV's.
 
 Formats that can only be read are in ``_foreign.py``.
 
@@ -211,8 +211,9 @@ def compose_camera_info(
 ) -> str:
     """Return the YAML of ROS' ``camera_info``; see :func:`write_camera_info`.
 
-    Source: ROS, ``camera_calibration_parsers`` (published). ``cols`` of the coefficients is their
-    number; readers that expect five misread files of eight (image_pipeline #278).
+    ``cols`` of the coefficients is their number, five or eight. Source: ROS,
+    ``camera_calibration_parsers`` (published); image_pipeline #278: some readers misread eight
+    coefficients, since they expect five.
     """
     undistorted = np.column_stack([camera.matrix, np.zeros(3)])
     return (
@@ -522,7 +523,7 @@ def _choose_size(stated: Sequence[Plain], given_size: tuple[int, int] | None) ->
     if not stated:
         if given_size is None:
             raise Code.WRONG_SIZE.refusal(
-                "file: expected width and height of the images, which it lacks; give them "
+                "file: expected width and height of the images, which the file lacks; give them "
                 "as size=(width, height), pixels",
                 "size=(width, height)",
             )

@@ -1,4 +1,4 @@
-"""Read files of other programs up to a size, and write files whole or not at all."""
+"""Read files of other programs, refusing large ones, and write files whole or not at all."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class UnscaledValue(Generic[T]):
-    """A value whose lengths are in the file's unit, since its format does not fix a unit."""
+    """A value with lengths in the file's unit: the format of the file allows several units."""
 
     value: T
     unit: str | None = None  # unit that the file names, or None
@@ -136,5 +136,5 @@ def _scale_translations(value: Any, factor: float) -> Any:
 def ignore_names(
     parse: Callable[[str], T | UnscaledValue[T]],
 ) -> Callable[..., T | UnscaledValue[T]]:
-    """Return a parser that ignores given names of frames: the format names them, or has none."""
+    """Return a parser that ignores the caller's names of frames: the format defines them itself."""
     return lambda text, *_names: parse(text)

@@ -149,7 +149,7 @@ FoundLenses = tuple["list[ForeignLens]", "list[Transform]", "str | None"]
 unknown."""
 
 METRES_BY_FORMAT: Final = ""
-"""Mark, in place of a unit, for lengths that are metres by the definition of the format."""
+"""Value in place of a unit: the format defines that lengths are in metres."""
 
 MAX_CAMERAS: Final = 64
 """Largest number of cameras of a chain."""
@@ -321,8 +321,8 @@ def parse_multical(text: str) -> FoundLenses:
         )
     if len(lenses) < 2:
         return lenses, [], None
-    # "b_to_a" is the motion from a's frame into b's; a single name is the master, or the pose of
-    # the rig
+    # the key "b_to_a" has the motion from a's frame into b's; a key with a single name has the pose
+    # of the master camera, or of the rig
     camera_poses: dict[str, Transform] = {}
     for name, pose in as_mapping(
         as_mapping(data, "file", ["camera_poses"])["camera_poses"], "poses"

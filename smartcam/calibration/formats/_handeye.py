@@ -2,7 +2,7 @@
 
 A file has the pose of the camera (``tracking_base_frame``): in the effector's frame if the robot
 carries the camera, in the base's frame if the camera is fixed. Another entry of the file says
-which.
+whether the robot carries the camera.
 
 Source: github.com/IFL-CAMP/easy_handeye, ``handeye_calibration.py`` (published);
 github.com/marcoesposito1988/easy_handeye2, ``handeye_calibration.py`` and ``easy_handeye2_msgs``

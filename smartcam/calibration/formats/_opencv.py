@@ -1,4 +1,4 @@
-"""Write YAML that ``cv2.FileStorage`` and PyYAML read: a plane's matrix, or a transform.
+"""Read and write a plane's matrix, or a transform, as YAML for ``cv2.FileStorage`` and PyYAML.
 
 Source: OpenCV, ``modules/core/src/persistence_yml.cpp`` (published): the first line begins with
 ``%YAML``; a number with a point is a real one; ``!!opencv-matrix`` has rows, cols, dt and data.
@@ -73,14 +73,14 @@ class PlaneMatrix(NamedTuple):
         )
 
 
-def compose_matrix(plane: PlaneMatrix, unit: str = "unit") -> str:
+def compose_matrix(plane: PlaneMatrix, unit: str = "unknown unit") -> str:
     """Return the matrix of a plane calibration, in YAML for OpenCV's and PyYAML's readers.
 
-    ``unit``: unit of the camera's coordinates, in words.
+    ``unit``: unit of the camera's coordinates u and v, as a text.
     """
     rows = plane.matrix.tolist()
     values = ",\n    ".join(", ".join(format_real(value) for value in row) for row in rows)
-    formula = f"w (x, y, z, 1) = matrix (u, v, 1), metres; {unit} in"
+    formula = f"w (x, y, z, 1) = matrix (u, v, 1), metres; u and v: {unit}"
     return (
         "%YAML 1.1\n---\n"
         f"about: {quote(formula)}\n"
@@ -106,7 +106,7 @@ def parse_matrix(text: str) -> PlaneMatrix:
 
 
 def storage_matrix(name: str, matrix: Array) -> str:
-    """Return a matrix with its name, in the form of ``cv2.FileStorage``."""
+    """Return the text of a named matrix, in the form of ``cv2.FileStorage``."""
     return (
         f"{name}: !!opencv-matrix\n   rows: {matrix.shape[0]}\n   cols: {matrix.shape[1]}\n"
         f"   dt: d\n   data: {flow_list(matrix.ravel())}\n"
@@ -114,7 +114,7 @@ def storage_matrix(name: str, matrix: Array) -> str:
 
 
 def compose_transform(transform: Transform) -> str:
-    """Return a transform as a (4, 4) ``!!opencv-matrix``, without :data:`HEAD`."""
+    """Return the text of a transform, a (4, 4) ``!!opencv-matrix``, without :data:`HEAD`."""
     return (
         f"target: {quote(frame_name(transform.target, 'target'))}\n"
         f"source: {quote(frame_name(transform.source, 'source'))}\n"
@@ -125,7 +125,7 @@ def compose_transform(transform: Transform) -> str:
 def parse_transform(text: str, target: str, source: str) -> UnscaledValue[Transform]:
     """Return the only (4, 4) matrix of a file of OpenCV, whatever its name.
 
-    ``target`` and ``source``: names of the frames if the file does not name them.
+    ``target`` and ``source`` are used as the frames' names if the file has no names.
     """
     data = as_mapping(load_storage(text), "file")
     names = [

@@ -1,4 +1,4 @@
-"""Parse texts of other programs into plain data, within bounds and without guessing types.
+"""Parse files of other programs into plain data, up to a size, and without guessing types.
 
 Scalars stay texts, as they are in the file. YAML gives texts many meanings (a time, a number to the
 base 60, ``1e-05`` as a string), and programs differ in the meanings that they support.
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Plain: TypeAlias = Any
-"""A text, or nested lists and mappings of texts; each use checks the type."""
+"""A text, or nested lists and mappings of texts; whoever uses the value checks its type."""
 
 POSE: tuple[str, ...] = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """Names of the numbers of :func:`pose_numbers` in most formats."""
@@ -183,7 +183,7 @@ def as_matrix(value: Plain, where: str, shape: tuple[int, int]) -> Array:
 
 
 def stored_matrix(value: Plain, where: str, shape: tuple[int, int] | None = None) -> Array:
-    """Return a matrix stored as ``rows``, ``cols`` and ``data``; ``shape``: None for any shape."""
+    """Read a matrix from ``rows``, ``cols`` and ``data``; ``shape``: None for any shape."""
     data = as_mapping(value, where, ["rows", "cols", "data"])
     rows, cols = (as_whole_number(data[key], f"{where}.{key}", 0) for key in ("rows", "cols"))
     if shape is not None and shape != (rows, cols):

@@ -35,7 +35,7 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
 
     Args:
         calibration: a calibration of the model ``rigid``, ``similarity`` or ``touches``.
-        name: name of the frame if the calibration has no ``camera_frame``.
+        name: name of the plane's frame, used if the calibration has no ``camera_frame``.
 
     Raises:
         CalibrationError: ``NOT_SIMILAR``: the model is ``affine`` or ``homography``, which is no

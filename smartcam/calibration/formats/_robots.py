@@ -1,4 +1,4 @@
-"""Convert poses to and from the forms of robots' controllers.
+"""Convert poses to and from the forms in which robots' controllers show them.
 
 ::
 

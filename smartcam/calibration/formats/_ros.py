@@ -1,8 +1,9 @@
 """Read and write arguments of ROS' ``static_transform_publisher`` and poses of ROS-Industrial.
 
-Three programs have that name. The arguments of ROS 1's ``tf`` end with a period in milliseconds,
-the arguments of ROS 1's ``tf2_ros`` do not, and ROS 2's program takes options. Each program accepts
-quaternions, and yaw, pitch and roll: ``Rz(yaw) Ry(pitch) Rx(roll)``, radians.
+Three programs are called ``static_transform_publisher``. The arguments of ROS 1's ``tf`` end with a
+period in milliseconds, the arguments of ROS 1's ``tf2_ros`` do not, and ROS 2's program takes
+options. Each program accepts quaternions, and yaw, pitch and roll: ``Rz(yaw) Ry(pitch) Rx(roll)``,
+radians.
 
 Source: wiki.ros.org/tf, section 6.3; github.com/ros2/geometry2,
 ``static_transform_broadcaster_program.cpp``; github.com/moveit/moveit_calibration,

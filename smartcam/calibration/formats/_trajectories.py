@@ -51,8 +51,9 @@ _COLUMNS = (
     (("timestamp", *POSE), ""),
     (("time", *POSE), ""),
 )
-"""Names, in lower case, of the columns of time and of the pose, and the unit of time for headers
-without a unit, such as EuRoC's ground truth. If this unit is empty, the header must name a unit."""
+"""For each kind of header: the names, in lower case, of the columns of time and of the pose, and
+the unit of time if the header names none, as in EuRoC's ground truth. If this unit is empty, the
+header must name one."""
 _SECONDS: Mapping[str, Decimal] = {
     "s": Decimal(1),
     "ms": Decimal("1e-3"),

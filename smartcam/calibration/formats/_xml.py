@@ -1,4 +1,4 @@
-"""Parse XML of other programs, within bounds and without document types."""
+"""Parse XML of other programs, up to a number of elements, and without document types."""
 
 from __future__ import annotations
 

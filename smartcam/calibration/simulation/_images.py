@@ -1,8 +1,9 @@
 """Draw images of targets as a camera would take them, for tests with known truth.
 
 Each pixel is the mean, over its square, of the image of a lens with a Gaussian blur. A sample that
-an edge divides has the mean of both sides, so edges are not rounded to a raster: a corner is where
-:meth:`~smartcam.calibration.CameraModel.project` says, to a few thousandths of a pixel.
+an edge divides has a mean of the levels on both sides, so edges do not snap to the raster of
+samples: a corner is where :meth:`~smartcam.calibration.CameraModel.project` says, to a few
+thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -155,7 +156,7 @@ def _sample_sheet(
     directions = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
     rays = np.column_stack([directions, np.ones(len(directions))])
     normal = pose.rotation[:, 2]
-    slope = np.minimum(rays @ normal, -1e-6)  # rays beyond the horizon meet the sheet far away
+    slope = np.minimum(rays @ normal, -1e-6)  # limits rays beyond the horizon
     points = (
         rays * (normal @ pose.translation / slope)[:, None] - pose.translation
     ) @ pose.rotation

@@ -1,4 +1,4 @@
-"""Simulate cameras on robots: views with noise, poses with noise, and the Cramer-Rao bound.
+"""Simulate cameras on robots, with noise, and compute the least possible error of calibrations.
 
 No images are drawn: the points of a target are projected. Tests compare the result of a calibration
 with the truth, and its error with the Cramer-Rao bound, which no unbiased estimate can beat.
@@ -98,7 +98,7 @@ def around(
         target: target that the camera looks at.
         count: number of poses.
         tilt: tilt of the outermost poses against the target's normal, radians.
-        distance: distance from the target's centre, metres; it varies by a fifth to both sides.
+        distance: mean distance from the target's centre, metres; distances vary by up to a fifth.
         random: source of the distances, and of the turns about the optical axis, up to 90 degrees.
 
     Returns:
@@ -249,7 +249,7 @@ def hand_eye_scene(
         setup: place of the camera. A camera beside the robot is fixed, and the target moves.
         poses: number of poses of the robot.
         tilt: tilt of the outermost views against the target's normal, radians.
-        distance: distance of camera and target, metres; it varies by a fifth to both sides.
+        distance: mean distance of camera and target, metres; distances vary by up to a fifth.
         random: source of the poses, and of the places of camera and target.
     """
     view_poses = around(target, poses, tilt=tilt, distance=distance, random=random)

@@ -1,4 +1,4 @@
-"""Run calibrations step by step, for any front-end."""
+"""Wizards, which guide people through a calibration step by step, in any front-end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The wizard that calibrates the place of a camera on a robot, or next to a robot.
+"""The wizard that calibrates the pose of a camera on a robot, or of a camera next to a robot.
 
 The wizard suggests a view, takes a picture, finds the target in it and reads the robot, any number
 of times. It shows the error at poses that were left out of the calibration, and names the worst
@@ -68,7 +68,7 @@ MAX_VIEWS = 40
 """Largest number of views of a run, far more than a calibration needs."""
 
 ADVISED_VIEWS = 10
-"""Number of views from which the wizard preselects the calculation."""
+"""From this number of views on, the wizard preselects the calculation."""
 
 CALCULATION_TIMEOUT = 120.0
 """Timeout of the calculation, seconds; with 15 views it takes a few seconds."""
@@ -108,7 +108,8 @@ def hand_eye_wizard(
 
     Args:
         take_picture: function that takes a picture while the robot stands still; or an open source
-            of frames, of which the first frame exposed after the button is used.
+            of frames, of which the first frame that was exposed after the button was pressed is
+            used.
         save_to: function that returns the file for a name.
         target: target on the sheet, with the lengths on paper; None: the wizard asks for it.
         suggested: default of the question for the target.
@@ -175,7 +176,7 @@ async def _ask_setup(
 
 @dataclass(eq=False)
 class _HandEyeRun:
-    """One run of the wizard; its state depends only on the answers."""
+    """One run of the wizard; answers and outcomes of steps determine its whole state."""
 
     _target: Target
     _setup: Setup

@@ -1,8 +1,8 @@
-"""Keep the journal of a sequence: one line for each entry.
+"""Keep a journal of a wizard's run (a sequence), so that the run can be resumed after a crash.
 
-The first line names the wizard, each other line is an entry. A line is written and synced to the
-disk before the next step is shown. A killed process leaves at most a part of a line, which the next
-process removes: the answer in this line was not confirmed yet.
+The first line names the wizard, each other line is an entry: a step with its answers. A line is
+written and synced to the disk before the next step is shown. A killed process leaves at most a part
+of a line, which the next process removes: the answer in this line was not confirmed yet.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAX_FILE = 1 << 28
 
 
 class Journal:
-    """A journal in a file, for one sequence at a time.
+    """A journal in a file; only one sequence at a time can use it.
 
     The file is locked while it is open, so that no other process writes into it.
 
@@ -78,7 +78,7 @@ class Journal:
         sync_folder(self.path.parent)
 
     def append(self, entry: dict[str, Any]) -> dict[str, Any]:
-        """Write an entry to the disk, and return the entry as it will be read.
+        """Write an entry to the disk, and return the entry as reading the journal will give it.
 
         Raises ``NOT_STORABLE`` if the entry is not possible as JSON, or too long, or if the journal
         is full; OSError if the entry cannot be written, which leaves the file as it was.

@@ -41,7 +41,7 @@ class Mark:
         return cls(row["feature_id"], row["x"], row["y"], row["theta"])
 
     def text(self, unit: str) -> str:
-        """Return the mark as a text with its place; ``unit``: of the place, m is shown as mm."""
+        """Return the mark's name and place as a text; places in the ``unit`` m are shown in mm."""
         name = self.feature if self.feature.isprintable() else repr(self.feature)
         factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
         return f"{name or 'mark'} at x {factor * self.x:.1f} {unit}, y {factor * self.y:.1f} {unit}"
@@ -54,7 +54,7 @@ class Touch:
     mark: Mark  # mark that the camera sees at the point; for a ray, its origin
     robot: Vector  # position of the tip in the robot's base, metres
     tool_z: Vector | None  # direction of the tool's axis; None if it is not known
-    label: str = "mark"  # ``mark``, or the letter of a point of the rays
+    label: str = "mark"  # ``mark``; for touches of the rays O, A or B
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

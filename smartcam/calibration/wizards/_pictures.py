@@ -71,7 +71,7 @@ PICTURE_DEADLINE: Final = 25.0
 """Longest time, seconds, to wait for a picture in a folder."""
 
 LISTING_PERIOD: Final = 0.2
-"""Seconds between two listings of a folder; a file with the same length in both is complete."""
+"""Seconds between two listings of a folder; a file whose length stays the same is complete."""
 
 SUFFIXES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}

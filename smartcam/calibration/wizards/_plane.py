@@ -1,8 +1,9 @@
 """The wizard that calibrates a smart camera's plane against a robot.
 
 The camera localizes marks, and the robot's tip touches any number of them; or the camera localizes
-the origin mark of the printed rays. The wizard knows no client and no robot: it gets a function
-that takes a picture and, if the robot can be read, a function that reads the robot's pose.
+the origin mark of the printed rays. The wizard does not depend on any client or robot: it is given
+a function that takes a picture and, if the robot can be read, a function that reads the robot's
+pose.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ class _MarkSource(PointSource):
         return marks[int((await ask(step))["mark"]) - 1], scale
 
     async def _nominal_scale(self) -> float:
-        """Ask for the metres per unit of the camera, which touches of rays do not determine."""
+        """Ask for the metres per unit of the camera, since touches of rays do not tell them."""
         if self.camera_unit == "px":
             label = "Size of a pixel on the plane"
             pixel = Number(name="pixel", label=label, unit="mm", minimum=1e-6, maximum=100.0)

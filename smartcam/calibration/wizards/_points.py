@@ -1,4 +1,4 @@
-"""Calibrate a plane by touches of points from any source.
+"""The common part of wizards that calibrate a plane by touches of points.
 
 A :class:`PointSource` provides the points: marks that a camera localizes, or points of a sheet that
 is found in a picture. The robot touches any number of these points; or it touches three: the origin
@@ -244,14 +244,14 @@ class PointSource(Touches, ABC):
         return replace(plane, allowed_error=None if allowed is None else 1e-3 * allowed)
 
     def _better_order(self) -> Reordered | None:
-        """Return the order of the touches that fits far better; None unless exactly one does."""
+        """Return the one order of the touches that fits far better; None for none or several."""
         touched = np.array(self.tip_positions)
         sigma = self.sigma or MAX_SIGMA.of(extent(touched))
         marks = np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
         return find_better_order(marks, touched, sigma)
 
     def _judge_error(self, error: CalibrationError) -> Judgement:
-        """Return the judgement of a failed fit; name a wrong or exchanged touch if possible."""
+        """Return the judgement of a failed fit; it names a wrong or exchanged touch if possible."""
         if (order := self._better_order()) is not None:
             numbers = np.arange(1, 1 + len(self.touches))
             return poor_judgement(Code.WRONG_ORDER, order.remark(numbers).text)
@@ -267,7 +267,7 @@ class PointSource(Touches, ABC):
         return poor_judgement(error.code or "", str(error))
 
     def _fits_without(self, index: int) -> bool:
-        """Return True if the touches fit without one, and enough are left to test the fit."""
+        """Return True if the other touches fit without a touch, and are enough to test the fit."""
         others = copy.copy(self)
         others.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
@@ -343,7 +343,7 @@ class PointSource(Touches, ABC):
 def _avoid_repeated_advice(
     judgement: Judgement, retouched: Collection[int], count: int
 ) -> Judgement:
-    """Change a judgement that asks again for a touch that was repeated already.
+    """Return other advice if a judgement asks for a touch that was repeated already.
 
     ``retouched``: numbers of the points that were touched again. ``count``: number of all points.
     """

@@ -1,4 +1,4 @@
-r"""Sequences: a wizard is one coroutine that asks for steps, and any front-end runs it.
+r"""Run wizards: a wizard is a coroutine that asks for steps; a sequence is one run of it.
 
 ::
 
@@ -14,9 +14,10 @@ How it works: the coroutine awaits only :func:`ask`. Everything that uses a came
 file is an *action* of a step: an async function that runs when the step is answered, and whose
 outcome is written into the journal together with the answers. So the list of answers
 and outcomes is the whole state of the coroutine. Undo runs the coroutine again with one entry less;
-resuming after a crash runs it again with all entries. Neither repeats an action.
+resuming after a crash runs it again with all entries. Neither undo nor resuming runs an action
+again.
 
-After an error the step stays the same, whether the answer was wrong, the action failed, or the
+After an error the step is shown again, whether the answer was wrong, the action failed, or the
 coroutine failed before its next step. Only an answer that the coroutine accepts is written.
 """
 
@@ -99,7 +100,7 @@ def ask(step: Step, action: Action | None = None) -> PendingStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wizard:
-    """A sequence that can be started.
+    """A coroutine function that can be run as a sequence of steps, and facts about it.
 
     Attributes:
         name: name of the wizard in journals.
@@ -167,7 +168,7 @@ _KEYS_BY_EVENT = {
 
 @dataclass(slots=True)
 class _SequenceLog:
-    """The state of a sequence after a list of entries."""
+    """The entries of a sequence's journal that count, and the state that follows from them."""
 
     entries: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     state: State = "asking"
@@ -228,7 +229,7 @@ class WizardSession:
             self._log = functools.reduce(_SequenceLog.with_entry, self._all_entries, _SequenceLog())
         except (KeyError, IndexError, TypeError, ValueError) as exc:
             raise Code.BROKEN_FILE.refusal(
-                f"the journal is incomplete: {exc!r}; expected one as a sequence writes it"
+                f"the journal is incomplete: {exc!r}; expected a journal as a sequence writes it"
             ) from exc
         self._script_run = self._replay_entries()
         if journal is not None and journal.header is None:
@@ -317,7 +318,7 @@ class WizardSession:
 
     @property
     def token(self) -> str:
-        """Word that a call must repeat, so that no call counts twice; each entry changes it."""
+        """Text that a call must send back, so that no call counts twice; each entry changes it."""
         return f"{self.flow}.{len(self._all_entries)}"
 
     @property

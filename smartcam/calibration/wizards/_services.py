@@ -1,4 +1,4 @@
-"""Offer calibration as services on one folder: start, go on, export, load, transform.
+"""Services for front-ends on one folder of calibrations: start a wizard, export, load, transform.
 
 A front-end starts a wizard under a name, shows its steps and sends the answers. No request reads or
 writes a file outside of the folder.
@@ -202,7 +202,7 @@ class CalibrationService:
             if form is not None:
                 body = compose(form, calibration, suffix=path.suffix).encode()
             else:
-                unit = str(document.context.get("camera_unit", "unit"))
+                unit = str(document.context.get("camera_unit", "unknown unit"))
                 body = compose_matrix(PlaneMatrix.of(calibration), unit).encode()
         replace_file(path, body)
         return f"{EXPORTS}/{path.name}"

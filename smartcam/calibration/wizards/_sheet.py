@@ -1,10 +1,10 @@
 """The wizard that calibrates a camera's pixels against a robot, by a picture of a printed sheet.
 
-It asks for the target and the lengths of its rulers, takes a picture and finds the target in it.
-Then the robot touches any number of the target's corners, or the origin and a point on each of the
-rays A and B: half-lines from the origin along the sheet's axes. The wizard
-knows no camera and no robot: it gets a function that takes a picture and, if the robot can be read,
-a function that reads the robot's pose.
+The wizard asks for the target and the lengths of the printed rulers, takes a picture and finds the
+target in it. Then the robot touches any number of the target's corners, or the origin and a point
+on each of the rays A and B: half-lines from the origin along the sheet's axes. The wizard does not
+depend on any camera or robot: it is given a function that takes a picture and, if the robot can be
+read, a function that reads the robot's pose.
 
 Source: the thesis with which smartcam began, 3.2.3.2 (published) for the origin that a camera finds
 in its image.
@@ -117,7 +117,7 @@ def sheet_wizard(
             suggested, known=parameters.get("target"), square=parameters.get("square")
         )
         source = _SheetSource(about, read_robot, target)
-        # v of pixels grows downwards, y of mapped positions upwards
+        # v of pixels points down, but the calibration maps localizations whose y points up
         source.connect = None if connect is None else {**connect, "y_down": True}
         await source.ask_picture(picture_taker(take_picture), camera, lens_covariance, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
@@ -202,7 +202,7 @@ class _SheetSource(PointSource):
         ]
 
     async def find_ray_origin(self) -> tuple[Mark, float]:
-        return Mark("", 0.0, 0.0, 0.0, number=0), 1.0  # a mark on the sheet is in metres
+        return Mark("", 0.0, 0.0, 0.0, number=0), 1.0  # places on the sheet are in metres
 
     async def add_points(self) -> None:
         self.check_count(1, MAX_POINTS, "points")

@@ -1,7 +1,7 @@
 """Define the steps of a sequence: the texts to show, and the answers to ask for.
 
-A step is data. Its inputs have a JSON Schema, and check answers by the same rules, so a front-end
-does not depend on any wizard.
+A step is data with a JSON Schema of its answers, and it checks answers by the same rules. So
+front-ends need no code for particular wizards.
 
 Source: the thesis with which smartcam began, 2.2.1 and Figure 2.9 (published), for a step's parts
 and for the three lists of numbers, texts and options of :func:`as_lists` and :func:`from_lists`.
@@ -32,7 +32,7 @@ _MAX_SHOWN_LENGTH = 40
 """Largest number of characters of a wrong answer that a message shows."""
 
 _YES_NO = {"no": False, "yes": True}
-"""Values of a flag by their words in the thesis' lists."""
+"""Values of a flag, by the words for them in the lists of :func:`as_lists`."""
 
 
 def _short_repr(value: object) -> str:
@@ -66,7 +66,7 @@ class Input(ABC):
         return {"title": self.label, **self._schema()}
 
     def checked(self, value: object) -> Any:
-        """Convert an answer; raise ValueError with the expected form if it is not valid."""
+        """Return an answer as its Python value; raise ValueError, which names the expected form."""
         return self._check_value(value)
 
     @abstractmethod
@@ -136,7 +136,7 @@ class Text(Input):
     max_length: int = 200
 
     def _schema(self) -> dict[str, Any]:
-        # not $, since Python allows a line feed after the end
+        # Python's $ would allow a line feed at the end
         pattern = rf"^(?:{self.pattern})(?![\s\S])"
         return {"type": "string", "pattern": pattern, "maxLength": self.max_length}
 
@@ -257,7 +257,7 @@ class Step:
         )
 
     def checked(self, answers: object) -> Answers:
-        """Convert answers, and fill in defaults for missing answers.
+        """Return checked answers, with defaults for missing answers.
 
         Raises:
             CalibrationError: ``WRONG_ANSWERS``; ``got`` has a text for each wrong answer, and under

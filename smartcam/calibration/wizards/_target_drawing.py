@@ -1,4 +1,4 @@
-"""Draw the picture of a step that looks at a target, as SVG: found points and covered areas.
+"""Draw an SVG for a step that takes a picture of a target: found points and covered areas.
 
 The background is the camera's picture, grey and reduced, since a page loads it at every step.
 """
@@ -56,7 +56,7 @@ def cell_counts(views: Sequence[TargetView]) -> NDArray[np.intp]:
     """Count the points of one camera's views in each cell of its image, ``CELLS``."""
     counts = np.zeros(CELLS, dtype=np.intp)
     for view in views:
-        # the centre of a pixel is a whole number, so the image begins half a pixel before the first
+        # pixels have whole numbers at their centres, so the image's edge is at -0.5
         fractions = (view.points + 0.5) / view.size
         column, row = np.floor(fractions * CELLS[::-1]).astype(np.intp).T
         inside = (row >= 0) & (row < CELLS[0]) & (column >= 0) & (column < CELLS[1])

@@ -72,7 +72,7 @@ def ruler_input(name: str, along: str = "") -> Number:
 async def ask_target(
     suggested: Target | None = None, *, known: object = None, square: float | None = None
 ) -> Target:
-    """Ask for the target on the sheet and for its printed rulers; return it with printed lengths.
+    """Ask for the target on the sheet and for its rulers; return the target with printed lengths.
 
     ``suggested``: default of the question. ``known``: a description of the target; the question is
     then skipped. ``square``: default of a square's side, mm. Raises CalibrationError for a wrong

@@ -1,9 +1,9 @@
 """Offer a camera's calibrations as five services, which the thesis behind smartcam defines.
 
-The steps are the steps of the web page and the terminal. Before them, a first step asks for facts
-that have no field in the request: the name, the camera's place, the source of pictures. A request
-does not name its step, so only one call is answered at a time, and only one calibration runs at a
-time, until it ends, is aborted or is abandoned.
+The steps are the same as on the web page and in the terminal, after a first step that asks for
+facts that have no field in the request: the name, the camera's place, the source of pictures. A
+request does not name its step, so only one call is answered at a time, and a second calibration
+cannot start until the running one ends, is aborted or is abandoned.
 
 Source: the thesis with which smartcam began, 2.2.2, Figures 2.8 to 2.12 (published) for the
 services and their fields.
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 SMARTCAMERA: Final = "SMARTCAMERA"
-"""Text that names the smart camera itself, in place of a topic."""
+"""Text in place of a topic: pictures come from the smart camera itself."""
 
 ABANDONED_AFTER: Final = 1800.0
 """Seconds without a call after which a running calibration is abandoned; its journal is kept."""
@@ -91,7 +91,7 @@ class CalibrationCamera(Protocol):
 
 
 class RobotGraph(Protocol):
-    """The part of ROS that is not the smart camera: pictures on topics, and the frames of TF."""
+    """Access to the rest of ROS: pictures on topics, lenses, and the frames of TF."""
 
     def check_topic(self, topic: str) -> None:
         """Raise ConfigurationError if a topic cannot have this name."""
@@ -339,7 +339,7 @@ class ThesisCalibration:
         is_first_call, sequence.was_returned = not sequence.was_returned, True
         try:
             if self.graph is not None and sequence.start_request.tf_frame_robot_tcp:
-                self.graph.listen()  # then the robot's pose at the time of a picture is known
+                self.graph.listen()  # so the robot's pose at a picture will be known
             if request.repeat_last_step:
                 return await self._go_back(sequence)
             if is_first_call:
@@ -477,7 +477,7 @@ class ThesisCalibration:
             step = _done_step(name, view)
             if session.state == "ended":
                 self._end_sequence(sequence, f"{name!r} was finished")
-                # loading fails for a calibration that maps no pixels
+                # a calibration that maps no pixels, such as a hand-eye one, cannot be loaded
                 with contextlib.suppress(CalibrationError, OSError):
                     self.load(name)
         return _reply_fields(step or sequence.first_step, error)

@@ -118,7 +118,7 @@ def compare_touches(
 
 
 def _drawn_area(points: Array, others: Array) -> Array:
-    """Return two corners of the area with all points (3, N), and with others (3, K) nearby."""
+    """Return two corners of an area with all points (3, N), and with nearby ``others`` (3, K)."""
     low, high = points[:2].min(axis=1), points[:2].max(axis=1)
     half = 0.5 * (high - low)
     other_points = others[:2].T

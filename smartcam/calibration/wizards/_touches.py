@@ -1,4 +1,4 @@
-"""Ask for touches with a robot's tip."""
+"""Ask the user of a wizard for touches with a robot's tip."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ SIDE = Option(
 
 @dataclass(eq=False)
 class Touches:
-    """Touches of one run of a wizard; the state depends only on the answers.
+    """Touches of one run of a wizard; answers and outcomes of steps determine the whole state.
 
     Attributes:
         about: answers of the first step: ``touch_sigma``, and, if the robot's pose is typed,

@@ -1,4 +1,4 @@
-"""Write lines that use a calibration, to copy to a shell or into Python."""
+"""Write example lines that use a calibration, for people to copy to a shell or into Python."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Check whether a calibration still holds: touch some marks again, and compare.
+"""The wizard that checks whether a calibration still holds: touch some marks again, and compare.
 
-A camera that was knocked sees all points shifted, which a few touches show. The offsets are
-compared with the noise of the new touches and of the calibration's touches.
+If the camera was knocked, it sees all points shifted, and a few touches show the shift. The offsets
+are compared with the noise of the new touches and of the calibration's touches.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ async def _load_calibration(
     camera.check_y_down(calibration.y_down, f"{name} was made")
     if calibration.touch_sigma is None and answers["touch_sigma"] is None:
         raise Code.WRONG_ANSWERS.refusal(
-            f"{name} does not tell how well a touch repeats: expected the touches' sigma",
+            f"{name} has no standard deviation of its touches: expected the touches' sigma",
             got={"touch_sigma": "no answer, and the calibration has none: expected one"},
         )
     document = read_document(file)
@@ -332,7 +332,7 @@ class _DriftCheck(Touches):
 
 
 def _notes(figures: Mapping[str, Any]) -> list[str]:
-    """Return the notes on a verdict, a line each."""
+    """Return the notes of the verdict's step, a line each."""
     count, offsets = figures["touches"], figures["offsets_mm"]
     knock = f"a knock of {1e3 * KNOCK_M:g} mm is noticed in {100 * NOTICED_SHARE:g} of 100 checks"
     needed = figures["needed"]

@@ -95,7 +95,7 @@ def _most_helpful_view(views: Sequence[TargetView]) -> NextView | None:
         lens = calibrate_intrinsics(views)
     except CalibrationError:
         return None
-    # parts will be about as far away as the target is
+    # the parts are assumed to be as far away as the target
     distance = float(np.median(np.linalg.norm(lens.target_points, axis=1)))
     suggested = suggest_views(
         lens, distance=distance, roll=ROLLS_RADIANS[len(views) % len(ROLLS_RADIANS)]

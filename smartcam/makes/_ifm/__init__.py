@@ -1,1 +1,1 @@
-"""ifm: the process interface PCIC."""
+"""Cameras of ifm, by their process interface PCIC."""

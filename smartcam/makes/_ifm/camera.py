@@ -1,4 +1,4 @@
-"""The emulated ifm sensor: applications, triggers, layouts of sessions, images."""
+"""The emulated ifm sensor, with applications, triggers, layouts of sessions and images."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 INPUT_CONTAINER_COUNT = 10
 _ELEMENT_TYPES: Mapping[type, str] = {str: "string", bool: "uint8", int: "int32"}
-"""ifm's names of the types of values; those of other types are ``float32``."""
+"""ifm's names of the types of values; values of other types are ``float32``."""
 
 _NETWORK_SETTINGS = ("255.255.255.0", "0.0.0.0", "00:02:01:00:00:01", "0", "80")  # noqa: S104
 """Settings after the address in the answer to ``G?``."""
@@ -47,7 +47,8 @@ class IfmApplication:
 
     Attributes:
         id: number, 1 to 99.
-        parts: values of each evaluation, by ids of elements; records are lists of mappings.
+        parts: values of each evaluation's result, by ids of layout elements; records are lists of
+            mappings.
         processing_time: seconds of an evaluation.
         trigger: trigger of evaluations: ``"process"``, ``"continuous"`` or ``"hardware"``.
         images: number of pictures of an evaluation.
@@ -180,7 +181,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return self.application.processing_time
 
     def report_evaluation(self, call: LineClient | None, part: Mapping[str, Any]) -> None:
-        """Answer with the result; send it to all clients that have switched results on."""
+        """Answer the trigger, and send the result to all clients that have switched results on."""
         self.values = part
         self.results += 1
         self.good += bool(part.get("passed", True))
@@ -200,7 +201,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
             return "!"
 
     def voided(self, call: LineClient) -> None:
-        """Refuse a trigger whose evaluation is interrupted by a switch."""
+        """Refuse a trigger whose evaluation a switch of the application has interrupted."""
         call.answer("!")
 
     def overrun(self) -> None:
@@ -285,7 +286,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"H\?")
     def _list_requests(self, call: IfmClient) -> str:
-        """Return this list."""
+        """Return the list of all requests."""
         groups = re.compile(r"\\d\{\d\}|\\d\\d|\(\S*?\)|\\")
         texts = {
             groups.sub("", form.pattern): handler.__doc__ for form, handler in self.requests.items()
@@ -335,7 +336,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"g[01]|d[01]\d{3}")
     def _accept(self, call: IfmClient) -> str:
-        """Open or close the gate of a trigger that lasts; switch the view indicators."""
+        """Accept a request without any effect: a trigger's gate, or the view indicators."""
         return "*"
 
     @request(r"o(0[1-4])([01])")

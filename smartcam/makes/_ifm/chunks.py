@@ -1,4 +1,4 @@
-"""Images of PCIC: chunks with a header of numbers and a picture."""
+"""Read and write images of PCIC: chunks with a header of numbers and a picture."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def read_chunks(data: bytes) -> list[ImageChunk]:
     """
     body = data[9:]
     if not data[:9].isdigit() or int(data[:9]) != len(body):
-        raise FrameError(f"{data[:16]!r} begins no image of PCIC", data=data[:64])
+        raise FrameError(f"{data[:16]!r} is not the beginning of a PCIC image", data=data[:64])
     chunks: list[ImageChunk] = []
     offset = 0
     while offset < len(body):

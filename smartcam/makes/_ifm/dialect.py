@@ -1,4 +1,4 @@
-"""PCIC, the process interface of ifm's sensors: each answer has the ticket of its question.
+"""PCIC, the protocol of ifm's sensors: each answer has the ticket (a number) of its question.
 
 The known facts about the devices, with their sources, are in ``docs/ifm.md``.
 """
@@ -45,16 +45,16 @@ RESULT_TICKET, ERROR_TICKET, NOTIFICATION_TICKET, DEBUG_TICKET = "0000", "0001",
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 
 MAX_APPLICATION = 99
-"""Largest number of an application: the commands that switch have two digits for it."""
+"""Largest number of an application: switching commands have two digits for the number."""
 
 MAX_INPUT_BYTES = 256
 """Largest number of bytes of an input container."""
 
 CODES: Mapping[str, int] = {"*": 0, "!": 1, "?": 2, "$": 3}
-"""Codes, of this library alone, for answers of a single character."""
+"""Result codes that smartcam defines for answers of a single character."""
 
 TRIGGER_REFUSED = 4
-"""Code, of this library alone, for a trigger that was answered with ``!``."""
+"""Result code that smartcam defines for a trigger that was answered with ``!``."""
 
 _CODE_MEANINGS: Mapping[int, CodeMeaning] = {
     0: CodeMeaning("done", Verdict.DONE),
@@ -67,7 +67,8 @@ _CODE_MEANINGS: Mapping[int, CodeMeaning] = {
 }
 
 FATAL_ERRORS = frozenset({110001001, 110001002, 110001003})
-"""Errors that set the bit System Error: boot timeout, fatal software error, unknown hardware."""
+"""ifm's errors that set the status bit System Error: boot timeout, fatal software error, unknown
+hardware."""
 
 OVERTEMPERATURE, OVERRUN = 110004000, 110001006
 
@@ -113,7 +114,7 @@ def _read_error(content: str) -> m.Notice:
 
 
 def _read_error_or_overrun(content: str) -> tuple[m.Message, ...]:
-    """Return an error; for an overrun also statuses of a dropped trigger, perhaps this client's."""
+    """Return an error; for an overrun also statuses that tell of a dropped trigger."""
     notice = _read_error(content)
     if notice.code != OVERRUN:
         return (notice,)
@@ -181,7 +182,8 @@ def _input_script(dialect: PcicDialect, message: m.SetInput) -> Script:
 def _make_rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, ...]:
     """Return the rows of a dialect.
 
-    There are rows for pictures only with ``lengths``, for unasked messages only with ``tickets``.
+    Only versions with ``lengths`` have rows for pictures, only versions with ``tickets`` have rows
+    for unasked messages.
     """
     read_error = _read_error if trigger.answer is m.ResultContainer else _read_error_or_overrun
     unasked_rows = (

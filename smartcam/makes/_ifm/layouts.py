@@ -1,4 +1,4 @@
-"""Write a layout of results as PCIC's JSON, and encode results by a layout in JSON."""
+"""Convert layouts of results to PCIC's JSON, and encode results for the emulated sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from smartcam.layout._inside import Field
 
 RESULT_MARK = "smartcam;"
-"""Beginning of each result in an uploaded layout; results in other layouts begin otherwise."""
+"""Text at the beginning of each result in a layout that smartcam has uploaded, and of no other
+result."""
 
 _ELEMENT_TYPES: Mapping[str, tuple[str, str]] = {
     **{f"int{bits}": (f"int{bits}", code) for bits, code in ((8, "b"), (16, "h"), (32, "i"))},
@@ -25,7 +26,7 @@ _ELEMENT_TYPES: Mapping[str, tuple[str, str]] = {
     "real64": ("float64", "d"),
     "bool": ("uint8", "B"),
 }
-"""By smartcam's names of types: ifm's name, and the letter for ``struct``."""
+"""For each type of smartcam's layouts: ifm's name, and the letter for ``struct``."""
 
 _STRUCT_CODES: Mapping[str, str] = dict(_ELEMENT_TYPES.values())
 

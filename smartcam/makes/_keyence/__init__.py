@@ -1,1 +1,1 @@
-"""Keyence: lines that end with CR."""
+"""Cameras and readers of Keyence, whose protocols consist of lines that end with CR."""

@@ -1,4 +1,4 @@
-"""Speak to Keyence IV2 and IV3: sensors that answer each trigger with a judgement.
+"""The protocol of Keyence IV2 and IV3: sensors that answer each trigger with OK or NG.
 
 The known facts about them, with their sources, are in ``docs/keyence.md``.
 """
@@ -44,7 +44,7 @@ CODES = {
     3: CodeMeaning("not now", Verdict.BUSY),
     22: CodeMeaning("wrong parameter", Verdict.REFUSED),
 }
-"""Codes after ``ER,<command>``; taken from other devices of the family (inferred)."""
+"""Meanings of the codes after ``ER,<command>``; inferred from other Keyence devices."""
 
 
 def read_result(line: str) -> m.ResultContainer:

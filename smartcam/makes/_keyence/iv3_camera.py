@@ -89,7 +89,7 @@ class EmulatedIv3(EvaluatingCamera):
 
     @request("T1")
     def _trigger_without_answer(self, client: LineClient) -> str:
-        """Inspect; the client asks for the result later."""
+        """Inspect without answering with the result, which the client asks for later."""
         if self.busy:
             return "ER,T1,03"
         self.begin_evaluation(None)

@@ -1,4 +1,4 @@
-"""Speak to Keyence SR readers: LON begins to read a code, LOFF ends it, a line has the code.
+"""The protocol of Keyence SR code readers: LON begins a reading, LOFF ends it.
 
 The known facts about them, with sources, are in ``docs/keyence.md``.
 """
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 DEFAULT_PORT = 9004
 LAST_BANK = 15
 NOTHING_READ = "ERROR"
-"""The line of a reader that has read no code."""
+"""Line that a reader sends if it has read no code."""
 
 CODES = {
     0: CodeMeaning("done", Verdict.DONE),
@@ -50,7 +50,8 @@ CODES = {
     22: CodeMeaning("a file is wrong", Verdict.REFUSED),
     99: CodeMeaning("the reader is broken", Verdict.REFUSED),
 }
-"""Codes after ``ER,<command>``. Code 00, an unknown command, is 100 here, since 0 means done."""
+"""Meanings of the codes after ``ER,<command>``. Code 00 (unknown command) has the key 100, since 0
+means done."""
 
 
 def _answer_code(line: str) -> int:
@@ -74,7 +75,7 @@ def _read_trigger_answer(line: str) -> tuple[m.Message, ...]:
 
 
 def _read_unasked(line: str) -> m.ResultContainer:
-    if line.startswith(("ER,", "OK,LON")):  # an answer and no code: LON has none
+    if line.startswith(("ER,", "OK,LON")):  # an answer, not a code; and LON has no answer
         raise ValueError(line)
     return read_code(line)
 
@@ -92,7 +93,7 @@ def _read_reply(line: str) -> LineReply:
 
 
 def _split(line: str) -> tuple[str, str]:
-    """Return the command that a line answers, "" for a code, and the line."""
+    """Return the command that a line answers ("" if the line is a code), and the line."""
     first, _, argument = line.partition(",")
     return (answer_key(line, {}) if first in {"OK", "ER"} and argument else ""), line
 

@@ -64,7 +64,7 @@ class EmulatedSr(LineCamera):
         super().__init__(**options)
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Answer a line; a reading is sent later, and until then other lines are answered."""
+        """Answer a line; a reading's result is sent later, and other lines are answered before."""
         call = client.answer_later()
         word, _, argument = line.partition(",")
         is_bank = argument.isdecimal() and len(argument) == 2 and int(argument) <= LAST_BANK

@@ -36,7 +36,7 @@ def check_done(line: str) -> int:
 
 
 def answer_key(line: str, answer_words: Mapping[str, str]) -> str:
-    """Return the word that shows what a line answers: the command in it, else the first word.
+    """Return the key of an answer: the command that the line names, else the line's first word.
 
     Args:
         line: the answer.

@@ -240,7 +240,7 @@ def test_map_has_its_figures_and_marks_places_without_a_value() -> None:
     covariance = found.covariance.copy()
     covariance[0, 0] = np.nan
     svg = draw_uncertainty(dataclasses.replace(found, covariance=covariance))
-    assert "beyond the model" in svg
+    assert "beyond the lens model" in svg
     assert "the model of the lens ends before 0.1% of the image" in svg
 
 
