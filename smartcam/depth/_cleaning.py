@@ -27,7 +27,7 @@ MAX_PASSES: Final = 16
 """Largest number of iterations of a filter, and largest width of a filled rim, pixels."""
 
 MIN_NEW_SCENE_SHARE: Final = 0.5
-"""Share of the pixels that must jump before the whole average restarts."""
+"""Least share of the pixels that must jump for the averages of all pixels to restart."""
 
 
 @check_arguments(scale=a_number)
@@ -134,7 +134,7 @@ class SpatialFilter:
 
 
 def _forth_and_back(count: int) -> list[tuple[int, int]]:
-    """Return pairs of a line and the line before it, forwards, then backwards."""
+    """Return the indices of each line and its predecessor, first forwards, then backwards."""
     forth = [(line, line - 1) for line in range(1, count)]
     return forth + [(before, line) for line, before in reversed(forth)]
 

@@ -332,7 +332,7 @@ def _make_wls_filter(wls: tuple[float, float]) -> Callable[..., Any]:
         smoothness = edges = -1.0
     if not (0 < smoothness < 1e9 and 0 < edges < 1e3):
         raise _argument_error("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)
-    wls_filter = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # True: weights by agreement
+    wls_filter = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # True: with confidences
     wls_filter.setLambda(smoothness)
     wls_filter.setSigmaColor(edges)
 

@@ -1,4 +1,4 @@
-"""Run blocking calls one after the other in a thread of its own."""
+"""Run blocking calls one after the other in one separate thread."""
 
 from __future__ import annotations
 

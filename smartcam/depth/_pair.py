@@ -32,7 +32,7 @@ MAX_ROTATION_ERROR: Final = 1e-3
 """Largest error of an element of a rotation matrix: ROS writes five digits."""
 
 REMAP_VARIANCE_PX2: Final = (1 / 32) ** 2 / 12
-"""Variance of a disparity by OpenCV's remap, which rounds to 1/32 pixel, in pixels^2.
+"""Variance, pixels^2, that OpenCV's remap adds to a disparity, since it rounds to 1/32 pixel.
 
 Both pictures are rounded; averaging over a window halves the sum of the two variances.
 """

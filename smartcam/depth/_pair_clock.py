@@ -56,8 +56,8 @@ class PairClock:
     def drift(self, clocks: Sequence[ClockStatistics | None]) -> tuple[float | None, str]:
         """Return the right clock's drift relative to the left clock, and the source of this value.
 
-        Each camera's own clock sets its frame rate. Without timestamps of these clocks, and at the
-        same nominal rate, the ratio of the frame rates is the ratio of the clocks.
+        Each camera's own clock sets its frame rate. So without the clocks' timestamps, and with
+        the same nominal rate, the ratio of the measured frame rates is the ratio of the clocks.
         """
         left, right = (None if clock is None else clock.drift for clock in clocks)
         if left is not None and right is not None:

@@ -181,7 +181,7 @@ def unpack_lzf(data: bytes, size: int) -> bytes:
         distance, position = ((control & 31) << 8 | data[position]) + 1, position + 1
         begin = len(out) - distance
         if begin < 0:
-            raise BadTableError("a place in what is unpacked", f"{-begin} bytes before it")
+            raise BadTableError("an offset in the unpacked data", f"{-begin} bytes before it")
         length += 2
         copied = out[begin : begin + length]  # may overlap with its own output
         out += (copied * (length // len(copied) + 1))[:length]

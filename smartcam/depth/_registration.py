@@ -1,4 +1,4 @@
-"""Register one cloud in another: ICP by small-gicp, with its uncertainty."""
+"""Find the pose of one cloud in another (registration) by small-gicp's ICP, with covariance."""
 
 from __future__ import annotations
 

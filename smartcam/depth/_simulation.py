@@ -44,7 +44,7 @@ GREY_SIGMA: Final = 3.0
 """Standard deviation of a picture's grey levels."""
 
 HOLE_SHARES: Final = (0.01, 0.4)
-"""Share of the pixels without a depth: in all of the picture, and at jumps of the depth."""
+"""Shares of pixels without a depth: among all pixels, and among pixels at jumps of the depth."""
 
 MIN_JUMP_METRES: Final = 0.004
 """Least difference in depth of neighbouring pixels that counts as a jump, metres."""
@@ -213,7 +213,7 @@ def _pixel_means(rays: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _find_jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return the mask of the pixels that have a neighbour beyond an edge."""
+    """Return the mask of the pixels next to a jump of the depth."""
     jumps = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis)) > MIN_JUMP_METRES

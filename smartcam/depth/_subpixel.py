@@ -116,7 +116,7 @@ def _relative_move(fit: _RefinedDisparity, before: Field, is_refined: NDArray[np
 
 
 def _find_far_from_holes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask of the pixels that have no hole nearby, as edges of near objects have."""
+    """Return the mask of the pixels without a hole nearby; edges of near objects have holes."""
     neighbourhood = np.ones((2 * HOLE_MARGIN_PX + 1, 2 * HOLE_MARGIN_PX + 1), np.uint8)
     return np.asarray(load("cv2").erode(known.astype(np.uint8), neighbourhood) > 0)
 
@@ -299,9 +299,9 @@ def _correlation_factor(fit: _RefinedDisparity, trusted: NDArray[np.bool_]) -> f
     The factor is 1 without correlation. Pixels of a rectified picture are correlated, since
     neighbours use the same source pixels.
     """
-    # Var(sum g e) = sum over all lags of C_ee C_gg + C_eg C_ge, as of normal values: Isserlis, On a
-    # formula for the product-moment coefficient (1918). Of white noise only lag 0 is there. Where
-    # one picture is sharper e has texture in it; that goes with g, and for the most part cancels.
+    # Var(sum g e) = sum over all lags of C_ee C_gg + C_eg C_ge for normal values: Isserlis, On a
+    # formula for the product-moment coefficient (1918). White noise counts at lag 0 only. Where one
+    # picture is sharper, e contains texture, which is correlated with g and mostly cancels.
     mask = fit.linear.mask * trusted
     e, g = fit.linear.e * mask, fit.linear.g * mask
     # one constant and gain for the whole picture, since values for each window would absorb noise

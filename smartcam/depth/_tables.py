@@ -1,4 +1,4 @@
-"""Read and write rows of numbers in files, as bytes and as text."""
+"""Read and write the rows of numbers in PLY and PCD files, as bytes and as text."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_HEADER_BYTES: Final = 1 << 16
-"""Largest number of bytes of the header."""
+"""Largest number of bytes of a file's header."""
 
 MAX_FIELDS: Final = 256
 
 MAX_ROW_BYTES: Final = 1 << 12
-"""Largest number of bytes of a row."""
+"""Largest number of bytes of a row that is stored as bytes."""
 
 MAX_LINE_BYTES: Final = 1 << 20
 """Largest number of bytes of a line of text, which leaves room for digits and spaces."""
@@ -91,10 +91,10 @@ def from_text(
 
     Numbers for integer types must be whole and in range.
     """
-    check_row(np.dtype([(str(place), kind) for place, kind in enumerate(types)]))
+    check_row(np.dtype([(str(index), column_type) for index, column_type in enumerate(types)]))
     if 2 * len(types) * count > len(data) - start + 1:
         raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
-    columns = tuple(np.empty(count, kind) for kind in types)
+    columns = tuple(np.empty(count, column_type) for column_type in types)
     row_count, offset, to_skip = 0, start, skip
     while row_count < count:
         lines: list[list[bytes]] = []
@@ -120,20 +120,20 @@ def from_text(
     return columns
 
 
-def _parse_numbers(texts: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Parse the numbers of a column."""
+def _parse_numbers(texts: Sequence[bytes], number_type: np.dtype[Any]) -> NDArray[Any]:
+    """Return the numbers of a column; raise BadTableError if a text is no number of the type."""
     try:
-        if kind.kind == "f":
+        if number_type.kind == "f":
             values = np.array([float(text) for text in texts], np.float64)
             with np.errstate(over="ignore"):
-                return values.astype(kind)
+                return values.astype(number_type)
         numbers = [int(text) for text in texts if len(text) <= 20]
     except ValueError as exc:
         raise BadTableError("numbers", shown(str(exc))) from None
-    limits = np.iinfo(kind)
+    limits = np.iinfo(number_type)
     if len(numbers) < len(texts) or not limits.min <= min(numbers) <= max(numbers) <= limits.max:
         raise BadTableError(f"numbers from {limits.min} to {limits.max}", "others")
-    return np.array(numbers, kind)
+    return np.array(numbers, number_type)
 
 
 def to_text(columns: Iterable[NDArray[Any]]) -> bytes:

@@ -13,8 +13,8 @@ INTERVAL_DURATION: Final = 0.5
 """Seconds of one interval; only the frame with the shortest delay in it is kept."""
 
 MIN_EARLY_JUMP_SECONDS: Final = 0.05
-"""A frame that comes earlier by this number of seconds than its clock allows shows that the clock
-jumped."""
+"""Least number of seconds by which a frame must arrive before the time on its clock to show that
+the clock jumped."""
 
 MIN_INTERVALS_FOR_JUMP: Final = 4
 """Number of intervals after which an early frame proves a jump: before, all frames may be late."""
@@ -43,8 +43,8 @@ class DeviceClock:
     """The offset of a device's clock from the host's, estimated from the arrival of its frames.
 
     A frame arrives with a varying delay. So arrival minus device time has a lower edge: the offset
-    between the clocks plus the shortest delay. The slope of this edge is the drift. The estimated
-    time is late by the shortest delay only.
+    between the clocks plus the shortest delay. The slope of this edge is the drift. So the
+    estimated time of a frame is late by the shortest delay only.
 
     The offset rises no faster than a clock can drift, so a queue that delays all frames does not
     change it. If a clock is set back by less than the time between two frames, this looks like a
@@ -99,7 +99,7 @@ class DeviceClock:
         if device_time < self._last_device_time:
             return True
         lateness = arrival - device_time - self._offset(device_time)
-        if self._offset_before_queue is not None:  # the delay has ended
+        if self._offset_before_queue is not None:  # the queue may have ended
             lateness = max(lateness, arrival - device_time - self._offset_before_queue)
         return (
             lateness < -MIN_EARLY_JUMP_SECONDS
@@ -124,7 +124,7 @@ class DeviceClock:
             return None
         half = len(points) // 2
         first, second = _lowest_point(points[:half], 0.0), _lowest_point(points[half:], 0.0)
-        for _ in range(3):  # iterate with the slope subtracted
+        for _ in range(3):  # the lowest points depend on the slope
             slope = _slope(first, second)
             first = _lowest_point(points[:half], slope)
             second = _lowest_point(points[half:], slope)

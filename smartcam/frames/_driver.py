@@ -99,9 +99,9 @@ class FrameDriver(ABC):
             that names the known ones.
 
     Attributes:
-        times_frames: whether ``captured`` of its frames is on the host's clock even if they have a
-            ``device_time``; else the source computes it.
-        lists_features: whether its device can list its features.
+        times_frames: whether the driver sets ``captured`` on the host's clock for all its frames;
+            else the source computes ``captured`` of frames with a ``device_time``.
+        lists_features: whether the device can list its features.
         form: format of the stream after a feature changed it; None: as :meth:`open` returned it.
         waits_for: condition that the device awaits before each picture, for error texts, such as
             ``TriggerSource is Line1``; ``""``: the device streams freely. A device that awaits a

@@ -89,7 +89,7 @@ class FrameGroup:
     Args:
         sources: unopened sources by name; the group opens and closes them.
         within: largest skew of a set, seconds; None: half of the time between two frames of the
-            fastest camera, so that each frame has one partner.
+            fastest camera, so that a frame matches only one of them.
         timeout: seconds that an iteration waits for a set; None: without limit.
 
     Raises:

@@ -39,7 +39,7 @@ class InSightDriver(FrameDriver):
     - ``name``: name of the source; by default host and port.
 
     The camera does not report when a picture was taken, or whether it is new. A picture with the
-    same bytes as the last is not returned again: if the camera may not be triggered for long, use
+    same bytes as the last is not returned again: if the camera may wait long for a trigger, use
     ``stall=None``. ``captured`` is the arrival of a frame, and ``duration`` the time since the
     previous request; the first frame's duration is infinite.
     """

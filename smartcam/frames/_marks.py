@@ -1,4 +1,4 @@
-"""Marks on a picture, which show people what a tool found."""
+"""Marks that are drawn on a picture to show people what a tool found."""
 
 from __future__ import annotations
 

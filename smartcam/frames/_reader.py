@@ -32,7 +32,7 @@ class ReaderStatistics:
         delivered: frames that the reader took.
         skipped: frames replaced by newer ones before the reader took them.
         waiting: 1 if a frame waits for the reader, else 0.
-        lost: frames that never came: lost in the camera or on the way.
+        lost: frames lost in the camera or on the way.
     """
 
     offered: int
@@ -127,10 +127,10 @@ class FrameReader:
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the first frame whose exposure began after a moment.
 
-        A frame that already waits is considered, too.
+        The frame may be one that already waits for the reader.
 
-        If the start of the exposure is not known exactly, the frame is the first that certainly
-        began later: see :attr:`Frame.began`.
+        If the start of the exposure is not known exactly, the frame is the first one that certainly
+        was exposed after the moment: see :attr:`Frame.began`.
 
         Args:
             moment: time of ``time.monotonic()``.

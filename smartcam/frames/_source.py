@@ -66,7 +66,7 @@ class SourceStatistics:
         started: number of starts of the device's stream.
         frames: number of received frames, with or without a reader.
         lost: number of frames lost in the camera or on the way.
-        ahead: number of frames whose time was later than their arrival, which was used instead.
+        ahead: number of frames whose time was later than their arrival; the arrival replaced it.
         clock: drift and jumps of the camera's own clock; None: no clock.
     """
 
@@ -529,7 +529,7 @@ class FrameSource(FrameSink):
             self._end_readers(end_cause[0])
 
     async def _wait_for_end(self) -> None:
-        """Wait until the driver ends or is stuck, or the linger has passed."""
+        """Wait until the driver ends or is stuck, or no reader came for the linger time."""
         while self._end_cause is None and not self._must_restart:
             if not self._readers:
                 remaining = self._idle_since + self._linger - asyncio.get_running_loop().time()

@@ -76,7 +76,7 @@ class TriggerQueue:
             return frame
         if refuse and self._lock.locked():
             raise CameraBusyError(f"{name}: another trigger is pending, and when_busy is 'refuse'")
-        steps = ["waiting for the triggers before it"]
+        steps = ["waiting for earlier triggers"]
         pending = AwaitedTrigger(0)
         try:
             async with asyncio.timeout(seconds), self._lock:

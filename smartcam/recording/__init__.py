@@ -1,4 +1,4 @@
-"""Record a camera's messages, replay them as an emulated camera, convert them for Wireshark.
+"""Record a camera's messages; replay them as an emulated camera, or convert them for Wireshark.
 
 ::
 

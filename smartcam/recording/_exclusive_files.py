@@ -1,4 +1,4 @@
-"""Open a file for a single recorder."""
+"""Open a file so that only one recorder can write it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def open_exclusively(path: Path, *, overwrite: bool) -> IO[bytes]:
-    """Open a file for a single recorder; truncate it only after it is locked.
+    """Open and lock a file for one recorder; truncate it only after it is locked.
 
     Raises:
         ConfigurationError: another recorder writes the file.

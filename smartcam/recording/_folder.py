@@ -1,4 +1,4 @@
-"""A folder of consecutive recordings: names, cameras and sizes of its files.
+"""Name, list, count and delete the files in a folder of consecutive recordings.
 
 A file's name consists of the camera's name, with ``.`` for ``/``, and the time of the first record,
 UTC: ``line1.cam3_20260102T030405.678Z.mcap``. Sorted by name, a camera's files are in order.
@@ -50,7 +50,7 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName | None:
-        """Return the parts of a name; None if no recorder gives such names."""
+        """Return the parts of a name; None if the name is not one that a recorder gives."""
         match = _NAME.fullmatch(name)
         if match is None:
             return None
@@ -125,14 +125,14 @@ class RecordingFolder:
         # for each examined file, by name: whether it is a recording of smartcam
         self._is_own: dict[str, bool] = {}
         self._lock: int | None = None
-        self._existed = False  # whether the folder existed earlier: it is not created again
+        self._existed = False  # whether the folder existed earlier; then it is not created again
         self._last: dict[str, datetime] = {}  # start of the last file of each camera
 
     def enter(self) -> None:
         """Create the folder if it never existed, lock it and list its files.
 
-        A folder that existed and is missing is not created again: it may have been a mount, and the
-        disk that is there instead may be small.
+        A folder that existed earlier and is missing now is not created again: it may have been a
+        mounted disk, and the disk below its mount point may be small.
 
         Raises:
             ConfigurationError: another recorder writes in it.

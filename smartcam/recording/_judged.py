@@ -20,8 +20,8 @@ MAX_PICTURES: Final = 256
 """Largest number of pictures of a camera that are kept for its results."""
 
 MAX_PICTURE_BYTES: Final = 1 << 28
-"""Largest number of bytes that the kept pictures of a camera may have together; the last one is
-kept in any case."""
+"""Largest number of bytes that the kept pictures of a camera may have together; the last
+picture is kept in any case."""
 
 MAX_RESULTS: Final = 1000
 """Largest number of results of a camera that wait for their pictures."""
@@ -34,8 +34,8 @@ class JudgedResult(NamedTuple):
         result: result of the camera.
         picture: picture of the result; None if it is unknown.
         linked: True if the picture was recorded with the result's number, as after
-            ``read_image()``; False if it was found by its time. A picture is found by its time only
-            if this client sent the trigger; otherwise ``picture`` is None.
+            ``read_image()``; False if the picture was found by its time. That works only if the
+            recording client sent the trigger; otherwise ``picture`` is None.
     """
 
     result: Result[Any]
@@ -64,8 +64,8 @@ class PictureMatcher:
     """Matches pictures and results of one camera.
 
     Args:
-        max_bytes: largest number of bytes of the pictures that are kept for results; the last one
-            is kept in any case.
+        max_bytes: largest number of bytes of the pictures that are kept for results; the last
+            picture is kept in any case.
 
     Attributes:
         results: results whose picture is not known yet.
@@ -122,7 +122,7 @@ class PictureMatcher:
             yield JudgedResult(result, picture, False)
 
     def _must_not_wait(self, result: Result[Any]) -> bool:
-        """Return True if a result should not wait for a picture any more."""
+        """Return True if a later picture has come, or too many results wait."""
         return (
             self._latest_capture > result.received_at.timestamp() or len(self.results) > MAX_RESULTS
         )
@@ -148,7 +148,7 @@ class PictureMatcher:
                 picture.result_number is None
                 and triggered <= exposure_start <= frame.utc <= received
             ):
-                missing = picture.left_out or frame.lost  # perhaps the result's picture
+                missing = picture.left_out or frame.lost  # a missing picture may be the result's
                 return None if missing else frame
         return None
 

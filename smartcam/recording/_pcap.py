@@ -1,7 +1,7 @@
 """Convert a recording to packets, for Wireshark and similar programs.
 
 A recording has frames and no packets, so packets are made: Ethernet, IP, and TCP with handshake,
-segments, acknowledgements and an end, or UDP with one datagram a frame. Times and payload are the
+segments, acknowledgements and an end, or UDP with one datagram per frame. Times and payload are the
 recorded ones. What was not recorded is invented: the client's address and port, the division into
 segments, and the end of a lost link.
 """
@@ -43,7 +43,7 @@ MSS = {4: 1460, 6: 1440}
 """Bytes of a TCP segment that fit into an Ethernet frame, by the version of IP."""
 
 FIRST_PORT, PORTS = 49_152, 16_384
-"""The ephemeral ports of clients (RFC 6335); each link uses the next one."""
+"""First ephemeral port of clients, and number of such ports (RFC 6335); each link uses the next."""
 
 MAX_DATAGRAM_BYTES = 65_507
 """Largest number of bytes of a UDP datagram over IPv4."""
@@ -83,7 +83,7 @@ def write_pcap(
     Raises:
         ConfigurationError: there is no such camera, or the file exists already or cannot be
             created.
-        UnsupportedError: a camera is a fleet's, whose frames only its agent has.
+        UnsupportedError: a camera belongs to a fleet, so that only the agent has its frames.
         RecordingError: the file cannot be written to its end: the disk is full, or a frame does
             not fit into a packet.
     """
@@ -93,8 +93,8 @@ def write_pcap(
     for recorded in [*recording.cameras.values()] if camera is None else [recording.camera(camera)]:
         if is_fleet(recorded.url):
             raise UnsupportedError(
-                f"recording {recording.path}: camera {recorded.name!r} is a fleet's, so no frames "
-                "of it are recorded, which packets are made of"
+                f"recording {recording.path}: camera {recorded.name!r} belongs to a fleet, so "
+                "the recording has no frames of it, of which packets could be made"
             )
     try:
         stream = path.open("wb" if overwrite else "xb")

@@ -59,14 +59,14 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
-"""Number of values that the messages of any file may have: ten seconds of work."""
+"""Number of values that the messages of any file may have; to read them takes ten seconds."""
 
 VALUES_PER_BYTE = 100
-"""Number of values for each byte that a larger file may have. Real recordings have less than one,
-since each message takes 16 bytes of index; tables of mostly zeros have ten."""
+"""Number of values that a larger file may have for each of its bytes. Real recordings have less
+than one, since each message takes 16 bytes of index; tables of mostly zeros have ten."""
 
 MIN_POINT_BYTES = 2
-"""Least number of bytes that a point of a mark has."""
+"""Least number of bytes of a mark's point in a message."""
 
 T = TypeVar("T")
 
@@ -97,8 +97,8 @@ class RecordedCamera(NamedTuple):
 class Recording:
     """An MCAP file of :class:`~smartcam.recording.Recorder`; made by :func:`load_recording`.
 
-    Or a folder of :class:`~smartcam.recording.FleetRecorder`. Its items are read from the file each
-    time, in the order of recording; for a folder, camera by camera.
+    It may also be a folder of :class:`~smartcam.recording.FleetRecorder`. Each call reads the items
+    from the file again, in the order of recording; in a folder, camera by camera.
 
     Attributes:
         path: the file, or the folder.
@@ -142,14 +142,14 @@ class Recording:
             name = check_text(name, "camera", f"recording {self.path}")
         names = ", ".join(self.cameras)
         if not names:
-            raise ConfigurationError(f"recording {self.path}: no camera is in it")
+            raise ConfigurationError(f"recording {self.path}: it has no camera")
         if name is not None and name not in self.cameras:
             raise ConfigurationError(
-                f"recording {self.path}: no camera {name!r} is in it; there are: {names}"
+                f"recording {self.path}: it has no camera {name!r}; it has: {names}"
             )
         if name is None and len(self.cameras) != 1:
             raise ConfigurationError(
-                f"recording {self.path}: {len(self.cameras)} cameras are in it, choose one: {names}"
+                f"recording {self.path}: it has {len(self.cameras)} cameras, choose one: {names}"
             )
         return self.cameras[next(iter(self.cameras)) if name is None else name]
 
@@ -164,7 +164,7 @@ class Recording:
     def all_items(self, camera: str | None = None) -> Iterator[Item | RecordedState]:
         """Yield the items for a replay, with those before ``since`` and the states of cameras.
 
-        If the rest of a file cannot be read, an unknown state of the camera follows.
+        If the rest of a file cannot be read, a state with unknown values follows.
         """
         if camera is not None:
             camera = check_text(camera, "camera", f"recording {self.path}")
@@ -575,8 +575,8 @@ class _FileScan:
             if any(name.startswith("smartcam.") for name in schemas.values()):
                 raise ConfigurationError(
                     f"recording {self.path}: it holds {names}, but its metadata records are "
-                    "missing, which say whose it is: another program left them out. mcap filter "
-                    "keeps them with --include-metadata; take the file that it was made of"
+                    "missing, which name the program that wrote it: another program left them out. "
+                    "mcap filter keeps them with --include-metadata; use the original file"
                 )
             raise ConfigurationError(
                 f"recording {self.path}: this MCAP file is no recording of smartcam; it holds "
@@ -587,4 +587,4 @@ class _FileScan:
 def _remark(count: int, cause: Exception) -> str:
     if isinstance(cause, CutOffError):
         return f"the file has no end: the recording was cut off; {count} messages were read"
-    return f"the file is damaged behind message {count}: {cause!s:.200}; the rest cannot be read"
+    return f"the file is damaged after message {count}: {cause!s:.200}; the rest cannot be read"

@@ -1,9 +1,9 @@
-"""Write a recording: an observer that collects items, and a thread that writes them.
+"""Record into a file: an observer collects items, and a thread writes them.
 
-The hooks put their arguments into a list and return. A thread takes the list twice a second, writes
-it as one chunk of the file and syncs that to the disk, so a crash, even of the machine, loses about
-half a second. No item is left out: if the disk is full or too slow, the recording ends with an
-error, and never has a gap.
+The observer's methods put their arguments into a list and return. A thread takes the list twice a
+second, writes it as one chunk of the file and syncs the chunk to the disk. So a crash, even of the
+machine, loses about half a second. No item except pictures is left out: if the disk is full or too
+slow, the recording ends with an error, and never has a gap.
 """
 
 from __future__ import annotations
@@ -225,8 +225,8 @@ class Recorder(Observer):
     def close(self) -> None:
         """Write waiting items and end the file; idempotent.
 
-        This waits for the disk, usually some milliseconds, 30 s at most: if an event loop must not
-        wait, call it in a thread.
+        The call waits for the disk, usually some milliseconds, at most 30 s. If an event loop must
+        not wait, call it in a thread.
 
         Raises:
             RecordingError: the recording has failed, earlier or now.
@@ -259,7 +259,7 @@ class Recorder(Observer):
         self._thread, self._items, self._waiting_bytes = None, [], 0
         self._waiting_picture_bytes = 0
         if self._file is not None:
-            self._fail("this process is a fork of the one that writes it, which goes on")
+            self._fail("this process is a fork; the recording goes on in the original process")
 
     @property
     def counts(self) -> Counts:
@@ -272,7 +272,7 @@ class Recorder(Observer):
         return self._failure.result() if self._failure.done() else None
 
     async def wait_failed(self) -> RecordingError:
-        """Wait until the recording fails, without a bound, and return the error.
+        """Wait, without a time limit, until the recording fails; return the error.
 
         Cancellation: safe.
         """
@@ -281,7 +281,7 @@ class Recorder(Observer):
     def describe(self, camera: str, **facts: object) -> None:
         """Write facts about a camera to the file, such as ``interpret_as``; None is left out.
 
-        The address and the dialect are written without this call, with every session.
+        The address and the dialect are written without this call, at the start of every session.
         """
         texts = {name: str(fact) for name, fact in facts.items() if fact is not None}
         self._put(Description({"camera": camera, **texts}), 0)
@@ -328,8 +328,8 @@ class Recorder(Observer):
     ) -> bool:
         """Add a picture to its camera's recording; never wait.
 
-        If more than 64 MiB of pictures wait for the disk, the picture is left out; the next one has
-        the number of those that were. Results are never left out for pictures.
+        If more than 64 MiB of pictures wait for the disk, the picture is left out; the next picture
+        has the number of pictures left out before it. Results are never left out for pictures.
 
         Args:
             frame: picture of a source of frames; its bytes are kept until they are written.
@@ -551,7 +551,7 @@ class RecordingFile:
         self._frame_texts = FrameTexts()
         self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # frame numbers by data
         self._size = 0  # size when the file was closed
-        # time of the last message, also in nanoseconds: frames that came together share it
+        # time of the last message, also in nanoseconds; frames that came together share it
         self._last_time: tuple[datetime | None, int] = None, 0
 
     def start(self) -> None:
@@ -654,7 +654,7 @@ class RecordingFile:
         return number
 
     def _write_picture(self, picture: RecordedPicture) -> None:
-        """Write a picture; do not compress its chunk."""
+        """Write a picture, without compressing its chunk."""
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures import messages
 
@@ -664,7 +664,7 @@ class RecordingFile:
         self._write_foxglove(picture, PICTURES, schema, messages.schema_data, data)
 
     def _write_annotations(self, picture: RecordedPicture) -> int:
-        """Write the marks of a picture, which comes next; return the number of the message."""
+        """Write the marks of a picture that is written next; return the number of the message."""
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures import annotations
 

@@ -60,8 +60,8 @@ class RecordedState(NamedTuple):
     def to_facts(self, endian: int, at: datetime) -> dict[str, str]:
         """Return the texts of the camera's state at a time, for a metadata record.
 
-        The time is that of the next record. With the time of writing, which is later since records
-        wait for the disk, a replay of a span would begin at a wrong time.
+        ``at`` is the time of the next record. The time of writing is later, since records wait for
+        the disk, so with it a replay of a span would begin at a wrong time.
         """
         facts = {
             "camera": self.camera,

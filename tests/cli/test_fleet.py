@@ -137,7 +137,7 @@ def test_record_keeps_what_can_be_replayed(fleet: str, tmp_path: Path) -> None:
         (line,) = run("trigger", url, *told).done().lines
     assert line["value"] == {"text": "Hello World"}
     refused = run("pcap", str(path), "-o", str(tmp_path / "run.pcap"))
-    refused.failed(5, "camera 'line1/text' is a fleet's, so no frames of it are recorded")
+    refused.failed(5, "camera 'line1/text' belongs to a fleet, so the recording has no frames")
 
 
 def test_record_of_a_free_run_plays_by_itself(fleet: str, tmp_path: Path) -> None:

@@ -232,7 +232,7 @@ def test_replay_of_no_recording_is_reported(options: list[str], code: int, text:
 def test_replay_wrong_camera_and_speed_are_reported(url: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     run("record", url, "-o", str(path), "--seconds", "0.1", "--name", "left").done()
-    run("replay", str(path), "--camera", "x").failed(2, "no camera 'x' is in it; there are: left")
+    run("replay", str(path), "--camera", "x").failed(2, "it has no camera 'x'; it has: left")
     run("replay", str(path), "--speed", "0").failed(2, "speed: expected a number, 0.001 to 1000")
 
 

@@ -101,7 +101,7 @@ def test_damage_is_reported_and_skipped_and_the_rest_is_played(folder: Path) -> 
     paths[2].write_bytes(b"no recording at all")
     found = load_recording(folder)
     remarks = found.remark.splitlines()  # a busy machine may have more to tell of other files
-    damage = f"{paths[1].name}: the file is damaged behind message "
+    damage = f"{paths[1].name}: the file is damaged after message "
     first = next((line for line in remarks if line.startswith(damage)), None)
     assert first is not None, remarks
     no_mcap = f"recording {paths[2]}: this is no MCAP file"
@@ -167,11 +167,11 @@ def test_serve_says_where_it_cannot_record_and_goes_on(tmp_path: Path) -> None:
         wait_until(lambda: files(tmp_path, "line1/text"))
         shutil.rmtree(tmp_path / "rec")
         run("trigger", shown[1], "--count", "2").done()
-        said = agent.read_until(b"until it is better", stream="stderr")
+        said = agent.read_until(b"until the disk works again", stream="stderr")
         assert f"recordings {tmp_path / 'rec'}: No such file or directory" in said
         (tmp_path / "rec").mkdir()
         run("trigger", shown[1], "--count", "2").done()
-        agent.read_until(b"recorded again", stream="stderr")
+        agent.read_until(b"records are written again", stream="stderr")
         agent.send_signal(signal.SIGTERM)
         assert agent.wait().code == 0
     assert files(tmp_path)

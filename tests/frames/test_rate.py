@@ -224,7 +224,7 @@ def test_quality_goes_first_then_the_frame_rate_and_back_in_reverse(
     assert f"{statistics.fps:.1f}"[:1] in caplog.messages[-1]
     link.run(40.0)
     assert control.fps == 30.0
-    assert caplog.messages[-1] == "frames: 30 a second at most: bit rate"
+    assert caplog.messages[-1] == "frames: at most 30 per second: bit rate"
     for one, other in itertools.pairwise(link.sent):
         assert one.quality == other.quality or 30.0 in (one.fps, other.fps)
     assert len(caplog.messages) < 15

@@ -547,7 +547,7 @@ def test_bag_of_one_camera_has_nothing_of_the_other(tmp_path: Path) -> None:
     recording = write(tmp_path / "run.mcap", items)
     write_bag(recording, tmp_path / "bag", camera="right")
     assert {one.topic for one in read(tmp_path / "bag")} == {"/right/results"}
-    with pytest.raises(ConfigurationError, match="no camera 'none' is in it"):
+    with pytest.raises(ConfigurationError, match="it has no camera 'none'"):
         write_bag(recording, tmp_path / "other", camera="none")
     assert not (tmp_path / "other").exists()
 
@@ -557,7 +557,7 @@ def test_bag_of_another_protocol_is_not_read_again(tmp_path: Path) -> None:
     items: list[CameraEvent | Result] = [Connected(camera="left", at=at(0), url=url)]
     items.append(result(1, {"A1": 3}))
     recording = write(tmp_path / "run.mcap", items)
-    with pytest.raises(UnsupportedError, match="only results of bvs can be read again"):
+    with pytest.raises(UnsupportedError, match="only results of bvs can be interpreted again"):
         write_bag(recording, tmp_path / "bag", interpret_as="n: int32")
     assert write_bag(recording, tmp_path / "bag").results == 1
 

@@ -112,7 +112,7 @@ def test_bag_command_with_a_calibration_wants_what_it_was_made_with(
         (["{run}", "-o", "{here}/none/bag"], 2, "No such file or directory"),
         (["{here}/none.mcap", "-o", "{here}/bag"], 2, "No such file or directory"),
         (["{bag}", "-o", "{here}/bag"], 2, "is no recording of smartcam; it holds"),
-        (["{run}", "-o", "{here}/bag", "--camera", "other"], 2, "no camera 'other' is in it"),
+        (["{run}", "-o", "{here}/bag", "--camera", "other"], 2, "it has no camera 'other'"),
         (["{run}", "-o", "{here}/bag", "--interpret-as", "n: int33"], 2, "int33"),
         (["{run}"], 2, "Missing option '-o'"),
     ],

@@ -161,4 +161,4 @@ def test_frame_of_a_result_must_be_there(tmp_path: Path, raw_from: object) -> No
     with mock.patch.dict(KINDS, results=kind._replace(to_text=told)):
         record_items(path, [*frames[:2], result("left", b"ab"), *frames[2:]])
     remark = load_recording(path).remark
-    assert "the file is damaged behind message 2: raw_from: " in remark
+    assert "the file is damaged after message 2: raw_from: " in remark

@@ -287,8 +287,8 @@ async def test_full_disk_is_told_once_counted_and_heals(
     ]
     texts = [record.getMessage() for record in caplog.records]
     assert [text.rpartition(": ")[2] for text in texts] == [
-        "No space left on device; nothing is recorded until it is better",
-        "recorded again",
+        "No space left on device; nothing is recorded until the disk works again",
+        "records are written again",
     ]
     first, second = files(tmp_path)
     whole = load_recording(tmp_path / "rec")
@@ -413,8 +413,8 @@ def test_disk_that_is_really_full(tmp_path: Path) -> None:
     assert found["told"].endswith("No space left on device")
     ours = [line for line in found["lines"] if "has no end" not in line]
     assert ours == [
-        f"{found['told']}; nothing is recorded until it is better",
-        f"recordings {tmp_path / 'rec'}: recorded again",
+        f"{found['told']}; nothing is recorded until the disk works again",
+        f"recordings {tmp_path / 'rec'}: records are written again",
     ]
     account, runs_seen = found["account"], found["runs"]
     assert account["waiting"] == 0

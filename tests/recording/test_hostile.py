@@ -299,7 +299,7 @@ def test_load_recording_message_that_is_no_object_is_told(tmp_path: Path, body: 
     path = written(tmp_path / "run.mcap", chunk(message(RESULT) + message(body)))
     recording = load_recording(path)
     assert recording.counts.results == 1
-    assert recording.remark.startswith("the file is damaged behind message 1: ")
+    assert recording.remark.startswith("the file is damaged after message 1: ")
 
 
 @pytest.mark.parametrize(

@@ -472,11 +472,11 @@ async def test_pictures_of_several_cameras_have_to_be_chosen_from(tmp_path: Path
     with Recorder(path) as recorder:
         recorder.add_picture(shot(1), camera="a")
         recorder.add_picture(shot(2), camera="b")
-    with pytest.raises(FrameFormatError, match=r"pictures of a, b: choose one.*#camera=a") as told:
+    with pytest.raises(FrameFormatError, match=r"pictures of a, b: choose .*#camera=a") as told:
         await played(str(path))
     assert told.value.available == ("a", "b")
     assert [one.sequence for one in await played(f"{path}#camera=b")] == [2]
-    with pytest.raises(FrameFormatError, match=r"no picture of camera 'c'.*those of a, b"):
+    with pytest.raises(FrameFormatError, match=r"no picture of camera .c.; it has .* of a, b"):
         await played(f"{path}#camera=c")
 
 
@@ -487,7 +487,7 @@ async def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
     with pytest.raises(FrameSourceError, match="no MCAP file"):
         await played(str(tmp_path / "text.mcap"))
     write(tmp_path / "run.mcap", session())
-    with pytest.raises(FrameFormatError, match="no picture is in it"):
+    with pytest.raises(FrameFormatError, match="it has no picture"):
         await played(str(tmp_path / "run.mcap"))
     with pytest.raises(ConfigurationError, match=r"unknown parameter 'sped'.*speed"):
         smartcam.frames.open(f"{tmp_path / 'run.mcap'}#sped=2")

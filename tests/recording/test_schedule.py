@@ -218,9 +218,9 @@ def test_plan_application_id_nobody_can_have_is_refused(tmp_path: Path) -> None:
         ),
         (
             [Connected(camera="left", at=at(0), url="insight://h:23?dialect=native")],
-            "camera 'left' speaks insight, not bvs; smartcam.recording.replay.. plays it where",
+            "camera 'left' speaks insight, not bvs; use smartcam.recording.replay..",
         ),
-        ([Connected(camera="left", at=at(0), url=URL)], "no answer of camera 'left' is in it"),
+        ([Connected(camera="left", at=at(0), url=URL)], "it has no answer of camera 'left'"),
     ],
 )
 def test_plan_camera_that_cannot_be_emulated_is_refused(

@@ -1,4 +1,4 @@
-"""Encode and decode H.264 by x264 and FFmpeg, without a frame of delay."""
+"""Encode H.264 by x264, without a frame of delay, and decode it by FFmpeg."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class H264Encoder:
         self._codec: Any = None
         self._grey: Any = None  # the last grey picture's frame, reusable since x264 copied it
         self._stream_key: tuple[object, ...] = ()
-        self._restarts = 0  # how often the stream was to begin with a new key frame
+        self._restarts = 0  # number of requests to restart with a key frame
         self._count = 0
 
     def request_key_frame(self) -> None:
@@ -141,9 +141,9 @@ class H264Decoder:
 
     It returns only whole pictures. The first one follows a key frame, or the end of a refresh that
     began after the decoder had decoded something: FFmpeg may take a refresh for complete although
-    its first frame had no reference. In the middle of a stream the first picture takes up to three
-    times the encoder's ``keyint``, after a loss two times, and after
-    :meth:`H264Encoder.request_key_frame` no time.
+    its first frame had no reference. A decoder that starts in the middle of a stream returns its
+    first picture after at most three times the encoder's ``keyint`` frames, after a loss two times,
+    and after :meth:`H264Encoder.request_key_frame` at once.
 
     Args:
         run: function that runs the work.

@@ -1,15 +1,15 @@
 """Assemble packets of a stream into frames, and count incomplete frames as lost.
 
-The module uses no socket and no clock: it gets packets with their time. It returns pictures in the
-order of their blocks, and requests for missing packets. At most :data:`MAX_OPEN_BLOCKS` blocks are
-kept.
+A block is the packets of one frame: a leader, the payload, and a trailer. The module uses no socket
+and no clock: its caller passes packets with their time. It returns pictures in the order of their
+blocks, and requests for missing packets. At most :data:`MAX_OPEN_BLOCKS` blocks are kept.
 
 A block with missing packets waits while they are requested, and later blocks wait for it. The block
 is lost when the camera no longer has the packets, when they have not come after
 :data:`MAX_REQUESTS` requests, or when too many are missing.
 
-The camera's clock distinguishes restarted ids from late packets: the time of a late leader is
-before that of the newest block. Without a clock, a second of silence means that the ids restarted.
+The time in a leader distinguishes restarted block ids from late packets: a late leader is older
+than the newest block's. Without such times, a second of silence means that the ids restarted.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MAX_REQUESTS: Final = 4
 """Largest number of requests for the packets of one block."""
 
 MAX_MISSING_PACKETS: Final = 64
-"""Up to this number, a block's missing packets are always requested. More are requested only if
+"""Largest number of a block's missing packets that are always requested. More are requested only if
 they are at most a quarter of the block."""
 
 MAX_GAPS_PER_BLOCK: Final = 1000
@@ -151,7 +151,7 @@ class Assembler:
             data: buffer of at least ``size`` bytes.
             size: size of the packet.
             now: present time, seconds, on the clock of the deadlines.
-            arrived_at: time of arrival; the first packet's becomes the picture's.
+            arrived_at: time of arrival; a picture gets the time of its first packet.
         """
         current = self._current
         if current is not None and size == self._datagram_bytes:
@@ -257,7 +257,7 @@ class Assembler:
         extended = header.size != HEADER_BYTES
         if not self._has_started:
             self._has_started = True
-            # if the ids start at 1, blocks before this one were lost, or come later
+            # unless the ids start at 1, earlier blocks belong to an earlier stream
             if not self._starts_at_one or header.block > MAX_OPEN_BLOCKS:
                 self._newest_number = self._closed_number = header.block - 1
         number = self._number_of(header.block, extended)

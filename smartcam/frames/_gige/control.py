@@ -96,7 +96,7 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     @property
     def path_mtu(self) -> int:
-        """Size of the largest IP packet on the path, bytes, as the system knows it; else 1500."""
+        """Size of the largest IP packet on the path, bytes; 1500 if the system does not know it."""
         if self._transport is None or sys.platform != "linux":
             return 1500
         sock = self._transport.get_extra_info("socket")

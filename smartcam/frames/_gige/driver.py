@@ -90,7 +90,7 @@ class GigEDriver(FrameDriver):
       largest that passes a test, or the camera's own if it sends no test packets.
     - ``resend=off``: missing packets are not requested.
     - ``trigger``: source of triggers, such as ``Software`` or ``Line1``, each of which causes one
-      picture; ``off``: the camera streams freely. It is applied last.
+      picture; ``off``: the camera streams freely. Applied after all other parameters.
 
     Args:
         address: parts of the URL.
@@ -398,7 +398,7 @@ class GigEDriver(FrameDriver):
             sink.ended(error)
 
     def _on_pictures(self, pictures: list[WholePicture]) -> None:
-        """Pass pictures to the sink, which may close the stream; report lost ones to a trigger."""
+        """Pass pictures to the sink, which may close the stream; note losses for a trigger."""
         stream = self._stream
         sink = None if pictures or self._armed is None else self._sink
         if sink is not None and stream is not None and (lost := stream.assembler.take_lost()):

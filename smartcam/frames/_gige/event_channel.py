@@ -1,4 +1,4 @@
-"""Receive the events of a GigE Vision camera by its message channel, each exactly once.
+"""Receive the events of a GigE Vision camera through its message channel, each only once.
 
 The data of an event are the bytes of its item, as EMVA's GenApi passes them to the description's
 event port: the item's size at address 0, its number at 2, and its data after the timestamp.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.description import Element
 
 MAX_LINKED_NODES: Final = 64
-"""Largest length of a chain of references between nodes: a longer chain is a circle."""
+"""Largest length of a chain of references between nodes; a longer one counts as a circle."""
 
 MAX_NODES_VISITED: Final = 5000
 """Largest number of nodes that are visited for one value."""

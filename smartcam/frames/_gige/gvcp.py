@@ -1,7 +1,7 @@
 """Encode and decode GVCP, the control protocol of GigE Vision: packets, registers, status codes.
 
-A request has an eight-byte header (key 0x42, flags, command, length, request id), an answer too:
-status, command, length, and the id of its request. All numbers are big-endian.
+A request has a header of eight bytes: key 0x42, flags, command, length, request id. An answer's
+header of eight bytes is status, command, length, and the request's id. All numbers are big-endian.
 
 Source: GigE Vision 2.0, chapters 14 to 16 (messages), 19 (status codes), 28 (bootstrap registers).
 """
@@ -34,7 +34,7 @@ _WORD: Final = struct.Struct(">I")
 
 
 class GvcpCommand(IntEnum):
-    """The command of a packet; an answer's is its request's plus one."""
+    """The command of a request; the answer's command is one more."""
 
     DISCOVERY = 0x0002
     FORCEIP = 0x0004

@@ -4,8 +4,8 @@ A frame is a *block*: a leader, the payload in packets of one size, with a short
 a trailer. Packet ids count from the leader's 0. Block ids have 16 bits, go from 1 to 65535 and
 continue at 1; or they have 64 bits if a bit of each header announces extended ids.
 
-Chunk data of the standard's first version (payload type 4) has a leader without the picture's size,
-which is in the camera's features. Its payload begins with the picture's chunk.
+Chunk data of the standard's first version (payload type 4) has a leader without the picture's size;
+the size is in the camera's features. Its payload begins with the picture's chunk.
 
 Source: GigE Vision 2.0, chapters 23 to 25.
 """
@@ -120,7 +120,7 @@ class Leader(NamedTuple):
 
 
 class ImpliedPicture(NamedTuple):
-    """A picture's format by the camera's features, for leaders without it.
+    """A picture's format and size from the camera's features, for leaders that lack them.
 
     Attributes:
         pixel_format: PFNC's number.

@@ -1,7 +1,7 @@
 """Read values that a camera sends without a request: chunk data of pictures, and data of events.
 
-A description has a port for each chunk and each event; a feature whose registers are behind such a
-port has its value in the message. Reading needs no request to the camera.
+A description has a port (GenICam's memory space) for each chunk and each event. A feature whose
+register is in such a port has its value in the message, so reading it needs no request.
 
 Source: GigE Vision 2.0, chapter 24.6 (chunks: data, id, length, from the end of the payload on);
 GenApi 2.0, chapter 2.8.16 (``ChunkID`` and ``EventID`` of a Port).
@@ -65,10 +65,10 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
 
 
 def doubt_about_size(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
-    """Return the reason why the size by the features may be wrong for a picture; "": it is right.
+    """Return why a picture may not have the size in the features; "": no reason for doubt.
 
     Args:
-        picture: picture with the size by the camera's features.
+        picture: picture with the size in the camera's features.
         chunks: values that came with the picture.
     """
     leader = picture.leader

@@ -87,7 +87,7 @@ def as_source(camera: AnsweringCamera) -> FoundSource:
     remark = ""
     if not camera.reachable:
         remark = (
-            f"its address {camera.info.address} is not of the network that it answered by: "
+            f"its address {camera.info.address} is outside of the network it answered from: "
             f"smartcam frames force-address {camera.info.mac} ADDRESS/PREFIX gives it another"
         )
     return FoundSource(f"gige://{camera.address}", camera.info.label, (), remark)

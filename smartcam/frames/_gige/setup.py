@@ -45,7 +45,7 @@ MAX_NUMBER: Final = 1e12
 _RATES: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 _RATE_SWITCHES: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 _EXPOSURES: Final = ("ExposureTime", "ExposureTimeAbs")
-"""Names of the exposure time, microseconds: of today's SFNC, then of its first versions."""
+"""Names of the exposure time, microseconds: in today's SFNC, then in its first versions."""
 
 
 class WantedStream(NamedTuple):
@@ -105,7 +105,7 @@ async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
         FrameSourceError: the camera has no such feature or value; the text lists the existing ones.
     """
     features = session.features
-    with contextlib.suppress(FrameSourceError):  # the camera does not stream, which may be an error
+    with contextlib.suppress(FrameSourceError):  # an error if it does not stream
         await features.execute("AcquisitionStop")
     await set_locked(features, False)
     mode = "AcquisitionMode"

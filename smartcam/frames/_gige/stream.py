@@ -127,7 +127,7 @@ class Stream:
                 size, sender = receive(view)
             except BlockingIOError:
                 break
-            except OSError:  # an error of an earlier sent datagram; reading goes on
+            except OSError:  # from a datagram sent earlier; reading goes on
                 continue
             if sender[0] == camera:
                 feed(view, size, now, arrived)

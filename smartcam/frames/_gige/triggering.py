@@ -1,9 +1,9 @@
 """Trigger a GigE Vision camera, and find the picture that a trigger caused.
 
-A picture belongs to the pending trigger, with three exceptions. By the camera's clock, which is
-read right before the trigger, it was exposed earlier; a picture was lost meanwhile; or an event of
-the camera names another block. If the clock cannot be read, the only evidence is that all earlier
-pictures of the stream have come.
+The next picture belongs to the pending trigger, with three exceptions. The picture was exposed
+before the trigger, by the camera's clock, which is read right before it; a picture was lost
+meanwhile; or an event of the camera names another block. If the clock cannot be read, the only
+evidence is that all earlier pictures of the stream have come.
 
 Source: SFNC 2.7, chapter 5 (``TriggerSelector``, ``TriggerMode``, ``TriggerSource``,
 ``TriggerSoftware``); GigE Vision 2.0, chapter 28 (timestamp latch).
@@ -200,7 +200,7 @@ class ArmedTrigger:
         ticks = picture.leader.ticks
         is_earlier = self._latched_ticks is not None and 0 < ticks < self._latched_ticks
         if is_earlier:
-            self._add_note(f"block {picture.block_id} came, which was exposed before it")
+            self._add_note(f"block {picture.block_id} came, which was exposed before the trigger")
         return is_earlier
 
     def reason_for_doubt(self, picture: WholePicture, *, ids_agree: bool) -> str:
@@ -211,7 +211,7 @@ class ArmedTrigger:
             ids_agree: whether this camera's events and pictures are known to have the same ids.
         """
         if picture.lost > 0 and not self._is_first:
-            return f"{picture.lost} right before it came incomplete, or not at all"
+            return f"{picture.lost} pictures right before it came incomplete, or not at all"
         if ids_agree and self.exposed and picture.block_id not in self.exposed:
             return f"the camera exposed block {self.exposed[0]} for it, which did not come"
         return ""

@@ -1,4 +1,4 @@
-"""Keep the planes of a decoded picture separate until all bytes are needed in a row."""
+"""Keep the planes of a decoded picture separate until their bytes must be contiguous."""
 
 from __future__ import annotations
 

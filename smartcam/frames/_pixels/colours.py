@@ -83,7 +83,7 @@ def _weights(matrix: Matrix, depth: int) -> _Weights:
 
 @lru_cache(maxsize=8)
 def _rgb_weights(matrix: Matrix, depth: int) -> NDArray[np.float64]:
-    """Return the weights of Y, U, V and 1 in red, green and blue, (3, 4)."""
+    """Return the weights of Y, U, V and the constant 1 in red, green and blue, (3, 4)."""
     weights = _weights(matrix, depth)
     shares = np.array(
         [

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PixelFormat:
-    """The layout of a frame's pixels in its bytes.
+    """The format of a frame's pixels in its bytes.
 
     Attributes:
         name: name in PFNC, such as ``Mono8``; without one, the usual name, such as ``NV12`` or

@@ -76,7 +76,7 @@ class PixelLayout(ABC):
 
     def planes(self, picture: RawPicture) -> tuple[NDArray[np.uint8], ...]:
         """Return Y, U and V, if they were sent."""
-        raise picture.format_error("a format of Y, U and V", "one without")
+        raise picture.format_error("a format of Y, U and V", "a format without them")
 
     def check(self, picture: RawPicture) -> None:
         """Check that the bytes can be a picture of this layout."""
@@ -108,7 +108,7 @@ def _view(
 class SampleLayout(PixelLayout):
     """One or more samples per pixel, one pixel after the other.
 
-    In a packed format with a stride of 0, a row may begin within a byte.
+    With a stride of 0, packed rows have no padding, so a row may begin within a byte.
 
     Attributes:
         colours: conversions of the samples.

@@ -19,28 +19,29 @@ STEADY_AVERAGING_TIME: Final = 1.0
 """Averaging time, seconds, of the frames' size in a steady scene."""
 
 COUNTED_SECONDS: Final = 2.0
-"""Duration, seconds, over which frames and bytes are counted."""
+"""Time constant, seconds, with which the counts of frames and bytes decay."""
 
 CHANGE_FACTOR: Final = 1.4
-"""Factor by which a value must differ from its mean to count as a change."""
+"""Factor by which a value must differ from its mean to count as a sudden change."""
 
 MAX_RISE_PER_SECOND: Final = 1.3
-"""Factor by which the bit rate may rise in a second, after the start."""
+"""Factor by which the bit rate may rise in a second after its first drop."""
 
 MAX_FIRST_RISE_PER_SECOND: Final = 8.0
 """Factor by which the bit rate may rise in a second until its first drop."""
 
 MIN_DEVIATION_SHARE: Final = 0.03
-"""Share of a value below which a deviation is not corrected."""
+"""Relative deviation from the target below which the quality stays unchanged, and the frame rate is
+not lowered."""
 
 BUSY_SHARE: Final = 0.7
-"""Share of the time in which a frame is in transit, above which the link limits the frame rate."""
+"""The link limits the frame rate if a frame is in transit for at least this share of the time."""
 
 SLOW_SOURCE_FACTOR: Final = 1.15
-"""The source limits the frame rate if the measured rate is below the allowed one by this factor."""
+"""The source limits the frame rate if its rate times this factor is below the allowed rate."""
 
 MAX_BUSY_SHARE_WHEN_FREE: Final = 0.5
-"""Share of the time in which a frame is in transit, below which a lower frame rate does not reduce
+"""If frames are in transit for less than this share of the time, a lower frame rate does not reduce
 latency."""
 
 LOGGED_CHANGE_FACTOR: Final = 1.25
@@ -56,11 +57,11 @@ class RateStatistics:
     """Quality and rates of a rate control, with the reason.
 
     Attributes:
-        quality: JPEG quality for the next frames.
+        quality: JPEG quality of the next frame.
         fps: largest frame rate, frames per second.
         why: reason for these values: "bit rate", "latency" or "at the highest quality"; "" before
-            the first frame. "at the lowest quality" is appended if the frame rate is lowered, too,
-            and "at the lowest quality and frame rate" if both limits are reached.
+            the first frame. "at the lowest quality" follows if the frame rate is lowered, too, and
+            "at the lowest quality and frame rate" if neither can be lowered further.
         bitrate: recent bit rate, bits per second.
         latency: recent time from capture to arrival, seconds.
     """
@@ -89,7 +90,7 @@ class _Mean:
 
 
 class _RecentCounts:
-    """Numbers of recent frames and bytes, and the duration in which they were sent, in seconds."""
+    """Decaying counts of recent frames and bytes, and of the seconds in which they were sent."""
 
     def __init__(self) -> None:
         self.frames = self.bytes = self.seconds = 0.0
@@ -142,7 +143,7 @@ class RateControl:
         # frame rate of the source, frames per second; 0: unknown
         self._source_fps = 0.0
         self._recent = _RecentCounts()
-        self._normalized_size = _Mean()  # size of a frame with quantization steps of 1, in bytes
+        self._normalized_size = _Mean()  # bytes of a frame at quality 50
         self._time_per_byte = _Mean()  # transit time per byte, seconds
         self._age, self._transit_time = _Mean(), _Mean()
 
@@ -276,16 +277,16 @@ class RateControl:
         change = self._fps / self._logged_fps
         if recovered or not 1 / LOGGED_CHANGE_FACTOR < change < LOGGED_CHANGE_FACTOR:
             self._logged_fps = self._fps
-            logger.info("frames: %.3g a second at most: %s", self._fps, self._why)
+            logger.info("frames: at most %.3g per second: %s", self._fps, self._why)
 
 
 def _step_scale(quality: float) -> float:
-    """Return the scale of a JPEG's quantization steps, 1 at quality 50 (libjpeg's definition)."""
+    """Return the scale of a JPEG's quantization steps: 1 at quality 50, as libjpeg defines it."""
     return 50 / quality if quality < 50 else max(0.02, (100 - quality) / 50)
 
 
 def _quality_for(size_ratio: float) -> float:
-    """Return the quality whose frames are smaller than those with steps of 1 by this ratio."""
+    """Return the quality whose frames are ``size_ratio`` times smaller than those of quality 50."""
     steps = float(max(1e-3, size_ratio) ** (1 / SIZE_EXPONENT))
     return 50 / steps if steps > 1 else 100 - 50 * steps
 

@@ -65,7 +65,7 @@ class DeviceControl:
         if self.menu:
             return ", ".join(f"{value} ({label})" for value, label in self.menu.items())
         if self.kind == "button":
-            return "anything: it is a button"
+            return "any value: it is a button"
         if self.kind == "boolean":
             return "0 (off), 1 (on)"
         if self.kind == "bitmask":

@@ -43,7 +43,7 @@ REASONS: Final = {
     errno.EPERM: "access is denied: add the user to the device's group, mostly 'video'",
     errno.EBUSY: "it is in use by another program",
     errno.ENOTTY: "it is not a V4L2 device, or its driver cannot do that",
-    errno.ENOSPC: "the bus has no room for so many pictures: take a smaller size or a lower rate",
+    errno.ENOSPC: "the bus cannot carry so much data: choose a smaller size or a lower rate",
     errno.EIO: "the device or its connection failed",
 }
 
@@ -62,7 +62,7 @@ def device_error(path: str, action: str, error: OSError) -> FrameSourceError:
 
 
 class WantedSetting(NamedTuple):
-    """The requested setting of a device; None leaves a value unchanged."""
+    """The requested setting of a device; None leaves the device's value unchanged."""
 
     format: PixelFormat | None
     size: tuple[int, int] | None
@@ -301,8 +301,8 @@ class CaptureDevice:
             )
         if actual.field not in abi.WHOLE_FIELDS:
             raise FrameFormatError(
-                f"{self.path}: expected whole pictures, it has fields (kind {actual.field}), half "
-                "the rows each",
+                f"{self.path}: expected whole pictures, it has fields (kind {actual.field}) of "
+                "half the rows",
                 source=self.path,
             )
 

@@ -40,7 +40,7 @@ class V4L2Driver(FrameDriver):
     A setting that is not in the URL keeps the device's value. An unsupported setting raises a
     :exc:`~smartcam.FrameFormatError` that lists the supported values.
 
-    - the path: path of the device; ``/dev/v4l/by-id/...`` finds the camera at any port.
+    - the path: path of the device; ``/dev/v4l/by-id/...`` finds the camera at any USB port.
     - ``format``: pixel format, by its name in PFNC or V4L2.
     - ``size``: ``WIDTHxHEIGHT``, pixels.
     - ``fps``: frames per second.
@@ -53,7 +53,7 @@ class V4L2Driver(FrameDriver):
     are set again.
 
     Without readers the device is closed, so that other programs can use it. Each frame's bytes are
-    copied from the driver's buffer once, even if the frame is replaced before a reader gets it:
+    copied from the driver's buffer once, even if a newer frame replaces it before a reader gets it:
     keeping the buffer would leave the driver fewer buffers.
 
     Blocking calls run in a thread; the event loop only reads filled buffers.
@@ -131,7 +131,7 @@ class V4L2Driver(FrameDriver):
 
     @property
     def features(self) -> V4L2Features:
-        """The controls, by SFNC's names if it has them: ``ExposureTime``, ``Gain``."""
+        """The controls, by SFNC's names (``ExposureTime``, ``Gain``) if SFNC has the control."""
         return V4L2Features(self)
 
     async def controls(self) -> dict[str, DeviceControl]:

@@ -1,4 +1,4 @@
-"""A V4L2 device's controls as features, by SFNC's names and units if it has them.
+"""Offer a V4L2 device's controls as features, with names and units of SFNC where it has them.
 
 A control that SFNC lacks has its own name: its label in lower case with underscores. A control that
 SFNC has is found by both names.

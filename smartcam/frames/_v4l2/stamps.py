@@ -1,4 +1,4 @@
-"""Interpret a driver's time stamps: the moment that they mean, and whether they are plausible."""
+"""Interpret a driver's time stamps: which moment a stamp means, and whether it is plausible."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ class BufferStamps:
     """The time stamps of one stream.
 
     A stamp of the monotonic clock is the start of the exposure or the end of the frame, depending
-    on its flags. If it is the end, the exposure began at most two periods earlier: one of exposure
-    and one of readout. Stamps of other clocks and implausible stamps are not used. Such a frame
-    began at most two periods before the queue of filled buffers was last empty.
+    on its flags. If the stamp is the end, the exposure began at most two frame periods earlier: one
+    of exposure and one of readout. Stamps of other clocks and implausible stamps are not used. A
+    frame with such a stamp began at most two periods before the queue of filled buffers was last
+    empty.
 
     Args:
         name: name of the camera, for the log.
@@ -44,9 +45,9 @@ class BufferStamps:
         self._name = name
         self._nominal_period = period
         self._last_empty_at = started_at  # when the queue of filled buffers was last empty
-        # stamp and number of the last frame; before the first frame, a time before the stream
+        # time stamp and number of the last frame; before the first frame, a time before the stream
         self._last: tuple[float, int | None] = (started_at - 2 * (period or DEFAULT_DURATION), None)
-        self.is_queue_empty = False  # whether the last frame is too new for another to wait
+        self.is_queue_empty = False  # whether the last frame is so new that none waits after it
         self._has_warned = False
 
     def set_queue_empty(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""Stream from a device: convert filled buffers to frames, and count buffers without a picture."""
+"""Convert the filled buffers of a device to frames, and count buffers without a picture."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ if TYPE_CHECKING:
     from smartcam.frames._v4l2.device import CaptureDevice, Setting
 
 MAX_CONSECUTIVE_BAD: Final = 30
-"""Number of consecutive buffers without a picture after which the stream fails."""
+"""Number of consecutive buffers without a whole picture after which the stream fails."""
 
 MAX_CONSECUTIVE_EMPTY: Final = 1000
-"""Largest number of consecutive times that the system reports a filled buffer without having one.
-"""
+"""Largest number of consecutive reports of a filled buffer by the system although there is none."""
 
 HALF_SEQUENCE_RANGE: Final = 1 << 31
-"""Half of the range of 32-bit frame numbers: a larger step forwards is a step backwards."""
+"""Half of the range of 32-bit frame numbers; a larger step forwards counts as a step backwards."""
 
 
 class CaptureStream:
@@ -57,8 +56,8 @@ class CaptureStream:
         self._buffers = Buffers(device, buffers)
         self._sequence: int | None = None  # driver's number of the last frame
         self._unwrapped_sequence = 0
-        # consecutive buffers without a picture, and consecutive calls without a filled buffer
-        self._bad = self._empty = 0
+        # consecutive buffers without a whole picture, and consecutive calls without a filled buffer
+        self._bad_count = self._empty_count = 0
 
     def close(self) -> None:
         """Stop the stream, release the buffers, and close the device."""
@@ -80,7 +79,7 @@ class CaptureStream:
                 return
             except OSError as exc:
                 raise device_error(self._name, "taking a picture", exc) from exc
-            self._empty = 0
+            self._empty_count = 0
             frame = self._to_frame(filled, sink)
             if frame is not None:
                 sink.frame(frame)
@@ -92,11 +91,11 @@ class CaptureStream:
         step = self._advance_sequence(filled.sequence)
         if len(filled.data) < self._min_bytes:
             sink.lost(step)
-            self._bad += 1
-            if self._bad >= MAX_CONSECUTIVE_BAD:
+            self._bad_count += 1
+            if self._bad_count >= MAX_CONSECUTIVE_BAD:
                 raise self._no_pictures_error(filled)
             return None
-        self._bad = 0
+        self._bad_count = 0
         now, utc = system.now(), time.time()
         stamp = self._stamps.frame_stamp(filled.stamp, filled.flags, self._unwrapped_sequence, now)
         return Frame(
@@ -116,8 +115,8 @@ class CaptureStream:
         )
 
     def _count_empty(self) -> None:
-        self._empty += 1
-        if self._empty > MAX_CONSECUTIVE_EMPTY:
+        self._empty_count += 1
+        if self._empty_count > MAX_CONSECUTIVE_EMPTY:
             raise FrameSourceError(
                 f"{self._name}: the driver reports a picture, but has none",
                 source=self._name,
@@ -142,6 +141,6 @@ class CaptureStream:
         )
         return FrameFormatError(
             f"{self._name}: expected {self._format.name} {self._width}x{self._height}, "
-            f"{self._min_bytes} bytes or more, got {content} {self._bad} times in a row",
+            f"{self._min_bytes} bytes or more, got {content} {self._bad_count} times in a row",
             source=self._name,
         )

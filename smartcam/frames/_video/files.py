@@ -46,11 +46,11 @@ _PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
 _INDEPENDENT_PICTURES: Final = frozenset(
     {"mjpeg", "png", "rawvideo", "bmp", "jpeg2000", "ffv1", "huffyuv"}
 )
-"""Codecs with independent pictures, so damage does not spread."""
+"""Codecs whose pictures are independent, so a damaged picture does not affect later ones."""
 
 _STRICT_ABOUT_TAGS: Final = frozenset({"tiff"})
-"""Codecs that report unknown tags as damage in FFmpeg's strict mode. Even without that mode, they
-report cut pictures."""
+"""Codecs that report unknown tags as damage in FFmpeg's strict mode; other modes, too, report cut
+pictures."""
 
 FORMATS: Final = (
     "asf,avi,dv,flv,gif,h264,hevc,ivf,m4v,matroska,mjpeg,mov,mpeg,mpegts,mpegvideo,mpjpeg,mxf,nut,"
@@ -67,7 +67,7 @@ PROTOCOLS: Final = {
     "rtsp": "rtp,tcp,udp",
     "rtsps": "rtp,tcp,tls,udp",
 }
-"""Protocols that FFmpeg may use, by the URL's scheme; a proxy is from the environment."""
+"""Protocols that FFmpeg may use, by the URL's scheme; the environment may name a proxy."""
 
 REMOTE_PROTOCOLS: Final = "crypto,data,http,https,httpproxy,rtp,tcp,tls,udp"
 """Protocols that FFmpeg may use with ``elsewhere``, which excludes this machine's files."""
@@ -111,7 +111,8 @@ class ReadPicture(NamedTuple):
     Attributes:
         pixels: pixels of the picture.
         time: time stamp, seconds of the stream's clock; None: no time stamp.
-        arrived_at: time of arrival or earlier, seconds of ``time.monotonic()``.
+        arrived_at: time of arrival, or an earlier time if FFmpeg buffered the packet, seconds of
+            ``time.monotonic()``.
         lost: number of damaged pictures since the last one that was returned.
         is_device_time: whether ``time`` is from the camera's clock.
     """
@@ -177,7 +178,7 @@ class VideoReading(PictureReading):
         try:
             self._stream = self._first_stream()
             self._packets = self._container.demux(self._stream)
-            rate = self._stream.average_rate  # not readable after closing
+            rate = self._stream.average_rate  # cannot be read after closing
             self._rate = float(rate) if rate else None
             self._is_live = self.plan.is_network and self._container.duration is None
         except BaseException:
@@ -367,7 +368,7 @@ class VideoReading(PictureReading):
         """Return the error for a failure of FFmpeg, without its text, which has the password."""
         name, limit = self.plan.name, self.plan.timeout
         timed_out = self.plan.is_network and duration >= limit and isinstance(failure, ValueError)
-        if timed_out or isinstance(failure, load("av").ExitError):  # RTSP's own timeout
+        if timed_out or isinstance(failure, load("av").ExitError):  # the timeout of RTSP
             text = f"{name}: expected an answer, got none within {limit:g} s"
             return FrameSourceError(text, source=name)
         error_class = FrameFormatError if isinstance(failure, ValueError) else FrameSourceError

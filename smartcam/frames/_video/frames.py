@@ -43,7 +43,7 @@ _SAMPLES: Final = {
     "bayer_grbg16le": "BayerGR16",
 }
 _SUBSAMPLING: Final = {(2, 2): "420", (2, 1): "422", (1, 1): "444"}
-"""Names of chroma subsampling, by pixels along a row and rows with common U and V."""
+"""Names of chroma subsampling, by the numbers of columns and rows that share U and V."""
 
 _YUV: Final = {
     f"{prefix}{digits}p{suffix}": f"I{digits}{our_suffix}"
@@ -209,7 +209,7 @@ def _with_supported_subsampling(video: Any, depth: int, *, has_alpha: bool) -> A
 
 
 def _chroma_size(video: Any) -> tuple[float, float]:
-    """Return width and height of U and V before rounding, by the ratios in a large picture."""
+    """Return width and height of U and V without rounding, from the ratios in a large picture."""
     kind, side = video.format, 1 << 10
     return (
         video.width * kind.chroma_width(side) / side,

@@ -34,7 +34,7 @@ SCAN, MIN_SEGMENT = 0xDA, 0xC0
 """Marker of a scan, and the first marker of a segment."""
 
 AFTER_PICTURE: Final = (b"\r\n", b"--", b"\n-")
-"""First two bytes that may follow a picture: of a boundary."""
+"""First two bytes of a boundary, which may follow a picture."""
 
 MARKERS_WITHOUT_SEGMENT: Final = frozenset((0x01, *range(0xD0, 0xD8)))
 """Markers without a segment."""
@@ -104,7 +104,8 @@ class PictureCutter:
     def _find_end(self) -> int | None:
         """Return the end of the picture; None: the end has not come yet.
 
-        Negative: this is no picture, and the next picture may begin at the number without its sign.
+        A negative result means that this is no picture; its absolute value is where the next
+        picture may begin.
         """
         while (end := self._next_segment_end()) is not None:
             if self._length is not None and abs(end) > self._length and self._ends_at_length():
@@ -126,8 +127,8 @@ class PictureCutter:
     def _next_segment_end(self) -> int | None:
         """Return the end of the next segment; None: the end has not come yet.
 
-        Negative: there is no segment at the number without its sign. Encoded data after the header
-        of a scan are skipped.
+        A negative result means that there is no segment at its absolute value. Encoded data after
+        the header of a scan are skipped.
         """
         data, offset = self._data, self._searched_bytes
         if self._in_scan:

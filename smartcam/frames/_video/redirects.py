@@ -213,7 +213,7 @@ def _request_text(method: str, url: SplitResult, cseq: int, authorization: str) 
 def _read_answer(link: socket.socket, peer: str, deadline: float, *, is_http: bool) -> _Answer:
     """Read an answer, and skip its body if another answer may follow.
 
-    Like FFmpeg, it accepts lines that end with LF, or with several CRs.
+    Like FFmpeg, this function accepts lines that end with LF, or with several CRs before it.
     """
     head = bytearray()  # without carriage returns
     size = 0
@@ -233,7 +233,7 @@ def _read_answer(link: socket.socket, peer: str, deadline: float, *, is_http: bo
     answer = _Answer(int(status.partition(" ")[2][:3]), headers, peer)
     if not is_http:
         remaining = int(headers.get("content-length", ("0",))[0])
-        # the last piece also holds the begin of the body, with carriage returns
+        # the last piece also has the beginning of the body, with carriage returns
         lines_of_head = received.count(b"\n") - head.count(b"\n", end_of_head + 2)
         remaining -= len(received.split(b"\n", lines_of_head)[-1])
         while remaining > 0:

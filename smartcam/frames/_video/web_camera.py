@@ -217,5 +217,5 @@ def _size_in(picture: bytes) -> tuple[int, int] | None:
 
 
 def _needs_proxy(scheme: str, host: str) -> bool:
-    """Return True if the environment names a proxy for a host, which FFmpeg uses."""
+    """Return True if the environment names a proxy for a host; FFmpeg uses the proxy."""
     return bool(urllib.request.getproxies().get(scheme)) and not urllib.request.proxy_bypass(host)

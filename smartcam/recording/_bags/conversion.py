@@ -1,4 +1,4 @@
-"""Convert a recording to a bag: its results with the recorded values, or interpreted again."""
+"""Convert a recording to a rosbag2, with the recorded values or with results interpreted again."""
 
 from __future__ import annotations
 
@@ -152,9 +152,9 @@ class BagConversion:
     def _reader(self, camera: RecordedCamera) -> _ResultReader:
         if camera.dialect not in BVS.dialects and camera.protocol != "bvs":
             raise UnsupportedError(
-                f"bag: camera {camera.name!r} is one of {camera.protocol or 'no known protocol'} "
-                f"(dialect {camera.dialect}): only results of bvs can be read again; without "
-                "interpret_as and calibration the recorded values are taken"
+                f"bag: camera {camera.name!r} speaks {camera.protocol or 'no known protocol'} "
+                f"(dialect {camera.dialect}): only results of bvs can be interpreted again; "
+                "without interpret_as and calibration the recorded values are used"
             )
         y_down = camera.facts.get("y_down") == "True" if self.y_down is None else self.y_down
         spec = self._spec(camera)

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 _DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
 
 _MAX_CONTAINERS = 64
-"""Largest number of containers that are kept until their results come: many come in one burst."""
+"""Largest number of containers kept until their results come; many containers may come at once."""
 
 UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
 """Errors of containers that could not be interpreted."""
@@ -72,7 +72,7 @@ class BagCounts(NamedTuple):
         messages: all messages.
         results: results, each on the topic ``results``, also results that could not be interpreted.
         unread: results that could not be interpreted; their messages have the error.
-        localizations: results that are localizations, which are on two more topics.
+        localizations: results that are localizations; each is also on two more topics.
         errors: other errors, on ``/diagnostics``.
     """
 
@@ -92,9 +92,10 @@ class BagMessage(NamedTuple):
 
 
 class ReadResult(NamedTuple):
-    """A result as it is written to the bag; ``error``: why it could not be interpreted, or "".
+    """A result as it is written to the bag.
 
-    ``was_reinterpreted``: it was interpreted again, so an earlier error does not count.
+    ``error`` says why the result could not be interpreted, or is "". ``was_reinterpreted`` is True
+    if the result was interpreted again, so that a recorded error does not count.
     """
 
     result: Result
@@ -320,7 +321,7 @@ def parts_from_json(value: object) -> list[Localization] | None:
 def _part(fields: Mapping[str, Any]) -> Localization:
     """Return a localization from JSON; raise if it is not valid."""
     if set(fields) != set(Localization._fields):
-        raise ValueError("these are not its fields")
+        raise ValueError("these are not the fields of a localization")
     pose, feature, photo = fields["pose"], fields["feature_id"], fields["photo_index"]
     header = pose["header"]
     if not (isinstance(feature, str) and isinstance(header["frame_id"], str)):

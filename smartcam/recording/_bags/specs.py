@@ -1,4 +1,4 @@
-"""Find out from recorded facts how results were interpreted: whether they are poses in metres."""
+"""Find out from recorded facts whether results were interpreted as poses in metres."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RecordedInterpreters:
         self._with_parts: set[int] = set()  # applications that had localizations
 
     def localizations(self, result: Result) -> list[Localization] | None:
-        """Return a result's localizations in metres; None if it has none, or in pixels.
+        """Return a result's localizations in metres; None without any, or if they are in pixels.
 
         An empty list counts as localizations if its application had some.
         """

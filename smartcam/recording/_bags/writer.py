@@ -1,10 +1,10 @@
-"""A rosbag2: a folder with an MCAP file of ROS 2 messages and a ``metadata.yaml`` about it.
+"""Write a rosbag2: a folder with an MCAP file of ROS 2 messages, described by ``metadata.yaml``.
 
-The contents of both are as in rosbag2: ``mcap_storage.cpp`` of rosbag2_storage_mcap
+The contents of both files are as in rosbag2: ``mcap_storage.cpp`` of rosbag2_storage_mcap
 (profile ``ros2``, schemas ``ros2msg``, ``offered_qos_profiles`` and ``topic_type_hash`` with each
 channel, a metadata record ``rosbag2``), ``yaml.hpp`` and ``qos.cpp`` of rosbag2_storage (the rest).
-The format is version 8, with the policies as numbers in a text: version 9 has their names in a
-list, which ROS 2 Humble does not read.
+The format is version 8, with the QoS policies as numbers in a text. Version 9 has the policies'
+names in a list, which ROS 2 Humble does not read.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ def _create_folder(folder: Path, label: str, *, overwrite: bool) -> bool:
         other = [path.name for path in folder.iterdir() if not _is_of_bag(folder, path)]
         if other:
             raise ConfigurationError(
-                f"{label}: the folder holds {other[0]!r:.80}, which is no part of a bag: it is "
-                "left as it is"
+                f"{label}: the folder holds {other[0]!r:.80}, which is no part of a bag: the "
+                "folder is left unchanged"
             ) from exc
         return False
     return True

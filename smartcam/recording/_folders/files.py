@@ -35,7 +35,7 @@ class Limits(NamedTuple):
 
     Attributes:
         size: bytes of a file at which it ends.
-        age: seconds of a file at which it ends.
+        age: age of a file, seconds, at which it ends.
         keep: largest number of bytes of all files.
     """
 
@@ -121,11 +121,11 @@ class FolderFiles:
         except BaseException as exc:  # noqa: BLE001 - an interpreter may raise anything
             track.count_one_lost(f"unexpected {exc!r}")
             return 0
-        track.extra_records += len(items) - 1  # an uninterpretable result makes an error, too
+        track.extra_records += len(items) - 1  # a bad result makes an error, too
         for item in items:
             try:
                 file.add(item)
-            except FrameFormatError as exc:  # an OSError, but not the disk's
+            except FrameFormatError as exc:  # an OSError, but not from the disk
                 track.count_one_lost(str(exc))
             except OSError:
                 raise
@@ -210,7 +210,7 @@ class FolderFiles:
     # ------------------------------------------------------------------ the bound on the disk
 
     def delete_old(self, tracks: Sequence[CameraTrack]) -> None:
-        """Delete the oldest files until the rest is within the bound."""
+        """Delete the oldest files until all files together are within ``keep``."""
         folder = self._folder
         while folder.total_bytes > self._limits.keep:
             old_files = [
@@ -221,7 +221,7 @@ class FolderFiles:
             oldest = min(old_files)
             for track in tracks:
                 if track.file is not None and track.file.path.name == oldest.name:
-                    self.finish(track)  # the camera's next record begins a new one
+                    self.finish(track)  # the camera's next record begins a new file
             try:
                 folder.delete(oldest.name)
             except OSError as exc:

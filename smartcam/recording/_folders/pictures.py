@@ -69,14 +69,14 @@ class FleetPictures:
             self._put_matched(track, matcher)
 
     def add_reported(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
-        """Record the picture of a result, of which the camera says that it belongs to it."""
+        """Record a picture that the camera itself sent as the result's picture."""
         link = 0, result.number, result.received_at
         self._put(track, RecordedPicture(track.camera, captured_at(frame), frame, *link))
 
     async def stop(self) -> None:
         """Record no more pictures.
 
-        Cancellation: takes effect when the tasks have ended, which takes no waiting.
+        Cancellation: takes effect when the tasks have ended, which happens at once.
         """
         tasks = [*self._tasks.values()]
         self._tasks.clear()
@@ -86,7 +86,7 @@ class FleetPictures:
             await asyncio.wait(tasks)
 
     async def _record(self, track: CameraTrack) -> None:
-        """Record while the agent has the camera and pictures of it."""
+        """Record as long as the agent has the camera and the camera has pictures."""
         delays, logged = RETRY.delays(), ""
         while True:
             host = self._server.hosts.get(track.camera)
@@ -151,7 +151,7 @@ class FleetPictures:
         )
 
     def _report(self, track: CameraTrack, reason: str) -> None:
-        """Report in the log and in the recording that a camera's pictures do not come."""
+        """Report in the log and in the recording why a camera's pictures are not recorded."""
         logger.warning("%s ! its pictures are not recorded: %s", track.camera, reason)
         text = f"its pictures are not recorded: {reason}"
         error = RecordedError(track.camera, datetime.now(UTC), "FrameSourceError", text, None)

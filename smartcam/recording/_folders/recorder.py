@@ -1,4 +1,4 @@
-"""Record the sessions of an agent into a folder."""
+"""Record the cameras of an agent (the process that shares a fleet) into a folder."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ class FleetRecorder(Server):
         async with FleetRecorder(server), server:
             ...
 
-    Start it before the server, and stop it after the server. The disk never delays the agent: if it
-    is full, missing or too slow, records are left out and counted in :attr:`accounts` and in the
-    files; it is tried again until it works.
+    Start the recorder before the server, and stop it after the server. The disk never delays the
+    agent: if the disk is full, missing or too slow, records are left out and counted in
+    :attr:`accounts` and in the files, and the disk is tried again until it works.
 
     Args:
         server: server whose cameras are recorded; not started yet.
-        section: settings of the recording; default: ``record`` of the server's file.
+        section: settings of the recording; default: ``record`` in the server's fleet file.
         on_trouble: function that is called in the event loop with the error when nothing can be
             written, and with None when it can again.
 
@@ -65,7 +65,7 @@ class FleetRecorder(Server):
         path: the folder.
 
     Raises:
-        ConfigurationError: neither the file has ``record`` nor is ``section`` given.
+        ConfigurationError: ``section`` is not given, and the fleet file has no ``record``.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class FleetRecorder(Server):
     async def start(self) -> None:
         """Start the thread that writes the folder.
 
-        A folder that cannot be created, or written, is no error: it is tried again.
+        A folder that cannot be created or written is no error: the recorder tries again.
 
         Raises:
             ConfigurationError: another recorder writes the folder, or the server was started.
@@ -142,7 +142,7 @@ class FleetRecorder(Server):
         return FleetPictures(self._server, writer, records_all=self.section.pictures == "all")
 
     async def stop(self) -> None:
-        """Write waiting records and end the files; 30 s at most, usually some milliseconds.
+        """Write waiting records and end the files, which takes some milliseconds, at most 30 s.
 
         Cancellation: the thread still finishes.
         """

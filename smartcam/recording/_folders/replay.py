@@ -44,7 +44,7 @@ class FleetReplay(Server):
             recording.
 
     Attributes:
-        skipped: reasons why cameras are not replayed, by name: there was no session, or the make
+        skipped: reason why a camera is not replayed, by its name: it had no session, or its make
             has no emulated camera.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The recording of one camera of an agent: its account, its file, and its gaps."""
+"""Keep the counts, file and gaps of the recording of one of an agent's cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class RecordingAccount(NamedTuple):
-    """The account of a camera's records: frames, results, events and errors together.
+    """Counts of a camera's records: frames, results, events, errors and pictures together.
 
     Attributes:
         written: records on the disk.
@@ -37,9 +37,9 @@ class Gap:
     """Records that were not written.
 
     Attributes:
-        since: time of the first record.
-        until: time of the last record.
-        count: number of records.
+        since: time of the first record that was not written.
+        until: time of the last record that was not written.
+        count: number of records that were not written.
         reason: cause of the gap, as text.
         events: last event of each kind among the records, in order.
     """
@@ -64,22 +64,23 @@ class CameraTrack:
 
     Args:
         camera: name of the camera.
-        make_items: function that makes items of an entry; called in the writer's thread.
+        make_items: function that makes the items of an entry, an object that waits for the disk;
+            called in the writer's thread.
 
     Attributes:
         endian: byte order of the last status.
-        offered: records so far.
-        left_out: offered records for which there was no room to wait.
+        offered: entries so far.
+        left_out: entries that were left out: too much waited for the disk, or they were too large.
         written: records on the disk.
-        lost: waiting records that could not be written.
-        overflow: the growing gap of records that are left out; None if none are.
+        lost: records that waited and could not be written.
+        overflow: gap that grows while entries are left out; None if none are left out now.
     """
 
     def __init__(self, camera: str, make_items: Callable[[Any], Iterator[Item]]) -> None:
         self.camera = camera
         self.make_items = make_items
         self.offered = self.left_out = 0  # counted in the threads that offer records
-        # counted in the writer's thread; `extra_records`: records beyond one of each entry
+        # counted in the writer's thread; `extra_records`: records in addition to one for each entry
         self.written = self.lost = self.extra_records = 0
         self.overflow: Gap | None = None
         self.state = RecordedState(camera)
@@ -93,7 +94,7 @@ class CameraTrack:
 
     @property
     def account(self) -> RecordingAccount:
-        """Account of the camera's records."""
+        """Counts of the camera's records."""
         written, lost = self.written, self.lost + self.left_out
         return RecordingAccount(written, self.offered + self.extra_records - written - lost, lost)
 
@@ -103,7 +104,7 @@ class CameraTrack:
             if isinstance(entry, Description):
                 self.facts |= entry.facts
             elif isinstance(entry, Gap):
-                self._extend_gap(entry)  # its records are already counted
+                self._extend_gap(entry)  # the gap's records are already counted
                 self.update_state_from_gap(entry)
             else:
                 self.update_state(entry)
@@ -116,7 +117,7 @@ class CameraTrack:
         self._extend_gap(Gap(at, at, 1, reason))
 
     def update_state(self, entry: object) -> None:
-        """Update the camera's state and address from an entry, if that is an event."""
+        """Update the camera's state and address from an entry, if the entry is an event."""
         if isinstance(entry, CameraEvent):
             self.state = self.state.after(entry)
         if isinstance(entry, (Connected, Reconnected)):

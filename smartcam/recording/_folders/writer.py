@@ -2,7 +2,7 @@
 
 Records are put into one bounded list; the thread takes the list twice a second and writes each
 camera's records to the disk. Records that cannot be written are counted for each camera, and
-reported in its files as soon as one can be written.
+reported in the camera's files as soon as the disk works again.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
 """Seconds until a disk that failed is tried again; the last delay is repeated."""
 
 EVENT_ROOM_FACTOR = 2
-"""Factor by which more may wait before events are left out, since these have the camera's state."""
+"""Events may wait until this multiple of the limit for other records, since they have the state."""
 
 
 @dataclass(eq=False)
@@ -116,7 +116,7 @@ class FolderWriter:
 
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
-        """Accounts of each camera's records."""
+        """Counts of each camera's records, by the camera's name."""
         with self._condition:
             return {name: track.account for name, track in self._tracks.items()}
 
@@ -144,7 +144,7 @@ class FolderWriter:
         Args:
             track: track of the camera that the entry is about.
             entry: object that ``make_items`` of the track makes items of.
-            size: bytes that the entry counts for while waiting; below 0: it is too large.
+            size: bytes for which the entry counts while it waits; below 0: the entry is too large.
             event: whether the entry is an event; events have more room to wait.
         """
         with self._condition:
@@ -191,7 +191,7 @@ class FolderWriter:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write waiting records and end the files; blocks, with a bound. Idempotent."""
+        """Write waiting records and end the files; blocks for at most 30 s. Idempotent."""
         with self._condition:
             self._is_closing = True
             self._condition.notify()
@@ -257,10 +257,10 @@ class FolderWriter:
                 track.count_lost(entries, trouble.reason)
 
     def _should_try(self, batches: dict[CameraTrack, list[Any]]) -> bool:
-        """Return True if the disk should be tried; after a failure, check its free room first.
+        """Return True if the disk should be tried now; check its free space after it was full.
 
         Raises:
-            ConfigurationError: another recorder has the folder now.
+            ConfigurationError: another recorder writes in the folder now.
             OSError: the folder does not exist, or there is no room.
         """
         trouble, now = self._trouble, self._clock()
@@ -290,12 +290,12 @@ class FolderWriter:
         retry_at = self._clock() + RETRY_DELAYS[min(failed_retries, len(RETRY_DELAYS) - 1)]
         self._trouble = _Trouble(failure, reason, disk_was_full, retry_at, failed_retries)
         if before is None:
-            logger.warning("%s; nothing is recorded until it is better", failure)
+            logger.warning("%s; nothing is recorded until the disk works again", failure)
             self._report(failure)
 
     def _report_recovery(self) -> None:
         """Report that the disk works again, if it had failed."""
         if self._trouble is not None:
             self._trouble = None
-            logger.warning("recordings %s: recorded again", self._folder.path)
+            logger.warning("recordings %s: records are written again", self._folder.path)
             self._report(None)

@@ -16,7 +16,7 @@ Value = TypeVar("Value")
 
 
 class LastBodies(Generic[Key, Value]):
-    """The numbers and data of a file's last frames with data.
+    """Values of a file's last frames that have data, by keys.
 
     A writer looks up the number of a frame by its data, a reader the data by the number. Both keep
     the same frames, so the reader finds each frame that the writer found.

@@ -42,8 +42,8 @@ FORMAT = "3"
 """Version of the format that is written."""
 
 FORMATS = ("1", "2", FORMAT)
-"""Versions of the format that are read; others are refused. In 1 a frame's body repeats the
-frame's end; in 1 and 2 a result repeats the bytes of its frame."""
+"""Versions of the format that are read; others are refused. In version 1 the field ``data`` of a
+frame's body repeats the end of the frame; in 1 and 2 a result repeats the bytes of its frame."""
 
 PROFILE = "x-smartcam"
 """Profile in the file's header."""
@@ -70,7 +70,7 @@ MAX_VALUES = 3_000_000
 object of a hundred times its size. A container of 1 MiB with one field per byte has two million."""
 
 MAX_CAMERAS = 10_000
-"""Largest number of cameras in a file: their facts are kept while it is read."""
+"""Largest number of cameras in a file: the facts about all cameras are kept while it is read."""
 
 MAX_NAME_CHARACTERS = 1000
 """Largest number of characters of a camera's name: a client allows 200, and HOST:PORT has fewer
@@ -90,7 +90,8 @@ class RecordedError(NamedTuple):
         at: time of the error, UTC.
         error: name of the exception's class.
         text: text of the error.
-        triggered_at: time of the call of ``trigger()``, UTC; None if no trigger ended with it.
+        triggered_at: time of the call of ``trigger()`` that ended with the error, UTC; None if the
+            error ended no trigger.
         since: time of the first record that was not written, UTC, if ``error`` is
             ``RecordingGap``; ``at`` is the time of the last record. None for other errors.
         records: number of records in a gap that were not written. None for other errors.
@@ -112,10 +113,12 @@ class RecordedPicture(NamedTuple):
         camera: name of the camera.
         at: time of the capture, UTC.
         frame: the :class:`~smartcam.frames.Frame`.
-        left_out: earlier pictures that were not written, since too much waited for the disk.
+        left_out: number of pictures right before this one that were not written, since too much
+            waited for the disk.
         result_number: :attr:`~smartcam.Result.number` of the picture's result; None if it is not
             known.
-        result_received_at: time of that result, UTC, since each client counts its results from 1.
+        result_received_at: arrival of that result, UTC; the number alone is not unique, since each
+            client counts its results from 1.
     """
 
     camera: str
@@ -142,7 +145,7 @@ class MessageKind(NamedTuple):
     schema: str  # name of the schema
     description: str  # description in the schema
     properties: Mapping[str, Any]  # properties in the schema, by field
-    required: tuple[str, ...]  # fields that are always there
+    required: tuple[str, ...]  # fields that are always present
     to_text: Callable[..., str]  # function that makes an item's message, in ASCII
     # function that makes the item of a JSON object, or raises any exception
     from_json: Callable[[dict[str, Any]], Item]
@@ -278,7 +281,7 @@ def _required_field(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
     """
     value = optional_field(fields, name, kind)
     if value is None:
-        raise ValueError(f"{name}: nothing is there, expected {kind.__name__}")
+        raise ValueError(f"{name}: the field is missing, expected {kind.__name__}")
     return value
 
 

@@ -1,8 +1,8 @@
-"""Frames and results as JSON, with fast code, since a recording consists mostly of them.
+"""Write frames and results as JSON quickly, since most records are frames or results.
 
 The text is that of ``json.dumps(jsonable(item))`` without white space and without fields that are
-None. Bytes are written only once (:func:`frame_text`, :func:`result_text`). Values of types that a
-client does not make are converted by ``jsonable`` and ``json.dumps``.
+None. Bytes are written only once (:func:`frame_text`, :func:`result_text`). Values of types that no
+client makes are converted by ``jsonable`` and ``json.dumps``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.observers import RawFrame
 
 MAX_CACHED_FRAME_TEXTS = 256
-"""Largest number of cached texts of frames, which are without time and data."""
+"""Largest number of cached texts of frames; a cached text lacks the frame's time and data."""
 
 VALUE_IS_RAW = '"raw"'
 

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 MAX_RECORD_BYTES = 1 << 28
-"""Largest number of bytes of one record of a file: smartcam's have about 1 MiB, a damaged length
-may be anything."""
+"""Largest number of bytes of one record of a file. smartcam's records have about 1 MiB; a damaged
+length may be any number."""
 
 MAX_CHUNK_BYTES = MAX_MESSAGE_BYTES + (1 << 21)
 """Largest number of bytes to which a chunk may unpack. A recorder ends its chunk after 1 MiB, so
-the largest has one message more; 2 kB of zstd can claim as much as this."""
+the largest chunk has 1 MiB and one more message. 2 kB of zstd can unpack to as much as this."""
 
 MAX_FACTS_BYTES = 1 << 20
 """Largest number of bytes of a schema, a channel or a metadata record: smartcam's have 2 kB."""
@@ -38,8 +38,8 @@ MIN_UNPACKED_BYTES = 1 << 29
 """Number of bytes to which the chunks of every file may unpack together: seconds of work."""
 
 UNPACKED_PER_BYTE = 10_000
-"""Number of bytes to which a larger file may unpack for each of its own. Containers of zeros reach
-6,000; a decompression bomb 30,000."""
+"""Number of bytes to which a larger file may unpack for each byte of the file. Containers of zeros
+reach 6,000; a decompression bomb reaches 30,000."""
 
 PIECE_BYTES = 1 << 18
 """Number of bytes that are read or inflated at once."""
@@ -74,7 +74,7 @@ class Channel(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """A message, its channel and its number there; ``data`` is a view of the chunk."""
+    """A message with its channel and its number in the channel; ``data`` is a view of the chunk."""
 
     channel_id: int
     sequence: int
@@ -82,7 +82,7 @@ class McapMessage(NamedTuple):
 
 
 class Metadata(NamedTuple):
-    """Facts under a name."""
+    """A metadata record: texts by their keys, under a name."""
 
     name: str
     facts: dict[str, str]
@@ -133,9 +133,9 @@ class RecordReader:
             elif opcode == _STATISTICS:
                 expected = _FieldReader(memoryview(self._read(_checked_length(length)))).number(8)
                 if expected != self._message_count:
-                    raise ValueError(f"of {expected} messages {self._message_count} are there")
+                    raise ValueError(f"{self._message_count} of {expected} messages are there")
             elif opcode == _NONE:
-                raise ValueError("a record of the kind 0, which there is not")
+                raise ValueError("a record of the kind 0, which does not exist")
             elif opcode == _METADATA:
                 yield _metadata(_FieldReader(memoryview(self._read(_checked_length(length)))))
             elif opcode in _PARSERS:
@@ -224,7 +224,7 @@ class RecordReader:
             raise ValueError(f"{magic.hex(' ')} is not MCAP's magic, {MAGIC.hex(' ')}")
 
     def _read(self, size: int) -> bytes:
-        """Return the next bytes; memory is allocated as they come: the length may be wrong."""
+        """Return the next bytes; allocate memory as they come, since the size may be wrong."""
         if size <= PIECE_BYTES:
             return self._read_piece(size)
         data = bytearray()
@@ -269,7 +269,7 @@ class _FieldReader:
         return int.from_bytes(self.read(size), "little")
 
     def text(self) -> str:
-        """Return the next text, which its length precedes."""
+        """Return the next text, which follows its length."""
         return str(self.read(self.number(4)), "utf-8")
 
 

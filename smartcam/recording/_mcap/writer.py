@@ -1,7 +1,7 @@
 """Write MCAP: chunks of messages compressed by zstd, their indexes, and the summary at the end.
 
-The bytes are those of the mcap library's ``Writer`` for the same calls, in a fifth of its time per
-message, which is most of the cost of a small message.
+The bytes are those of the mcap library's ``Writer`` for the same calls. This writer takes a fifth
+of the library's time per message, which is most of the cost of a small message.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ZSTD = "zstd"
 class McapWriter:
     """Writes a file from its beginning to its end, in one thread.
 
-    After an error nothing more may be written: the file could not be read.
+    After an error nothing more may be written, since the file could then not be read.
 
     Args:
         stream: the file, open.

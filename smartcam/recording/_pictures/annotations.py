@@ -1,8 +1,8 @@
 """The marks of a picture as Foxglove's message ``foxglove.ImageAnnotations``.
 
-A viewer draws them over the picture. Fields with numbers from 100 on are smartcam's, and are in the
-file's schema: with them a mark is read exactly as it was written. Foxglove counts pixels from
-the upper left corner of the upper left pixel, smartcam from its centre.
+A viewer draws the marks over the picture. Fields with numbers from 100 on are smartcam's, and
+are in the file's schema. With these fields a mark is read exactly as it was written. Foxglove
+counts pixels from the upper left corner of the upper left pixel, smartcam from its centre.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
         drawings[_mark_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
     for annotation in lists.get("texts", ()):
         values = parse_message(_MESSAGES["TextAnnotation"], annotation, 100)
-        if "place" in values:  # others are the words of points
+        if "place" in values:  # texts without a place are the words beside points
             point = _coordinates(values.get("position", memoryview(b"")))
             text = _text(values, "text")
             drawings[_mark_number(values)] = Drawing("text", (point,), _role(values), text)
@@ -164,7 +164,7 @@ def _coordinates(data: memoryview) -> tuple[float, float]:
 
 
 def _colour(role: Role | None) -> bytes:
-    """Return the colour of a role; without a role, a transparent black for the background."""
+    """Return the colour of a role; without a role transparent black, as for a background."""
     red, green, blue = (0, 0, 0) if role is None else COLOURS[role]
     opacity = 0.5 if role is None else 1.0
     values = {"r": red / 255, "g": green / 255, "b": blue / 255, "a": opacity}

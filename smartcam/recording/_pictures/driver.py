@@ -1,4 +1,4 @@
-"""A source of frames that replays a recording's pictures, with their times and gaps."""
+"""Replay a recording's pictures as a source of frames, with their times and gaps."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_DELAY: Final = 0.5
-"""Seconds by which a picture may be late before later ones are delayed as well."""
+"""Largest delay of a picture, seconds, that later pictures catch up; longer delays shift them."""
 
 MAX_LOOKAHEAD: Final = 100
 """Number of items after the first picture that are searched for pictures of other cameras."""
@@ -48,17 +48,17 @@ class RecordedDriver(TaskDriver):
     Parameters follow after ``#``: ``run.mcap#camera=left&pace=none``.
 
     ========== ====================================================================================
-    ``camera`` name of the camera in the recording; needed where several have pictures
+    ``camera`` name of the camera in the recording; needed if several cameras have pictures
     ``pace``   ``real`` (default): with the recorded times between pictures; or ``none``: each
-               picture when the readers have taken the last one, and none is skipped
-    ``speed``  times faster than recorded, 0.001 to 1000; default 1
-    ``name``   of the source; default: that of the camera
+               picture as soon as the readers have taken the last one, without skips
+    ``speed``  factor by which to replay faster than recorded, 0.001 to 1000; default 1
+    ``name``   name of the source; default: the name of the camera
     ========== ====================================================================================
 
     A frame has the recorded bytes, number, ``utc``, ``device_time``, ``moment`` and ``duration``;
-    ``lost`` counts frames that were lost or not recorded before it. Only ``captured`` is a time of
-    the replay, on ``time.monotonic()``, with the recorded intervals. If a recording is silent for
-    longer than a source allows, open the source with ``stall=None``.
+    ``lost`` counts frames right before it that were lost or not recorded. Only ``captured`` is a
+    time of the replay, on ``time.monotonic()``, with the recorded intervals. If a recording is
+    silent for longer than a source allows, open the source with ``stall=None``.
     """
 
     times_frames: ClassVar[bool] = True
@@ -84,7 +84,7 @@ class RecordedDriver(TaskDriver):
 
     @property
     def name(self) -> str:
-        """The name in the URL, or of the camera; the path before the driver is opened."""
+        """The name in the URL, or the camera's name; without both, before opening, the path."""
         return self._given_name or self._camera or str(self._path)
 
     async def open(self) -> StreamFormat:
@@ -119,16 +119,16 @@ class RecordedDriver(TaskDriver):
         if self._camera is None and len(cameras) > 1:
             raise self._several_cameras_error(cameras)
         if first is None:
-            cameras_text = f"; those of {', '.join(cameras)} are" if cameras else ""
+            cameras_text = f"; it has pictures of {', '.join(cameras)}" if cameras else ""
             whose = f" of camera {self._camera!r}" if self._camera is not None else ""
             raise FrameFormatError(
-                f"{self._path}: no picture{whose} is in it{cameras_text}", source=self.name
+                f"{self._path}: it has no picture{whose}{cameras_text}", source=self.name
             )
         return first
 
     def _several_cameras_error(self, cameras: dict[str, None]) -> FrameFormatError:
         return FrameFormatError(
-            f"{self._path}: there are pictures of {', '.join(cameras)}: choose one, such as "
+            f"{self._path}: it has pictures of {', '.join(cameras)}: choose a camera, such as "
             f"{self._path}#camera={next(iter(cameras))}",
             source=self.name,
             available=tuple(cameras),
@@ -200,4 +200,4 @@ def _seconds_between(last: Frame, frame: Frame) -> float:
 
 def _retrieve_exception(done: asyncio.Future[RecordedPicture | None]) -> None:
     if not done.cancelled():
-        done.exception()  # the caller may no longer wait
+        done.exception()  # mark the error as retrieved: the caller may be cancelled

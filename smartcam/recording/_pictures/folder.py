@@ -1,4 +1,4 @@
-"""Record pictures into consecutive files, of which the oldest are deleted."""
+"""Record pictures into consecutive files in a folder, and delete the oldest files."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class RotatingRecorder:
             async with smartcam.frames.open(url) as source:
                 await folder.record(source)
 
-    Each camera has files of its own, such as ``left_20260102T030405.678Z.mcap``. If the disk is
+    Each camera has separate files, such as ``left_20260102T030405.678Z.mcap``. If the disk is
     full, slow or missing, pictures are lost, and counted in the files; when it works again, the
     recording goes on.
 
     Args:
         path: the folder; created if it does not exist.
-        size: bytes of a file, after which the next one begins.
-        age: seconds of a file, after which the next one begins.
+        size: number of bytes after which a file ends and the next one begins.
+        age: number of seconds after which a file ends and the next one begins.
         keep: bytes of all files together, beyond which the oldest recordings are deleted.
         on_trouble: function that is called in the writer's thread with the error when nothing can
             be written, and with None when it can again.
@@ -114,7 +114,7 @@ class RotatingRecorder:
 
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
-        """Accounts of each camera's pictures: written, waiting and lost."""
+        """Counts of each camera's pictures: written, waiting and lost."""
         return {} if self._writer is None else self._writer.accounts
 
     @property
@@ -151,7 +151,7 @@ class RotatingRecorder:
             if FileName.parse(str(example)) is None:
                 raise ConfigurationError(
                     f"recordings {self.path}: camera {name!r:.60}: expected a name of small "
-                    "letters, digits, _ and -, which the files have in theirs"
+                    "letters, digits, _ and -, since the files' names contain it"
                 )
             track = self._tracks[name] = self._writer.new_track(name, _single_item)
         size = memoryview(frame.data).nbytes
@@ -173,7 +173,7 @@ class RotatingRecorder:
         return await record_frames(source, self, camera, count, on_start)
 
     async def wait_failed(self) -> RecordingError:
-        """Wait forever: errors of the disk do not end such a recording.
+        """Wait forever, since errors of the disk do not end a recording into a folder.
 
         Cancellation: safe.
         """

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def frame_of_image(camera: str, image: bytes, result: Result[Any] | None) -> Frame:
-    """Return the frame of a bitmap, which was captured before now, and after its result's trigger.
+    """Return the frame of a bitmap that was captured between its result's trigger and now.
 
     Raises:
         FrameFormatError: the file is no bitmap.

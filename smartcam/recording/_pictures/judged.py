@@ -32,7 +32,7 @@ LAST_PICTURE_TIMEOUT: Final = 2.0
 class JudgedPictures(Observer):
     """Adds the picture of each result to a recording, if it can be found by its time.
 
-    It observes the camera whose results are recorded; its pictures come from a source of frames.
+    This observer gets the results of a camera; the camera's pictures come from a source of frames.
 
     Args:
         recorder: recorder that keeps the pictures.

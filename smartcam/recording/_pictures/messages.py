@@ -57,7 +57,7 @@ _ENCODINGS: Final = {
     "YUV422_8": "yuyv",
     "YUV422_8_UYVY": "uyvy",
 }
-"""Foxglove's encodings, by smartcam's formats; others have the name of the format itself."""
+"""Foxglove's encodings, by smartcam's formats; the encoding of another format is its name."""
 
 _COMPRESSIONS: Final = {"MJPEG": "jpeg", "PNG": "png", "JPEGXL": "jxl", "H264": "h264"}
 
@@ -228,7 +228,7 @@ def picture_of(
         schema: name of the message.
         data: bytes of the message.
         number: number of the last message of annotations; 0: there was none.
-        drawings: marks in that message, which the picture gets if it names it.
+        drawings: marks in that message; the picture gets the marks if it names this number.
 
     Raises:
         ValueError: the message is not valid, or lacks a field of its format.

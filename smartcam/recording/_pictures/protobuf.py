@@ -59,7 +59,7 @@ def encode_message(fields: Fields, values: Mapping[str, Any]) -> bytes:
 
 
 def encode_field(field: WireField, value: Any) -> bytes:
-    """Return a field with its value; of a repeated field with each of the values in a list."""
+    """Return a field with its value; a repeated field once for each value in a list."""
     if field.repeated and isinstance(value, list):
         return b"".join(encode_field(field, item) for item in value)
     if field.type == "double":
@@ -79,7 +79,7 @@ def encode_timestamp(utc: float) -> bytes:
 
 
 def length_delimited(number: int, data: bytes) -> bytes:
-    """Return a field of bytes, before which their number stands."""
+    """Return a field of bytes, preceded by the number of bytes."""
     return tag(number, BYTES) + varint(len(data)) + data
 
 
@@ -105,7 +105,7 @@ def parse_message(fields: Fields, data: memoryview, most: int) -> dict[str, Any]
     """Return the values of a message's known fields; a repeated field has a list of them.
 
     Args:
-        fields: the known fields; others are passed over.
+        fields: the known fields; other fields are skipped.
         data: bytes of the message.
         most: largest number of fields that the message may have.
 

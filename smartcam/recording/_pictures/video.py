@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
 
 TICK_DURATION: Final = Fraction(1, 1000)
-"""Step of a Matroska file's times as FFmpeg writes them, seconds."""
+"""Resolution, seconds, of the times that FFmpeg writes into a Matroska file."""
 
 OPTIONS: Final = {"cluster_time_limit": "500", "flush_packets": "1"}
-"""Options for FFmpeg, by which a crash loses only the last cluster, half a second."""
+"""Options for FFmpeg with which a crash loses only the last cluster, half a second."""
 
 
 def check_writable(frame: Frame) -> None:
@@ -149,7 +149,7 @@ class VideoFile:
         video.time_base = TICK_DURATION
         video.codec_context.time_base = TICK_DURATION
         if is_jpeg:
-            video.pix_fmt = "yuvj420p"  # nothing is encoded: the JPEGs have these values themselves
+            video.pix_fmt = "yuvj420p"  # the JPEGs are not encoded again, and have this format
         else:
             video.pix_fmt = to_lossless_video(frame).format.name
             video.codec_context.color_range, video.codec_context.colorspace = colour_properties(

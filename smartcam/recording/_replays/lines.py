@@ -1,10 +1,11 @@
-"""Emulate a recorded camera whose protocol has lines: each line gets its recorded answer.
+"""Emulate a recorded camera whose protocol consists of lines: send the recorded answers.
 
-The n-th trigger gets the answer of the n-th recorded one, byte for byte and after the same time; a
-trigger after the last one gets no answer. Every other line gets the camera's answer at the same
-moment of the recording: before the first trigger, during the n-th one, or after its answer. So a
-client that sends a line more or less often than the recorded one gets the state that belongs to
-the trigger. A line that was not recorded ends the connection, since its answer is unknown.
+The n-th trigger gets the answer of the n-th recorded trigger, byte for byte and after the same
+time; a trigger after the last recorded one gets no answer. Every other line gets the answer from
+the same moment of the recording: before the first trigger, during the n-th one, or after its
+answer. So a client that sends a line more or less often than the recorded client gets the state
+that belongs to the trigger. A line that was not recorded ends the connection, since its
+answer is unknown.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class LineAnswers:
 
     Attributes:
         answers: the answers.
-        moments: the moment of each: 0 before the first trigger, 2n - 1 during the n-th one, 2n
-            after its answer.
+        moments: moment of each answer: 0 before the first trigger, 2n - 1 during the n-th trigger,
+            2n after its answer.
         next_index: index of the next answer, if they are played in order.
         asked_count: number of times that the line was sent during ``asked_moment``.
         asked_moment: moment that ``asked_count`` belongs to.
@@ -68,7 +69,7 @@ class LineAnswers:
         return max(0, len(self.answers) - self.next_index)
 
     def next_answer(self, *, loop: bool) -> list[TimedLine]:
-        """Return the next answer; after the last one the last again, or with ``loop`` the first."""
+        """Return the next answer; at the end repeat the last one, or with ``loop`` begin again."""
         if loop and self.next_index >= len(self.answers):
             self.next_index = 0
         answer = self.answers[min(self.next_index, len(self.answers) - 1)]
@@ -76,10 +77,10 @@ class LineAnswers:
         return answer
 
     def next_answer_at(self, moment: int) -> list[TimedLine]:
-        """Return the next answer of a moment; after its last one the last again.
+        """Return the next answer of a moment; at the end repeat the last one.
 
-        Without an answer at the moment, use the nearest moment of the same kind, earlier ones
-        first: before and after triggers are one kind, during triggers is the other.
+        Without an answer at the moment, use the nearest moment of the same kind, and prefer earlier
+        ones. Moments between triggers are one kind, moments during triggers the other.
         """
         if moment != self.asked_moment:
             self.asked_count, self.asked_moment = 0, moment
@@ -131,7 +132,7 @@ class _AskedLine:
 
 
 def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
-    """Find the answer to each line: the bytes after it, or the bytes with its key.
+    """Find the answer to each line: the bytes after the line, or the bytes with the line's key.
 
     Raises:
         RecordingError: the recording is more than :data:`MAX_REPLAY_BYTES`.
@@ -236,13 +237,13 @@ class ReplayedLines(LineCamera):
         super().__init__(**{"name": recorded.name, **options})
         if recording.since is not None:
             raise ConfigurationError(
-                f"recording {recording.path}: camera {recorded.name!r} speaks in lines, which are "
-                "played from the beginning, not from a time on"
+                f"recording {recording.path}: camera {recorded.name!r} has a protocol of lines; "
+                "such a recording is played from its beginning, not from a time on"
             )
         self.plan: LinesPlan = plan_lines(recording.items(recorded.name), self.lines)
         if not self.plan.answers:
             raise ConfigurationError(
-                f"recording {recording.path}: no line to camera {recorded.name!r} is in it"
+                f"recording {recording.path}: it has no line to camera {recorded.name!r}"
             )
         self._speed, self._loop = speed, loop
         dialect = next(iter(self.protocol.dialects.values()))
@@ -355,7 +356,7 @@ class ReplayedLines(LineCamera):
             on_over()
 
     def _answer_for(self, line: bytes, answers: LineAnswers) -> list[TimedLine]:
-        """Return the recorded pieces that answer a line now, one of ``answers``."""
+        """Return the recorded answer in ``answers`` that a line gets now."""
         if (
             is_trigger(self.lines, line)
             or not self.plan.triggers

@@ -1,4 +1,4 @@
-"""Show the pictures of recorded results, each when a replay sends its result again.
+"""Show recorded pictures in a replay: each picture when its result is sent again.
 
 The protocol of BVS cameras has no pictures. So the agent that shares a replayed camera offers them
 as the camera's frames. A picture belongs to a result with the same application and bytes; several

@@ -1,12 +1,12 @@
-"""Emulate a recorded camera, which sends the recorded messages with the same timing.
+"""Emulate a recorded camera that sends the recorded containers with the same timing.
 
 The device is the emulator's own. Its applications send the recorded containers, byte for byte:
 
 - The n-th trigger of an application gets the container of the n-th recorded trigger, after the same
   time. It has no result if the recorded one had none, and is dropped if the recorded one was.
-- Containers without a trigger are sent by themselves: the first at its time after the start of the
-  run, each other at its time after the container before. They wait while the camera is stopped or
-  has another application; none is left out.
+- Containers without a trigger are sent without one: the first at its time after the start of the
+  run, each other one at its time after the previous container. They wait while the camera is
+  stopped or has another application; none is left out.
 - Overheat and System Error rise and fall at their times after the start of the first session.
 
 Sequence numbers differ from the recorded ones if the client sets them, as it does if its layout has
@@ -47,10 +47,10 @@ if TYPE_CHECKING:
 from smartcam.recording._replays.schedule import ApplicationRuns, RecordedRun, ReplayPlan
 
 MAX_SPEED = 1000.0
-"""Largest factor of the speed; beyond it the timers' millisecond is too coarse."""
+"""Largest factor of the speed; timers, which count milliseconds, are too coarse for more."""
 
 MIN_INSPECTION_TIME = 1e-6
-"""Least seconds of a replayed inspection: its recorded run is chosen after it has begun."""
+"""Shortest replayed inspection, seconds: its recorded run is chosen only after it has begun."""
 
 FREE_RUN_RATE = 0.0001
 """Rate of a free-running application, per second; the replay itself sends its containers."""
@@ -298,7 +298,7 @@ class ReplayedCamera(EmulatedCamera):
         await super().stop()
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """Handle a message of a link; once it sets a sequence number, containers get the number."""
+        """Handle a message; after a SetSequenceNumber, containers get the client's numbers."""
         if isinstance(message, m.SetSequenceNumber):
             for track in self._tracks.values():
                 track.sequence_field = self._sequence_field
@@ -340,7 +340,7 @@ class ReplayedCamera(EmulatedCamera):
             )
 
     def _arm_drops(self, track: _ApplicationTrack) -> None:
-        """Make the device drop the next triggers if the recorded ones were dropped."""
+        """Make the device drop the next triggers if the recorded triggers were dropped."""
         run = track.triggered.next_run
         if run is not None and run.drops and run is not self._armed_run:
             self._armed_run = run
@@ -464,9 +464,9 @@ def replay(
 ) -> ReplayedCamera | ReplayedLines:
     """Return an emulated camera that replays a recording, for any protocol.
 
-    For a protocol of frames it is a :class:`ReplayedCamera`. With a protocol of lines the n-th
-    trigger gets the n-th recorded answer, after the same time, and other lines the answer of that
-    moment. For a fleet's camera, which has no recorded frames, the results are replayed.
+    For a protocol of frames this is a :class:`ReplayedCamera`. With a protocol of lines the n-th
+    trigger gets the n-th recorded answer, after the same time, and other lines get the recorded
+    answer of that moment. Of a fleet's camera, which has no recorded frames, results are replayed.
 
     Args:
         recording: recording to replay.
@@ -497,8 +497,8 @@ def replay(
     if issubclass(camera_class, EmulatedCamera):
         return ReplayedCamera(recording, **common, **options)
     raise ConfigurationError(
-        f"recording {recording.path}: cameras of {recorded.protocol} cannot be replayed; those "
-        "that speak in lines, and bvs, can"
+        f"recording {recording.path}: cameras of {recorded.protocol} cannot be replayed; "
+        "cameras with protocols of lines, and of bvs, can"
     )
 
 

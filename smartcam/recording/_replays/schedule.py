@@ -46,8 +46,8 @@ MAX_TIME_AFTER_FIRST = 0.1
 always reports that it waits for a trigger."""
 
 MAX_REPLAY_BYTES = 1 << 30
-"""Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
-per second."""
+"""Largest number of bytes of containers that a replay keeps in memory: five hours of 30 containers
+of 2 kB per second."""
 
 
 @dataclass(slots=True)
@@ -56,7 +56,8 @@ class RecordedRun:
 
     # containers that the camera sent, in order; empty if the trigger had no result
     containers: list[bytes]
-    seconds: float  # seconds from the run's beginning to its first container, else to its end
+    # seconds from the run's beginning to its first container; without a container to its end
+    seconds: float
     # seconds from the end of the run before, or from when the camera began to run, to this run;
     # only for a run without a trigger
     gap: float = 0.0
@@ -126,7 +127,7 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     maker.finish()
     if maker.session_start is None:
         raise ConfigurationError(
-            f"recording {recording.path}: no answer of camera {recorded.name!r} is in it"
+            f"recording {recording.path}: it has no answer of camera {recorded.name!r}"
         )
     applications = _emulatable(recording, maker.applications, dialect)
     return ReplayPlan(
@@ -174,15 +175,15 @@ def _dialect_of(
         if dialect is None:
             raise ConfigurationError(
                 f"recording {recording.path}: camera {camera.name!r} of a fleet speaks dialect "
-                f"{camera.dialect}, expected one of bvs; no frames of it are recorded, which would "
-                "be played line by line"
+                f"{camera.dialect}, expected one of bvs; the recording has no lines of it that "
+                "could be played"
             )
         return dialect, "tcp"
     address = parse_address(camera.url)
     if address.protocol != "bvs" or address.dialect is None:
         raise ConfigurationError(
             f"recording {recording.path}: camera {camera.name!r} speaks {address.protocol}, not "
-            "bvs; smartcam.recording.replay() plays it where that can be played"
+            "bvs; use smartcam.recording.replay(), which also plays protocols of lines"
         )
     protocol = cast("Protocol", PROTOCOLS.load("bvs"))
     dialect = cast("FramedDialect", protocol.dialects[address.dialect])
@@ -226,27 +227,27 @@ _ANSWERS = {("<", "SwitchAnswer"): _StepKind.SWITCHED, ("<", "QueryAnswer"): _St
 
 
 def _steps_since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
-    """Return steps, where those before a time are replaced by the camera's state at that time."""
-    single = {_StepKind.TRIGGER, _StepKind.CONTAINER, _StepKind.SWITCH}
+    """Return the steps from a time on, after earlier steps that set the camera's state then."""
+    momentary_kinds = {_StepKind.TRIGGER, _StepKind.CONTAINER, _StepKind.SWITCH}
     return [
         step._replace(at=max(step.at, at))
         for step in steps
         if (step.at if step.recorded_at is None else step.recorded_at) >= at
-        or step.kind not in single
+        or step.kind not in momentary_kinds
     ]
 
 
 class _GapSteps:
-    """Makes the steps at a recording's beginnings and gaps.
+    """Makes the steps at the beginnings of files and at gaps.
 
-    Without these steps results around a gap would be matched with wrong triggers.
+    Without these steps, results around a gap would be matched with wrong triggers.
     """
 
     def __init__(self) -> None:
         self._is_complete = False  # whether all earlier items are known
 
     def steps(self, item: Item | RecordedState, at: float) -> list[_ReplayStep]:
-        """Return the steps of an item, at a time that does not decrease."""
+        """Return the steps that an item adds; ``at`` is never less than in the last call."""
         if isinstance(item, RecordedError) and item.error == GAP:
             self._is_complete = False
             return [_ReplayStep(at, _StepKind.LOST)]
@@ -360,12 +361,12 @@ _BY_AGENT = {_StepKind.TRIGGER, _StepKind.ABORT, _StepKind.CONTAINER}
 
 
 def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
-    """Return steps with times that fit their order.
+    """Return steps with times on one clock, which fit the steps' order.
 
     The times of results are on the agent's clock, the times of other events on the program's.
     """
     least, most = -math.inf, math.inf  # bounds of the difference between the clocks
-    by_program, by_agent = -math.inf, -math.inf  # the last times
+    by_program, by_agent = -math.inf, -math.inf  # time of the last step on each clock
     for step in steps:
         if step.kind is _StepKind.CONTAINER:
             by_agent = step.at
@@ -405,7 +406,7 @@ def _without_single_statuses(
 
 
 def _step_of_frame(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:
-    """Return the step of a frame; None if it has none."""
+    """Return the step of a frame; None if the frame means nothing for a replay."""
     key, fields = (entry.direction, entry.message), entry.fields
     if key in _SIMPLE_STEPS:
         return _ReplayStep(at, _SIMPLE_STEPS[key])
@@ -473,6 +474,7 @@ class _ScheduleMaker:
         self._open_run_at = 0.0  # time of the first container of that run
         self._untriggered_start: float | None = None  # start of an inspection without a trigger
         self._gap_start = 0.0  # time from which the gap of the next untriggered run is counted
+        # time of the last request to switch, and the id of the requested application
         self._switching: tuple[float, int] | None = None
         self._handlers: Mapping[_StepKind, Callable[[_ReplayStep], None]] = {
             _StepKind.CONNECTED: self._on_connected,
@@ -542,10 +544,10 @@ class _ScheduleMaker:
         """Count the last trigger as dropped by the camera."""
         self._triggers.pop()
         if self._triggers:
-            return  # a triggered inspection is under way: the emulated camera drops it by itself
+            return  # during a triggered inspection the emulated camera itself drops the trigger
         if Status.WAITING_FOR_TRIGGER in bits:
             self._drops += 1
-        elif self._untriggered_start is None:  # an untriggered inspection, which shows late
+        elif self._untriggered_start is None:  # an untriggered inspection, noticed late
             self._untriggered_start = self._waited_until
 
     def _on_trigger(self, _: _ReplayStep) -> None:

@@ -186,7 +186,7 @@ async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.Monke
     first, second = await GigEDriver.discover()
     assert first.url == "gige://10.0.0.8"
     assert first.remark == ""
-    assert "10.0.0.9 is not of the network" in second.remark
+    assert "10.0.0.9 is outside of the network" in second.remark
 
 
 # FORCEIP

@@ -109,7 +109,7 @@ async def test_missed_trigger_reports_that_an_older_picture_came() -> None:
         asyncio.get_running_loop().call_later(
             0.1, lambda: there.expose(ticks=there.clock() - there.ticks)
         )
-        with pytest.raises(TriggerTimeoutError, match="block 2 came, which was exposed before it"):
+        with pytest.raises(TriggerTimeoutError, match="block 2 came, which was exposed before"):
             await source.trigger(timeout=0.3)
         assert number_in(await source.trigger()) == there.exposed[3]
 

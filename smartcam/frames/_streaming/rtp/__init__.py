@@ -1,1 +1,1 @@
-"""H.264 over RTP: RFC 3550, RFC 4585 and RFC 6184."""
+"""Send H.264, and receive H.264, H.265 and JPEG, in packets of RTP (RFC 3550)."""

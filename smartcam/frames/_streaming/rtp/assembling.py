@@ -41,6 +41,11 @@ class AccessUnit(NamedTuple):
 class OpenUnit(ABC):
     """An access unit whose packets are still coming.
 
+    Args:
+        timestamp: ticks of 90 kHz.
+        unbroken: whether the unit's first packet is not missing.
+        arrived_at: time of arrival of the first packet.
+
     Attributes:
         is_intact: whether no packet is missing and every payload is valid so far.
         has_picture: whether picture data came, and not only parameters.
@@ -130,7 +135,7 @@ class NalAccessUnit(OpenUnit):
         while offset >= 0:
             head = access_unit[offset + 3 : offset + 3 + cls.HEADER_SIZE]
             unit_type = cls.unit_type(head[0]) if len(head) == cls.HEADER_SIZE else -1
-            if cls.is_picture(unit_type):  # finding the picture's end would take long for nothing
+            if cls.is_picture(unit_type):  # its end is not needed, and searching it takes long
                 yield head
                 return
             next_start = access_unit.find(b"\0\0\1", offset + 3)

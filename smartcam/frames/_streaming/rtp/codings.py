@@ -1,4 +1,4 @@
-"""Define the codecs of streams: payloads, parameters and decoders."""
+"""List the codecs of streams, each with its payload format, size reader and decoder."""
 
 from __future__ import annotations
 

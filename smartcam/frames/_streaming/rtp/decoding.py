@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_FRAMES: Final = 16
-"""Largest number of encoded frames that wait for the decoder; more are dropped until a key
-frame."""
+"""Largest number of encoded frames that wait for the decoder. If there are more, all are dropped,
+and decoding continues with a key frame."""
 
 MAX_UNDECODABLE_FRAMES: Final = 10
 """Number of undecodable frames in a row after which the stream may end with an error."""
 
 FAILURE_GRACE: Final = 3.0
-"""Seconds of undecodable frames before the stream ends: another sender may replace the first."""
+"""Seconds of undecodable frames before the stream ends: meanwhile another sender may take over."""
 
 
 DRAIN_TIMEOUT: Final = 5.0
@@ -282,7 +282,7 @@ class UnitDecoding:
 
 
 class _UnitPace:
-    """The pace of encoded frames, which gives the number of frames in a gap."""
+    """Estimate the number of frames lost in a gap from the time between frames."""
 
     def __init__(self) -> None:
         self._last_timestamp: int | None = None
@@ -297,8 +297,8 @@ class _UnitPace:
     def lost_frames(self, unit: AccessUnit) -> int:
         """Return the estimated number of frames lost before this frame.
 
-        For a gap with whole frames lost, the number follows from the time and the pace of earlier
-        frames, and is at most the number of missing packets.
+        If whole frames were lost, their number follows from the gap and the time between earlier
+        frames. It is at most the number of damaged frames and lost packets.
         """
         is_first = self._last_timestamp is None or unit.starts_stream
         since = 0 if is_first else self._ticks_since_last(unit)
@@ -316,7 +316,7 @@ class _UnitPace:
 
 
 MAX_STEP_TICKS: Final = 60 * 90_000
-"""Largest distance of two frames, ticks, that defines a pace."""
+"""Largest time between two frames, ticks, that counts as the time between frames."""
 
 
 def _format_size(size: tuple[int, int] | None) -> str:

@@ -18,8 +18,8 @@ MAX_WAITING_PACKETS: Final = 64
 """Largest number of packets that wait for a missing earlier packet."""
 
 MAX_PACKETS_AHEAD, MAX_PACKETS_LATE = 3000, 500
-"""Largest distance of a sequence number ahead or late; two consecutive numbers beyond it show a
-restarted stream."""
+"""Largest distance of a packet's sequence number from the expected one, forwards and backwards. Two
+consecutive numbers that are farther away show a restarted stream."""
 
 MIN_RIGHT_MARKERS: Final = 2
 """Number of frames with a right marker after which markers are trusted."""
@@ -70,7 +70,7 @@ class Depacketizer:
         self._next: int | None = None  # next expected sequence number with wraps counted
         self._held: dict[int, tuple[RtpPacket, float]] = {}
         self._open: OpenUnit | None = None
-        self._unbroken = False  # whether no packet is missing before the next one
+        self._unbroken = False  # whether no packet is missing right before the next one
         self._last_timestamp: int | None = None  # timestamp of the last ended frame
         self._is_stream_start = True  # whether the stream has had no complete frame yet
         self._after_jump: int | None = None  # sequence number that would confirm a restarted stream

@@ -39,9 +39,9 @@ class RtpDriver(FrameDriver):
     ``name``     of the camera
     ============ =================================================================================
 
-    Only complete pictures are returned. Lost packets are requested again (generic NACK), and if
-    they do not come, a key frame (PLI); without support by the sender, pictures continue after its
-    next refresh. ``frame.lost`` is the estimated number of lost frames.
+    Only complete pictures are returned. Lost packets are requested again (generic NACK). If they do
+    not come, a key frame is requested (PLI). If the sender supports neither, pictures continue
+    after its next refresh. ``frame.lost`` is the estimated number of lost frames.
 
     ``captured`` is the arrival of a frame's first packet. Once the sender has reported its clock
     (RTCP sender reports), ``device_time`` is the frame's time on that clock, in seconds since 1970.
@@ -161,7 +161,7 @@ class FirstPicture(FrameSink):
 
 
 class _RtpPlan(NamedTuple):
-    """Options from the URL."""
+    """The options in a URL."""
 
     name: str
     payload: int

@@ -20,7 +20,7 @@ MAX_KEPT_PACKETS: Final = 1024
 """Largest number of packets that are kept for requests to send them again."""
 
 MAX_RESEND_AGE: Final = 0.2
-"""Largest age, seconds, of a packet that is sent again: an older one would come too late for its
+"""Largest age, seconds, of a packet that is sent again: an older packet would come too late for its
 picture."""
 
 MAX_RESENDS: Final = 5

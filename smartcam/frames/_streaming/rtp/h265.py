@@ -44,7 +44,7 @@ class H265PayloadFormat:
 
     @staticmethod
     def is_frame_start(payload: bytes) -> bool:
-        """Return True if a packet has a unit that can only begin a frame."""
+        """Return True if a packet begins with a NAL unit that can only begin a frame."""
         unit_type = H265AccessUnit.unit_type(payload[0]) if payload else -1
         if unit_type == H265AccessUnit.AGGREGATION and len(payload) > 4:
             payload = payload[4:]
@@ -88,7 +88,7 @@ def _size(bits: FieldBits) -> tuple[int, int]:
 
 
 def size_in(access_unit: bytes) -> tuple[int, int] | None:
-    """Return the size of the pictures; None if an encoded frame has no parameters.
+    """Return the size of the pictures; None if the encoded frame has no parameter set.
 
     Raises:
         FrameFormatError: the parameters are not valid.

@@ -8,13 +8,13 @@ from typing import Final
 from smartcam.frames._streaming.rtp.assembling import OpenUnit
 
 HEAD_BYTES: Final = 8
-"""Number of bytes of the header before each piece of a picture."""
+"""Number of bytes of the JPEG header in each packet, before its piece of the picture."""
 
 RESTARTS: Final = range(64, 128)
 """Types of pictures with restart markers."""
 
 MAX_QUANTIZATION_TABLES: Final = 64
-"""Largest number of remembered sets of quantization tables, by their quality."""
+"""Largest number of remembered sets of quantization tables, one for each quality."""
 
 _LUMA: Final = (
     "16 11 12 14 12 10 16 14 13 14 18 17 16 19 24 40 26 24 22 22 24 49 35 37 29 40 58 51 61 60 57 "
@@ -51,14 +51,15 @@ _HUFFMAN: Final = tuple(
         ),
     )
 )
-"""Huffman tables of all these pictures (annex K.3): class and id, counts, values."""
+"""Huffman tables of all JPEGs over RTP (annex K.3): class and id, counts, values."""
 
 
 class JpegPayloadFormat:
     """The RTP payload format of JPEG; it remembers tables that a sender sends only once.
 
     Args:
-        size: size of the pictures, for sizes above 2040 pixels, which packets cannot hold.
+        size: width and height of pictures with a side above 2040 pixels, which do not fit into the
+            packets' header; None: the header has the size.
     """
 
     def __init__(self, size: tuple[int, int] | None = None) -> None:
@@ -166,7 +167,7 @@ def scaled_tables(quality: int) -> tuple[bytes, ...]:
 def split_tables(data: bytes, wide_bits: int) -> tuple[bytes, ...]:
     """Return the tables in ``data``: each has 64 bytes, or 128 if its bit in ``wide_bits`` is set.
 
-    Empty: a table is cut off.
+    The result is empty if a table is cut off.
     """
     tables: list[bytes] = []
     while data and len(tables) < 4:

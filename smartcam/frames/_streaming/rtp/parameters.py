@@ -21,7 +21,7 @@ _HIGH_PROFILES: Final = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135
 """Profiles whose parameters have a chroma format (ITU-T H.264, 7.3.2.1.1)."""
 
 SUBSAMPLING: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
-"""Horizontal and vertical chroma subsampling of each chroma format; cropping counts in it."""
+"""Horizontal and vertical chroma subsampling of each chroma format: the units of cropping."""
 
 
 class FieldBits:
@@ -129,7 +129,7 @@ def _skip_scaling_list(bits: FieldBits, count: int) -> None:
 
 
 def size_in(access_unit: bytes) -> tuple[int, int] | None:
-    """Return the size of the pictures; None if an encoded frame has no parameters.
+    """Return the size of the pictures; None if the encoded frame has no parameter set.
 
     Raises:
         FrameFormatError: the parameters are not valid.

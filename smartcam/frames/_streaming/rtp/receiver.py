@@ -53,8 +53,8 @@ KEY_FRAME_REQUEST_INTERVAL: Final = 0.2
 """Seconds between two requests for a key frame."""
 
 NEW_STREAM_DELAY: Final = 1.0
-"""Seconds after which another stream is accepted: after silence if it comes from the same host, and
-from any host after packets without a decodable picture."""
+"""Seconds after which another stream replaces the current one: of silence if the other comes from
+the same host, or of packets without a decodable picture, then from any host."""
 
 NEW_HOST_DELAY: Final = 5.0
 """Seconds of silence after which a stream from another host is accepted."""
@@ -362,7 +362,7 @@ class StreamReceiver:
     def _send_report(self, *more: wire.Report) -> None:
         """Send a compound report: reception, name, and further messages.
 
-        The counts of the reception are left out if the first message is a request.
+        The report block is left out if the first further message is a request.
         """
         if self._reception is None:
             return

@@ -61,7 +61,7 @@ class RtpSenderStatistics:
         bytes: bytes of these packets, with the headers of RTP.
         cut: frames that were sent only in part, since the socket was full.
         resent: packets sent again on request.
-        anew: key frames encoded because a receiver joined or lost packets, or after a cut frame.
+        anew: key frames encoded because a receiver joined or lost packets, or a frame was cut.
         receivers: last reports of the receivers.
     """
 

@@ -204,7 +204,7 @@ class SocketPair:
                 data, sender = sock.recvfrom(65536)
             except BlockingIOError:
                 break
-            except OSError:  # an error of an earlier sent datagram; reading goes on
+            except OSError:  # from a datagram sent earlier; reading goes on
                 continue
             on_datagram(data, sender)
         if not self._closed:

@@ -66,7 +66,7 @@ class ConnectionOwner(Protocol):
         ...
 
     def mark_served(self, connection: RtspConnection) -> None:
-        """Mark a connection as the most recently served: others are closed first to make room."""
+        """Mark a connection as the most recently served one, which is closed last to make room."""
         ...
 
     def on_last_session_end(self, connection: RtspConnection) -> None:

@@ -102,7 +102,7 @@ async def _setup(connection: RtspConnection, request: RtspRequest) -> RtspAnswer
         session = _session_of(connection, request)
         if session.is_playing or session.stream is stream:
             raise RtspError(455, f"{stream.name}: the session is set up already")
-        raise RtspError(459, "each stream has a session of its own")
+        raise RtspError(459, "each stream needs a separate session")
     requested = requested_transport(request.headers.get("transport", ""), str(connection.peer[0]))
     if len(connection.sessions) >= MAX_SESSIONS:
         raise RtspError(453, f"{MAX_SESSIONS} sessions are open on this connection")

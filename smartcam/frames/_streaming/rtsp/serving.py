@@ -91,7 +91,7 @@ class RtspServing:
         self._acceptor.leave(connection)
 
     def mark_served(self, connection: RtspConnection) -> None:
-        """Mark a connection as the most recently served: others are closed first to make room."""
+        """Mark a connection as the most recently served one, which is closed last to make room."""
         self._acceptor.restart_idle_time(connection)
 
     def on_last_session_end(self, connection: RtspConnection) -> None:

@@ -65,7 +65,7 @@ class RtspSession:
         self._last_ticks = -1  # timestamp of the last frame, without the offset
         self._awaits_key_frame, self._is_skipping = True, False
         self._reported_at = -REPORT_INTERVAL
-        self._last_sign_of_life = self._loop.time()
+        self._client_heard_at = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
 
     @property
@@ -109,7 +109,7 @@ class RtspSession:
 
     def keep_alive(self) -> None:
         """Restart the time within which the client must send something."""
-        self._last_sign_of_life = self._loop.time()
+        self._client_heard_at = self._loop.time()
 
     def take_rtcp(self, data: bytes) -> None:
         """Process a report of the client; invalid bytes are ignored."""
@@ -187,7 +187,7 @@ class RtspSession:
         if is_alive is False:
             self.stream.stalled += 1
             self._end("")
-        elif now - self._last_sign_of_life >= SESSION_TIMEOUT:
+        elif now - self._client_heard_at >= SESSION_TIMEOUT:
             self.stream.silent += 1
             self._end(f"no request or report came for {SESSION_TIMEOUT} s")
         elif self.is_playing and now - self._reported_at >= REPORT_INTERVAL:

@@ -22,8 +22,8 @@ class RtspStatistics:
         failed: frames that failed to encode.
         sent: frames sent, summed over all viewers.
         skipped: frames skipped for slow viewers, summed over all viewers.
-        stalled: viewers disconnected since they accepted no data.
-        silent: viewers disconnected since they sent no request or report.
+        stalled: viewers disconnected because they accepted no data.
+        silent: viewers disconnected because they sent no request or report.
     """
 
     viewers: int

@@ -135,7 +135,7 @@ class AnswerParser:
             self._searched_bytes = 0
         if match is None or not self._stray_bytes or self._data[:1] != b"$":
             return match is not None
-        if len(self._data) <= 4:  # after skipped bytes, a dollar may be data
+        if len(self._data) <= 4:  # after skipped bytes, a dollar sign may be part of data
             return False
         if self._data[4] >> 6 == 2 and self._data[1] in self._channels:
             return True

@@ -37,8 +37,8 @@ def parse_pair(text: str, most: int) -> tuple[int, int] | None:
 class InterleavedChannels:
     """Two channels of a connection.
 
-    Some servers use other channels than announced: until a packet comes on the announced channels,
-    a packet of the stream's payload type shows the right channel.
+    Some servers use other channels than they announce. So until a packet comes on the announced
+    channel, a packet of the stream's payload type on another channel selects that channel.
 
     Args:
         link: the connection.
