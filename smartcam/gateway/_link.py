@@ -40,7 +40,8 @@ class RobotLink(asyncio.Protocol):
         acceptor: object that bounds the number of connections.
 
     Attributes:
-        keeps_place: True once the robot has requested a part. Until then the connection may be closed
+        keeps_place: True once the robot has requested a part. Until then the connection may be
+        closed
             to make room for a new one.
     """
 
