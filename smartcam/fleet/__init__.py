@@ -1,12 +1,13 @@
 """Cameras of a plant, shared by many programs.
 
-A camera takes one client, and the newcomer wins. So one process, the *agent*, has the sessions with
-the cameras and shares them: :func:`serve`, or ``smartcam serve fleet.yaml``. Any number of programs
-use them, each by :func:`smartcam.connect` with a URL such as ``fleet://plant-server/line1/cam3``,
-or all of a fleet together by :func:`open`.
+A camera serves one client at a time: a new client replaces the old one. So one process, the
+*agent*, is the client of the cameras, and shares them (:func:`serve`, or ``smartcam serve
+fleet.yaml``). Any number of programs use the shared cameras. A program opens one camera by
+:func:`smartcam.connect` with a URL such as ``fleet://plant-server/line1/cam3``, or all cameras of a
+fleet by :func:`open`.
 
-Between processes this needs the extra ``fleet``; :func:`open` with a fleet file has agent and
-cameras in this process, and needs nothing.
+If agent and programs are different processes, they need the extra ``fleet``. :func:`open` with a
+fleet file runs the agent in this process, and needs no extra.
 """
 
 from __future__ import annotations

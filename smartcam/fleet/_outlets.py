@@ -89,7 +89,7 @@ class FleetOutlets(Server):
         self._server.stored_results = self.read_stores
 
     async def stop(self) -> None:
-        """Stop; undelivered records stay in the spools."""
+        """Stop; undelivered results stay in the spools, and are delivered after the next start."""
         if self._observer in self._server.observers:
             self._server.observers.remove(self._observer)
         cameras, self._command_cameras = [*self._command_cameras.values()], {}
@@ -124,7 +124,7 @@ class FleetOutlets(Server):
             spec: Any = "raw" if entry.interpret_as is None else entry.interpret_as
             if host is not None:
                 spec = host.settings.interpret_as
-            elif is_software:  # waiting entries of an earlier run may be requested first
+            elif is_software:  # entries of an earlier run may need it before the camera is started
                 device = software_camera(camera, entry.software or {}, self._server.folder)
                 spec = {number: program.interpret_as for number, program in device.programs.items()}
             interpretation = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)

@@ -1,4 +1,4 @@
-"""Run a fleet's cameras as nodes of ROS 2, on the fleet's own session of Zenoh."""
+"""Run a node of ROS 2 for each camera of a fleet, on the Zenoh session of the fleet's bus."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ class RosFleet(Server):
         controls: functions that return the open source of a camera's frames, by name, for cameras
             whose device has controls.
         hand_eyes: hand-eye calibrations of the cameras, by name.
-        wanted: function that returns whether a camera of an agent gets a node.
+        wanted: function of an agent's name and a camera's name that returns whether the camera
+            gets a node.
         desks: calibrations of the agent's cameras; None if there is no folder for them.
 
     Raises:
@@ -135,7 +136,7 @@ class RosFleet(Server):
         self._task = asyncio.get_running_loop().create_task(self._follow(events))
 
     async def _follow(self, events: Any) -> None:
-        """Create a node for each new camera; the node of a lost camera stays, and reports it."""
+        """Create a node for each new camera. The node of a lost camera stays, and reports that."""
         async for event in events:
             if isinstance(event, CameraJoined) and self._wanted(event.agent, event.camera):
                 await self._create_node(event.camera)

@@ -1,8 +1,8 @@
 """Serve robots and PLCs over TCP: a controller asks for a part and gets its pose, or an error.
 
-:class:`Gateway` has a camera and listens; a controller sends ``TRIGGER`` and ``NEXT``, and each
-request has one answer, within a deadline. :class:`GatewaySettings` set the form of the answers,
-which differs between makes of robots. ``smartcam gateway`` is the command.
+A :class:`Gateway` serves one camera on a port. A controller sends ``TRIGGER`` or ``NEXT``; the
+gateway answers each request once, within a deadline. :class:`GatewaySettings` set the form of the
+answers, which differs between makes of robots. The command is ``smartcam gateway``.
 """
 
 from __future__ import annotations

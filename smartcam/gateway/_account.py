@@ -18,7 +18,8 @@ class GatewayAccount:
         requests: requests that came.
         answered: requests that were answered with a part, or with the state or reason asked for.
         errors: requests that were answered with an error.
-        abandoned: requests whose robot had disconnected before the answer.
+        abandoned: requests that were never answered: the robot disconnected, or the gateway closed
+            the connection, before the answer.
         open: requests that are not answered yet.
         parts: parts in all results that were made for robots' requests.
         delivered: parts that were sent to a robot.

@@ -1,4 +1,4 @@
-"""Run a gateway: a camera, a port, and the robots that connect."""
+"""Run a gateway: listen on a port, and serve the robots that connect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _log = logging.getLogger("smartcam.gateway")
 
 
 class Gateway(Server):
-    """Answers controllers that ask for parts, line by line.
+    """Answers controllers that ask for a camera's parts.
 
     ::
 
@@ -33,7 +33,7 @@ class Gateway(Server):
             async with Gateway(camera, GatewaySettings(robot="ur")) as gateway:
                 print(gateway.address)
 
-    No password is asked for: any program that reaches the port may trigger.
+    There is no password: any program that can connect to the port may trigger the camera.
 
     Args:
         camera: the camera; the caller opens and closes it. While it has no session, requests are
@@ -78,7 +78,7 @@ class Gateway(Server):
 
     @property
     def camera(self) -> Camera:
-        """The camera; another object may replace it if it could not be opened."""
+        """The camera. The caller may set another object, after this one could not be opened."""
         return self._shared.camera
 
     @camera.setter
@@ -89,7 +89,7 @@ class Gateway(Server):
         """Open the port; do nothing if it is already open.
 
         Raises:
-            ConfigurationError: the gateway cannot listen there.
+            ConfigurationError: the gateway cannot listen on the address in the settings.
 
         Cancellation: leaves the port closed.
         """
@@ -106,7 +106,7 @@ class Gateway(Server):
         self._acceptor.open(self._socket)
 
     async def stop(self) -> None:
-        """Close the port and all connections; open requests get no answer."""
+        """Close the port and all connections; unfinished requests get no answer."""
         listener, self._socket = self._socket, None
         if listener is None:
             return

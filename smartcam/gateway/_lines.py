@@ -16,11 +16,11 @@ MAX_LINE_BYTES: Final = 256
 """Largest number of bytes of a request; a longer request ends the connection."""
 
 MAX_BRACKETED_NUMBERS: Final = 30
-"""Largest number of numbers that ``socket_read_ascii_float`` reads at once (Script Manual, module
-interfaces)."""
+"""Largest number of numbers that a robot's ``socket_read_ascii_float`` can read at once (Universal
+Robots' Script Manual, module interfaces)."""
 
 MAX_NUMBER: Final = 1e9
-"""Largest number that is written; controllers read 32-bit floats."""
+"""Largest absolute value that an answer may have; controllers read 32-bit floats."""
 
 _REQUEST = re.compile(rb"(?:(\d{1,9}) +)?([A-Za-z]{1,16})(?: +(\d{1,10}))?", re.ASCII)
 _XML = re.compile(
@@ -36,7 +36,7 @@ _BLANKS = b" \t\r\n\0"
 
 
 class AnswerCode(enum.IntEnum):
-    """The code with which an answer begins; 0 and 1 are no errors."""
+    """The number with which each answer begins; 0 and 1 report success, the others errors."""
 
     PART = 0
     NONE = 1
@@ -79,9 +79,9 @@ class RobotAnswer(NamedTuple):
 
     Attributes:
         code: outcome of the request.
-        left: number of parts of the result that follow this one.
+        left: number of parts of the result that the robot can still request.
         values: values of the part, or of the camera's state.
-        words: the reason, for people.
+        words: the reason of an error, as a text for people.
     """
 
     code: AnswerCode
@@ -107,7 +107,7 @@ class RequestReader:
     controllers send arrays of a fixed length. XML ends with the closing tag of its first element.
 
     Args:
-        form: form of the lines, as :attr:`Style.form`.
+        form: form of the requests: ``text``, ``brackets`` or ``xml``, as in :attr:`Style.form`.
     """
 
     def __init__(self, form: str) -> None:
@@ -133,7 +133,7 @@ class RequestReader:
         return requests
 
     def _find_end(self, data: bytes, start: int) -> int:
-        """Return the index after the request that begins at ``start``; 0 if it is incomplete."""
+        """Return the index after the request that begins at ``start``; 0 if its end is missing."""
         begin = _XML_BEGIN.match(data, start) if self._xml else None
         if begin is None:  # a line, which may also come instead of XML
             line_end = _LINE_END.search(data, start)
@@ -222,7 +222,7 @@ class AnswerWriter:
         return f"({','.join([*head, *padded])})"
 
     def _xml(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
-        # always all elements: EthernetKRL has a queue for each, and the queues must stay in step
+        # write every element: EthernetKRL queues each element separately, and reads row by row
         padded = values + ["0"] * (len(self.names) - len(values))
         part = " ".join(
             f"{name.upper()}={quoteattr(value)}"

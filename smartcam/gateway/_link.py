@@ -1,4 +1,4 @@
-"""Serve a robot's connection, on which one request is answered after the other."""
+"""Serve the connection of one robot: answer its requests one after the other."""
 
 from __future__ import annotations
 
@@ -18,29 +18,31 @@ if TYPE_CHECKING:
     from smartcam.gateway._requests import GatewayCamera
 
 MAX_WAITING_REQUESTS: Final = 8
-"""Largest number of numbered requests that wait while another one is being answered."""
+"""Largest number of a robot's requests that wait while an earlier one is answered. Only requests
+that carry a number may wait."""
 
 MAX_UNSENT_BYTES: Final = 1 << 16
-"""Largest number of unsent bytes for a robot that does not read."""
+"""Largest number of bytes that wait to be sent to a robot; with more, the robot counts as stuck."""
 
 _KEEPALIVE_PERIOD = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
-"""Options of TCP: seconds without a byte until a check, seconds between checks, number of
-checks."""
+"""TCP's keep-alive options: seconds of silence until the first check, seconds between checks, and
+number of unanswered checks that end the connection."""
 
 _log = logging.getLogger("smartcam.gateway")
 
 
 class RobotLink(asyncio.Protocol):
-    """One connection.
+    """The connection of one robot.
 
     Args:
         shared: the camera and other objects that all robots share.
-        writer: writer of answers.
-        acceptor: acceptor, which bounds the number of connections.
+        writer: object that formats the answers.
+        acceptor: object that bounds the number of connections.
 
     Attributes:
-        keeps_place: whether the robot has requested a part. Then its connection stays; otherwise
-            it may be closed in favour of a new connection.
+        keeps_place: True once the robot has requested a part. Until then the connection may be
+        closed
+            to make room for a new one.
     """
 
     _transport: asyncio.Transport
@@ -95,11 +97,11 @@ class RobotLink(asyncio.Protocol):
                 self._accept_request(request)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End the open requests, and forget parts that were not requested."""
+        """End the unfinished requests, and forget parts that the robot has not requested."""
         self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
 
     def close_for(self, why: str) -> None:
-        """Close the connection at once, in favour of another one."""
+        """Close the connection at once, to make room for another one."""
         self._close(why, abort=True)
 
     # ------------------------------------------------------------------ requests
@@ -113,7 +115,7 @@ class RobotLink(asyncio.Protocol):
             self._account.open += 1
             self._task = loop.create_task(self._serve(request, deadline), name="smartcam.gateway")
         elif request.tag is None:
-            # the robot would take the earlier answer for the answer to this request
+            # without numbers, the robot would read the previous answer as the answer to this one
             self._account.abandoned += 1
             self._close("a request without a number came before the answer to the one before")
         elif len(self._queue) >= MAX_WAITING_REQUESTS:
@@ -157,7 +159,7 @@ class RobotLink(asyncio.Protocol):
     def _report_error(self, answer: RobotAnswer, tag: int | None) -> None:
         self._account.requests += 1
         if self._task is not None:
-            # the robot would take an answer now for the answer to another request
+            # without numbers, the robot would read a late error as the answer to its next request
             self._account.abandoned += 1
             return
         self._account.errors += 1
@@ -195,7 +197,7 @@ class RobotLink(asyncio.Protocol):
             self._transport.close()
 
     async def finish(self) -> None:
-        """Close the connection, and wait until its request has ended."""
+        """Close the connection, and wait until the task that answers its requests has ended."""
         task = self._task
         self._close("the gateway is closed")
         if task is not None:
@@ -203,7 +205,7 @@ class RobotLink(asyncio.Protocol):
 
 
 def _keep_alive(sock: socket.socket | None) -> None:
-    """Make the system detect a robot that was switched off."""
+    """Have TCP detect a robot that was switched off or unplugged."""
     if sock is None:
         return
     with contextlib.suppress(OSError):

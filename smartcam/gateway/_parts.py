@@ -1,4 +1,4 @@
-"""Make rows of values for a robot: one row for each part of a result."""
+"""Convert a result into rows of values for a robot, one row for each part."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Row = list[float | str]
 
 
 class Parts:
-    """Makes rows of values: poses in a robot's convention, records in its units.
+    """Converts results: poses to the robot's convention, other values to the robot's units.
 
     Args:
-        settings: the convention, the units, and the values that follow a pose.
+        settings: the pose convention, the units, and which values follow a pose.
         spec: ``interpret_as`` of the camera, whose layout shows which values are lengths.
     """
 
@@ -52,7 +52,7 @@ class Parts:
         """Return a row for each part of a result.
 
         Raises:
-            InterpretationError: the value has no parts.
+            InterpretationError: the value holds neither localizations nor records.
         """
         if type(value).__module__ == "numpy":
             value = _records_of(value)
@@ -82,7 +82,7 @@ class Parts:
     def _pose_row(self, part: Localization) -> Row:
         x, y, z, w = part.pose.orientation
         if self._settings.tool_flip:
-            x, y, z, w = w, z, -y, -x  # multiplied by (1, 0, 0, 0): half a turn about x
+            x, y, z, w = w, z, -y, -x  # the quaternion times (1, 0, 0, 0): half a turn about x
         pose = Transform(
             "robot",
             "part",
@@ -114,7 +114,7 @@ class Parts:
 
 
 def _layouts(spec: object) -> dict[int | None, Layout]:
-    """Return the layouts in ``interpret_as``, by application; key None: for all applications."""
+    """Return the layouts in ``interpret_as`` by application; the key None means all others."""
     if spec is None:
         return {}
     by_application = spec if isinstance(spec, Mapping) else {None: spec}

@@ -1,4 +1,4 @@
-"""Answer the requests of one robot at a gateway, and keep the parts that it may request."""
+"""Answer the requests of one robot, and keep the parts that the robot may still request."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from smartcam.models import Result
 
 CANCEL_GRACE: Final = 0.2
-"""Seconds after a request's deadline at which a call that still runs is cancelled."""
+"""Seconds after a request's deadline when a call to the camera that still runs is cancelled."""
 
 PART_WORDS = ("TRIGGER", "NEXT", "WAIT")
-"""The words of requests for a part."""
+"""The words with which a robot requests a part."""
 
 WORDS = (*PART_WORDS, "STATUS", "WHY")
-"""The words that a request may begin with."""
+"""All words with which a request may begin."""
 
 _log = logging.getLogger("smartcam.gateway")
 
@@ -58,20 +58,20 @@ CODES: tuple[tuple[type[BaseException], AnswerCode], ...] = (
     (ConfigurationError, AnswerCode.REFUSED),
     (SmartCamError, AnswerCode.FAULT),
 )
-"""The code of each class of errors; the first class that matches decides."""
+"""The code that answers each class of errors; the first class that matches decides."""
 
 
 class GatewayCamera:
-    """The camera of a gateway, with the settings and counts that all robots share.
+    """The camera, the settings and the counts, which all robots of a gateway share.
 
     Args:
         camera: the camera.
-        settings: deadlines and ages.
-        account: account that counts the parts.
+        settings: timeouts of requests, and the age up to which parts are given to robots.
+        account: counts of requests and parts.
 
     Attributes:
-        camera: the camera; another object may replace it.
-        trigger_lock: lock that the robot has which triggers.
+        camera: the camera; the gateway may set another object.
+        trigger_lock: lock that a robot's request holds while it triggers the camera.
     """
 
     def __init__(
@@ -94,9 +94,9 @@ class RobotRequests:
     def __init__(self, shared: GatewayCamera) -> None:
         self._shared = shared
         self._rows: list[Row] | None = None  # rows of the last result; None without one
-        self._rows_expire_at = 0.0  # loop time after which the rows are no longer given
+        self._rows_expire_at = 0.0  # loop time after which the robot gets no more of the rows
         self._last_error = RobotAnswer(AnswerCode.NONE, words="no request has failed")
-        self._answer_has_row = False  # the answer that is written now has the first row
+        self._answer_has_row = False  # True while an answer with the first row is being written
 
     # ------------------------------------------------------------------ a request
 
@@ -136,7 +136,7 @@ class RobotRequests:
         camera = self._shared.camera
         if request.word == "WAIT":
             return await camera.next_result(timeout=_time_left(deadline))
-        # the camera gets at least half of the timeout
+        # wait for the lock at most half of the time, so that the camera gets the other half
         async with _hold_lock(
             self._shared.trigger_lock, deadline - 0.5 * self._shared.settings.timeout
         ):
@@ -172,7 +172,7 @@ class RobotRequests:
         return RobotAnswer(AnswerCode.PART, len(self._rows) - 1, self._rows[0])
 
     def on_sent(self) -> None:
-        """Count the part in the last answer as delivered, since the answer was written."""
+        """Count the part in the last answer as delivered; called after the answer was written."""
         if self._answer_has_row and self._rows:
             del self._rows[0]
             self._shared.account.waiting -= 1

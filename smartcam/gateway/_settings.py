@@ -35,7 +35,7 @@ Also = Literal["quality", "photo_index", "feature_id"]
 
 
 class Style(NamedTuple):
-    """The style of answers, with every option set.
+    """The style of answers: each option has a value here, from the make or from the settings.
 
     Attributes:
         form: form of an answer: ``text``, ``brackets`` or ``xml``.
@@ -46,7 +46,8 @@ class Style(NamedTuple):
         separator: text between two values.
         line_end: text after an answer.
         width: number of bytes of each answer, filled with blanks; 0: as many as the answer needs.
-        longest: largest number of bytes of an answer; words are cut, numbers never.
+        longest: largest number of bytes of an answer. A longer text for people is cut; too many
+            numbers are an error.
     """
 
     form: str = "text"
@@ -67,7 +68,7 @@ STYLES: Mapping[str, Style] = {
     "fanuc": Style(pose="fanuc", line_end="\r", longest=120),
     "siemens": Style(width=96, longest=96),
 }
-"""Style of answers that each make of controller reads; the page on robots has the sources."""
+"""The style of answers that each make of controller can read; docs/robots.md names the sources."""
 
 
 def _check_listen(text: str) -> str:
@@ -89,7 +90,7 @@ Seconds = Annotated[float, Field(gt=0, le=MAX_SECONDS, allow_inf_nan=False)]
 
 
 class GatewaySettings(BaseModel):
-    """The settings of a gateway; options without a value get the values of the robot's make."""
+    """The settings of a gateway; an option that is None gets the default of the robot's make."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True)
 

@@ -8,14 +8,13 @@
     inspection.ok, inspection.reason, inspection.value.text
     payload = inspection.payload()  # bytes in the layout program.interpret_as
 
-A *tool* inspects a picture; it is a plug-in, an entry point of the group ``smartcam.tools``. A
-*program* is the ordered list of tools of an application. A *finding* is the result of one tool:
-values, a verdict with its reason, marks to draw, and a frame of reference that later tools may
-follow. An *inspection* holds all findings of one picture. The program determines the layout of a
-result.
+A *tool* inspects a picture; each kind of tool is a plug-in, an entry point of the group
+``smartcam.tools``. A *program* is the ordered list of tools of an application. A *finding* is the
+result of one tool: values, a verdict with its reason, marks to draw, and a frame of reference that
+later tools may follow. An *inspection* holds all findings of one picture. The program determines
+the layout of a result.
 
-Programs use no sockets and no clock of a camera. The extra ``inspection`` installs the
-dependencies.
+A program needs no camera and no network. The extra ``inspection`` installs the dependencies.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 class ApplicationEntry(BaseModel):
-    """An application of a software camera; every other key is a tool, in running order."""
+    """An application of a software camera; its other keys are its tools, in running order."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="allow", frozen=True, hide_input_in_errors=True

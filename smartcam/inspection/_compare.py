@@ -24,7 +24,7 @@ MAX_AREA_PX: Final = 1_000_000_000
 """Largest area that a setting may have, in pixels."""
 
 MAX_SHIFT_PX: Final = 50
-"""Largest shift of a part that is searched, in pixels; the time grows with its square."""
+"""Largest shift of a part that a search may cover, in pixels; the time grows with its square."""
 
 MAX_DRAWN_DIFFERENCES: Final = 100
 """Largest number of differences that are drawn."""
@@ -42,16 +42,17 @@ MAX_ITERATIONS: Final = 30
 """Largest number of iterations of the alignment."""
 
 MIN_LIGHT_CORRELATION: Final = 0.5
-"""Least correlation of taught and current levels at which a change of light is assumed."""
+"""Least correlation of taught and current grey levels for which different light is assumed."""
 
 LIGHT_FIT_ROUNDS: Final = 4
-"""Number of fits of the light; each leaves out the outliers of the one before."""
+"""Number of fits of the light; each fit leaves out the outliers of the fit before."""
 
 MAX_LIGHT_PIXELS: Final = 50_000
 """Largest number of pixels in the fit of the light; a larger region is sampled."""
 
 SURROUNDINGS_PX: Final = 31
-"""Side of the square of surroundings from which a pixel must differ, in pixels."""
+"""Side, pixels, of the square around a pixel; the pixel is compared with the darkest and the
+brightest pixel of this square."""
 
 OUTLIER_SIGMAS: Final = 2.5
 """Residual, in standard deviations, from which a pixel is an outlier of the light's fit."""
@@ -255,7 +256,7 @@ class Compare(Tool[CompareSettings]):
 
 
 def _find_hidden(relit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
-    """Return a mask of pixels whose difference from their surroundings is lost by saturation.
+    """Return a mask of pixels that cannot be judged, since saturation hides their contrast.
 
     Args:
         relit: taught levels in the current light, (H, W), not limited to 0 to 255.
@@ -279,7 +280,7 @@ def _find_hidden(relit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
     clipped = np.clip(relit, 0, 255)
     darker, lighter = compare_surroundings(relit)
     still_darker, still_lighter = compare_surroundings(clipped)
-    # beside a visible edge, a pixel is between the levels of both sides
+    # next to a visible edge, a pixel's level lies between the levels of both sides
     edge = cv2.morphologyEx(clipped, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
     is_flat = edge * (1 - EDGE_TOLERANCE_PX / 2) < level
     mask: NDArray[np.bool_] = ((darker & ~still_darker) | (lighter & ~still_lighter)) & is_flat

@@ -1,4 +1,4 @@
-"""Learn tolerances from pictures of good parts, and describe them in sentences."""
+"""Compute the tools' tolerances from pictures of good parts, and explain each in a sentence."""
 
 from __future__ import annotations
 
@@ -19,30 +19,34 @@ if TYPE_CHECKING:
     from smartcam.inspection._finding import Finding, Inspection
 
 AREA_MARGIN: Final = 0.2
-"""Share by which a spot may be smaller or larger than the spots of the good pictures."""
+"""Share by which the area of a spot may be below the smallest, or above the largest, spot of the
+good pictures."""
 
 DIFFERENCE_MARGIN: Final = 1.5
 """Ratio of the allowed number of differing pixels to the largest number in a good picture."""
 
 MIN_VALUES: Final = 5
-"""Least number of good pictures with a value to learn a tolerance: with fewer, outliers are not
-found."""
+"""Least number of good pictures with a measured value from which a tolerance is learned; among
+fewer values, outliers cannot be found."""
 
 TOLERANCE_COVERAGE: Final = 0.997
 """Share of all good parts that a learned tolerance contains."""
 
 CONFIDENCE: Final = 0.95
-"""Probability that a learned tolerance contains this share, over samples of good parts."""
+"""Probability, over all samples of good parts, that a learned tolerance contains
+``TOLERANCE_COVERAGE`` of the good parts."""
 
 OUTLIER_SPREADS: Final = 5.0
-"""Distance from the median, in standard deviations, of an outlier in a large sample."""
+"""Distance from the median, in standard deviations, beyond which a value of a large sample is an
+outlier."""
 
 SMALL_SAMPLE: Final = 8.0
-"""Sample size at which ``OUTLIER_SPREADS`` doubles, since the spread of few values is less certain.
-In simulations with 5 to 200 good parts, at most 2 % of the samples lose a good value."""
+"""Number of values at which this distance is twice ``OUTLIER_SPREADS``, since the spread of few
+values is uncertain. In simulations with 5 to 200 good parts, at most 2 % of the samples lose a good
+value."""
 
 MAX_PICTURES_IN_REMARK: Final = 5
-"""Largest number of pictures that a remark names; others are counted."""
+"""Largest number of pictures that a remark names; further pictures are only counted."""
 
 MAX_DIGITS: Final = 9
 """Largest number of decimals of a learned tolerance."""
@@ -53,7 +57,7 @@ class Lesson(NamedTuple):
 
     Attributes:
         tools: settings of the tools by their keys, with the learned tolerances.
-        remarks: sentences for each tool that explain its new tolerance.
+        remarks: a text for each tool that explains the tool's new tolerance.
     """
 
     tools: dict[str, dict[str, Any]]
@@ -61,7 +65,7 @@ class Lesson(NamedTuple):
 
 
 class _Learned(NamedTuple):
-    """New settings of a tool, and their explanation."""
+    """New settings of a tool, and a sentence that explains them."""
 
     settings: dict[str, Any]
     remark: str
@@ -211,14 +215,14 @@ def _is_number(details: Any) -> bool:
 
 
 def _choose_unit(old: Tolerance | None, measured_unit: str) -> tuple[str, float]:
-    """Return the unit to write, and its ratio to the measured unit."""
+    """Return the unit of the new tolerance, and the number of measured units in this unit."""
     written = measured_unit if old is None else old.written_unit
     name, factor = UNITS[written]
     return (written, factor) if name == measured_unit else (measured_unit, 1.0)
 
 
 def _unwrap_degrees(values: Array) -> Array:
-    """Return directions in degrees, without jumps of 360 between them."""
+    """Return directions in degrees, shifted by multiples of 360 so that they lie close together."""
     if not len(values):
         return values
     turns = np.array([math.remainder(angle - values[0], 360.0) for angle in values.tolist()])
@@ -243,7 +247,7 @@ def _find_outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.
 def _tolerance_text(
     values: Array, spread: float, guard: float, old: Tolerance | None, unit: str
 ) -> str:
-    """Return the text of a tolerance for values (N,); it is one-sided if the old one is."""
+    """Return the text of a tolerance for values (N,), one-sided if the old tolerance is."""
     mean, one_sided = float(values.mean()), old is not None and math.inf in (-old.least, old.most)
     sigma_width = _tolerance_factor(len(values), one_sided=one_sided) * spread
     half = max(sigma_width, float(np.abs(values - mean).max())) + guard
@@ -262,9 +266,9 @@ def _tolerance_text(
 
 
 def _tolerance_factor(count: int, *, one_sided: bool) -> float:
-    """Return the tolerance factor of ``count`` normal values, in standard deviations.
+    """Return the half width of a tolerance from ``count`` normal values, in standard deviations.
 
-    The formulas are Howe's for two sides, and Natrella's approximation for one side.
+    The formula is Howe's for a two-sided tolerance, and Natrella's for a one-sided one.
     """
     special = load("scipy.special", "teaching measure needs")
     degrees = count - 1

@@ -148,8 +148,8 @@ class Picture:
     def ends(self) -> tuple[int, int]:
         """Saturation levels of black and white in :attr:`levels`.
 
-        These are the least and the largest possible level. If the picture's least level is 16 of 8
-        bits, or its largest level is 235, that limit of video is the saturation level.
+        These are the least and the largest level that ``depth`` allows. But if the picture's least
+        level is 16 (in 8 bits), or its largest level is 235, this limit of video is used instead.
         """
         return _saturation_levels(self.levels, self.depth)
 

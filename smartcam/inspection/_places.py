@@ -1,4 +1,4 @@
-"""Frames of reference and regions of tools in a picture.
+"""Define where tools work in a picture: frames of reference, and regions.
 
 Pixel coordinates have x to the right and y down; the centre of the upper left pixel is (0, 0), as
 in all of smartcam. Angles are in radians from x towards y, so positive angles are clockwise in the

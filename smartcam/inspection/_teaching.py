@@ -1,6 +1,6 @@
-"""Teach an application: try its tools on pictures, change them, and save them in the file.
+"""Teach an application: try its tools on pictures, change them, and save them in their file.
 
-Only changed values are written: comments, order and quotes of the YAML are kept.
+Saving writes only values that have changed, and keeps the comments, order and quotes of the YAML.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAX_FILE_BYTES: Final = 1 << 22
 """Largest size of a cell file, bytes."""
 
 LINE_WIDTH: Final = 4096
-"""Width of written lines, in characters, which is large enough to wrap none."""
+"""Width, in characters, at which written lines are wrapped; large enough that no line is."""
 
 NON_TOOL_KEYS: Final = ("name", "sequence", "rate")
 """Keys of an application that do not name tools."""

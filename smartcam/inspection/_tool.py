@@ -1,4 +1,4 @@
-"""The interface of tools: settings, fields, and a function from a view to a finding."""
+"""Define the base class of tools, their settings, and the input that a tool gets for a picture."""
 
 from __future__ import annotations
 

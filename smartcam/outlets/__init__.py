@@ -1,9 +1,9 @@
 """Delivery of results to brokers, databases and PLCs, without loss while these cannot be reached.
 
-:class:`Outlets` runs the outlets of a section ``outlets:``. Each one has a spool on the disk, and
-an account that balances. :class:`Outlet` is the base of a new kind: a class in the entry-point
-group ``smartcam.outlets``. The commands are ``smartcam serve``, ``smartcam outlet`` and
-``smartcam results``.
+:class:`Outlets` runs the outlets that a section ``outlets:`` of a file describes. Each outlet keeps
+undelivered results in a spool (a file), and counts every result. A new kind of outlet derives from
+:class:`Outlet`, and is named in the entry-point group ``smartcam.outlets``. The commands are
+``smartcam serve``, ``smartcam outlet`` and ``smartcam results``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Carry out commands to a camera that come through outlets."""
+"""Carry out commands to a camera that clients of an outlet send, such as a trigger over MQTT."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ async def do_command(
 
     Raises:
         ConfigurationError: a field is wrong or unknown.
-        SmartCamError: the outcome of the command.
+        SmartCamError: the command failed.
     """
     known = _FIELDS[verb]
     for name in arguments:

@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_HEADER_BYTES = 12
-"""Number of bytes of a packet without topic and text: kind, three lengths, number and
-properties."""
+"""Number of bytes of an MQTT packet besides its topic and its text, which are the packet's type,
+three lengths, its number and its properties."""
 
 MAX_COMMANDS = 1_000
-"""Largest number of commands under way at the same time, such as a trigger of each camera. Further
-ones are answered with an error. The same number of messages may wait before that."""
+"""Largest number of commands that run at the same time, such as a trigger of each camera. Further
+commands are answered with an error. As many received messages may wait to be read."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes of waiting commands; further ones are not answered."""
+"""Largest number of bytes of received messages that wait; further messages are not answered."""
 
 MAX_COMMAND_BYTES = 1 << 16
 """Largest number of bytes of a command's message."""
@@ -110,7 +110,7 @@ class MqttSettings(OutletSettings):
 
 
 class _CommandQueue(asyncio.Queue[Any]):
-    """A queue of messages that also has a bound on their bytes."""
+    """A queue of messages that bounds their number and their total bytes."""
 
     _bytes = 0
 
@@ -166,7 +166,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         Raises:
             ConfigurationError: a secret or the authority's file does not exist.
             MissingExtraError: aiomqtt is not installed.
-            Exception: the broker cannot be reached, or refuses.
+            Exception: the broker cannot be reached, or refuses the connection.
         """
         aiomqtt = load("aiomqtt")
         settings, online = self.settings, f"{self.settings.topic}/outlet/{self.name}"
@@ -213,7 +213,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         return context
 
     def _watch_refusals(self, client: Any) -> None:
-        """Make the client note refused messages, which aiomqtt does not report."""
+        """Note the messages that the broker refuses, since aiomqtt does not report them."""
         paho = client._client  # noqa: SLF001
         publish_inner, on_publish_inner = paho.publish, paho.on_publish
         on_connect_inner = paho.on_connect
@@ -276,7 +276,7 @@ class MqttOutlet(Outlet[MqttSettings]):
     async def _publish_while_connected(self, calls: list[Any]) -> None:
         """Await calls that publish; raise if the connection to the broker is lost before.
 
-        The messages are sent in order, without waiting for the acknowledgement of each.
+        The messages are sent in order. No message waits for the acknowledgement of the one before.
         """
         connection_task = self._connection_task
         if connection_task is None:
@@ -298,7 +298,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             raise OutletError(f"the broker refused a message: {self._refusal_reason}")
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
-        """Schedule the camera's state to be published, retained."""
+        """Have the camera's state published soon, as a retained message."""
         if camera in self._states or len(self._states) < MAX_STATES:
             self._states[camera] = state
             self._unsent_states.add(camera)

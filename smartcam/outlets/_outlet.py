@@ -1,4 +1,4 @@
-"""The base of outlets: the class that a plug-in derives from."""
+"""Define the base class of outlets, from which plug-ins derive their own outlet."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SettingsT = TypeVar("SettingsT", bound="OutletSettings")
 
 
 class OutletContext:
-    """Functions of the process that has the cameras, which an outlet may call.
+    """Functions that an outlet may call; the process that runs the cameras provides them.
 
     Args:
         columns: function that returns names, types and units of the values of a camera's
@@ -50,10 +50,10 @@ Column = tuple[str, str, str]
 class Outlet(ABC, Generic[SettingsT]):
     """The base class of outlets; derive from it, and name the class in an entry point.
 
-    An outlet only delivers. Its caller queues, counts and repeats: it calls :meth:`open` first,
-    then :meth:`deliver` for one batch after the other, in order. If one of them raises an
-    exception, the far end cannot be reached: the caller calls :meth:`close`, and after a delay
-    :meth:`open` again, then :meth:`deliver` with the same batch.
+    An outlet only delivers entries to a receiver, the *far end*, such as a broker or a database.
+    Its caller queues, counts and repeats: the caller calls :meth:`open`, then :meth:`deliver` for
+    one batch after the other. If a method raises an exception, the far end counts as unreachable:
+    the caller calls :meth:`close`, after a delay :meth:`open`, and delivers the same batch again.
 
     Args:
         name: name of the outlet.
@@ -84,18 +84,22 @@ class Outlet(ABC, Generic[SettingsT]):
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Deliver entries, and return when the far end has stored all of them.
 
-        If it is unknown whether a batch arrived, it comes again: send each entry's ``id``.
+        If it is unknown whether a batch arrived, the caller delivers the batch again. So send the
+        ``id`` of each entry, by which the far end recognizes a repetition.
 
         Raises:
-            EntryRefusedError: the far end will never accept one of them.
-            Exception: the far end cannot be reached; the batch comes again.
+            EntryRefusedError: the far end will never accept one of the entries.
+            Exception: the far end cannot be reached; the caller will deliver the batch again.
         """
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
         """Handle a camera's state: ``connected``, ``application``, ``reason``; return at once."""
 
     def stored(self, question: StoreQuestion) -> StoredResults | None:
-        """Return the results at the far end; None if it has no query. Called in a thread."""
+        """Return results that the far end has stored; None if it cannot be queried.
+
+        Called in a thread.
+        """
         return None
 
     async def watch(self) -> None:

@@ -1,4 +1,4 @@
-"""Run all outlets of a process, which get the results, errors and states of cameras."""
+"""Run all outlets of a process, and pass the cameras' results, errors and states to them."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from smartcam.outlets._stored import StoredResults
 
 SWITCH_INTERVAL = 0.0005
-"""Switch interval of the interpreter's threads while outlets run, seconds. With the usual 5 ms, a
-result that comes while a spool is written could wait that long."""
+"""Python's switch interval between threads while outlets run, seconds. With Python's default of
+5 ms, a result that arrives while a thread writes a spool could wait for 5 ms."""
 
 RESULT_BYTES = 600
 """Approximate number of bytes of a result in memory, without its container."""
@@ -59,8 +59,8 @@ class Outlets(Server):
         columns: function that returns names, types and units of an application's values, by its
             layout.
         command: function that carries out a command from an outlet.
-        on_trouble: function that is called with an outlet's name and its trouble, and with "" when
-            that is over.
+        on_trouble: function that is called with an outlet's name and the reason why the outlet
+            cannot deliver or spool, and with "" when it can again.
         cameras: function that returns the cameras' names, and whether each is emulated; None if
             that is not known.
         names: function that returns the names of a camera's applications, with their numbers.
@@ -108,7 +108,7 @@ class Outlets(Server):
         self._started: list[Pump] = []
 
     async def start(self) -> None:
-        """Open the spools, and begin to deliver; a far end that cannot be reached is no error.
+        """Open the spools, and begin to deliver. An unreachable broker or database is no error.
 
         Raises:
             ConfigurationError: a spool cannot be opened, or another process has it.
@@ -147,7 +147,7 @@ class Outlets(Server):
         }
 
     def stored(self, question: StoreQuestion) -> dict[str, StoredResults]:
-        """Return the results at far ends with a query, by the outlet's name; blocks.
+        """Return the results in the outlets' stores, by the outlet's name; blocks.
 
         Raises:
             ConfigurationError: one of the stores cannot be read now.

@@ -28,7 +28,7 @@ T = TypeVar("T")
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_WAITING = 20_000
-"""Largest number of entries that wait in memory for the spool's disk."""
+"""Largest number of entries that wait in memory to be written to the spool."""
 
 MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes of the entries that wait in memory."""
@@ -37,20 +37,20 @@ MAX_WRITE_BATCH = 500
 """Largest number of entries that are written to the spool in one transaction."""
 
 GATHER_TIME = 0.002
-"""Seconds for which entries are collected in memory before they are written together. So a write
-does not delay the trigger, and many results need a single write."""
+"""Seconds for which entries are collected in memory before they are written together. A write is
+thus not part of a trigger's latency, and many results need a single write."""
 
 DISK_RETRY_SECONDS = 1.0
-"""Seconds until a disk that was full or unavailable is tried again."""
+"""Seconds until the next try to write to a disk that was full or unavailable."""
 
 STOP_TIMEOUT = 10.0
-"""Seconds for writing the waiting entries at the end."""
+"""Largest number of seconds that :meth:`Pump.stop` spends on writing the waiting entries."""
 
 FINAL_DELIVERY_TIMEOUT = 1.0
-"""Seconds for delivering spooled entries at the end, if the server accepts them."""
+"""Largest number of seconds that :meth:`Pump.stop` spends on delivering spooled entries."""
 
 CLOSE_TIMEOUT = 5.0
-"""Seconds for an outlet's ``close``."""
+"""Largest number of seconds for an outlet's ``close``."""
 
 
 class Arrival(NamedTuple):
@@ -138,7 +138,7 @@ class Pump:
         try:
             await self._cancel_tasks(self._tasks[:1])
             if self._open:
-                with contextlib.suppress(Exception):  # the next start adds a gap for the rest
+                with contextlib.suppress(Exception):  # the next start adds a gap for unwritten ones
                     async with asyncio.timeout(STOP_TIMEOUT):
                         while self._waiting or self._dropped:
                             await self._store_waiting()
@@ -183,7 +183,7 @@ class Pump:
         if (
             len(self._waiting) >= MAX_WAITING
             or self._waiting_bytes + size > MAX_WAITING_BYTES
-            or self._dropped  # entries may not come before the gap of earlier ones
+            or self._dropped  # the gap for dropped entries must be written before later entries
         ):
             self._dropped[camera] = arrival, self._dropped.get(camera, (arrival, 0))[1] + 1
         else:
@@ -294,7 +294,7 @@ class Pump:
         try:
             outcome = await asyncio.shield(running)
         except asyncio.CancelledError:
-            await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # a disk may hang forever
+            await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # bounded: a disk may hang forever
             if running.done() and running.exception() is None:
                 on_done(running.result())
             raise
@@ -377,7 +377,7 @@ class Pump:
         return True
 
     async def _remove_delivered(self, head: SpoolHead, count: int | None, refused: str) -> None:
-        """Remove delivered entries, so that none is sent twice; wait while the disk is full."""
+        """Remove delivered entries, so that none is sent twice; retry while the disk is full."""
 
         def work() -> OutletAccount:
             self.spool.remove_delivered(head, count, refused)

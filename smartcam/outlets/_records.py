@@ -26,7 +26,7 @@ def picture_of(pattern: str, folder: Path, fields: Mapping[str, Any]) -> Path | 
 
 
 def records_of(value: Any) -> list[dict[str, Any]] | None:
-    """Return the records of a value, each a mapping of plain values; None if it has none."""
+    """Return the records of a value as mappings of plain values; None if it has no records."""
     if isinstance(value, dict):
         fields = cast("dict[str, Any]", value)
         lists = [name for name, field in fields.items() if isinstance(field, list)]

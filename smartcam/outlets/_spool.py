@@ -31,7 +31,7 @@ MIN_FREE_PLACES = 1 << 32
 """Least number of free places after the last one. If there are fewer, the file is damaged."""
 
 MAX_REASON_CHARACTERS = 500
-"""Largest number of characters of a gap's reasons; several gaps may become one."""
+"""Largest number of characters of a gap's reason; joined gaps have several reasons."""
 
 MAX_DAMAGED_FILES = 3
 """Largest number of damaged files that are kept in the folder of the spool."""
@@ -111,7 +111,7 @@ class Spool:
         self._lock: int | None = None
 
     def open(self) -> None:
-        """Open the file; also after an error closed it."""
+        """Open the file, for the first time or after an error has closed it."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self._lock is None:
             self._lock = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
@@ -128,7 +128,7 @@ class Spool:
         self._write_epoch(self.epoch)
 
     def replace_damaged(self, why: str) -> None:
-        """Rename the damaged file, and go on with a new one that has its readable entries."""
+        """Rename the damaged file, and copy its readable entries to a new file."""
         database, self._database = self._database, None
         if database is not None:
             database.close()
@@ -170,7 +170,7 @@ class Spool:
         file_epoch, lock_epoch = counts.get("epoch", 0), self._read_epoch()
         self.epoch = max(file_epoch + 1, lock_epoch + 1, time.time_ns() // 1000)
         with _transaction(database):
-            if counts.get("running"):  # no regular end: results that waited in memory are lost
+            if counts.get("running"):  # the process crashed: results that were in memory are lost
                 why = "the process ended at once; what came behind the last entry may be missing"
                 for camera, epoch, number in _last_numbers(database):
                     _add_gap(database, _make_gap(camera, epoch, number + 1), 0, why, 0)
@@ -183,7 +183,7 @@ class Spool:
         self._counts = {**counts, "epoch": self.epoch, "running": 1}
 
     def _read_epoch(self) -> int:
-        """Return the epoch in the lock file, which remains if the spool is deleted."""
+        """Return the epoch in the lock file, a file of its own that outlives a deleted spool."""
         if self._lock is None:
             return 0
         os.lseek(self._lock, 0, os.SEEK_SET)
@@ -443,7 +443,7 @@ def _open_connection(path: Path) -> sqlite3.Connection:
 
 
 def _check_versions(path: Path) -> None:
-    """Check the versions in the file's header, since SQLite opens a wrong version read-only.
+    """Check the file's format versions: with a damaged one, SQLite would open the file read-only.
 
     Raises:
         sqlite3.DatabaseError: the entries are damaged.
@@ -480,7 +480,7 @@ def _account(counts: Mapping[str, int], spooled: int) -> OutletAccount:
 
 
 def _balance(database: sqlite3.Connection, counts: dict[str, int]) -> int:
-    """Correct counts so that they fit the entries in the file; return how many entries are lost."""
+    """Correct the counts to fit the entries in the file; return the number of lost entries."""
     spooled, _ = database.execute(_TOTALS).fetchone()
     account = _account(counts, int(spooled))
     accounted = account.delivered + account.spooled + sum(account.dropped.values())
@@ -507,7 +507,7 @@ def _write_counts(database: sqlite3.Connection, new: Mapping[str, int]) -> None:
 
 
 def _write_last_numbers(database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> None:
-    """Write the last number of each camera; after a crash, a gap is added behind it."""
+    """Write the number of each camera's last entry; after a crash, a gap follows this number."""
     last = {entry.camera: (entry.camera, entry.epoch, entry.number) for entry in entries}
     database.executemany("INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)", last.values())
 
@@ -572,7 +572,7 @@ def _add_gap(
         why: reason.
         in_flight: place up to which entries are being delivered, and must not change.
         place: place of the gap; None: the end.
-        at_least: whether more entries may be missing than ``count``.
+        at_least: whether more entries than ``count`` may be missing.
     """
     at_least, joined_places, reasons = at_least or count == 0, list[tuple[int]](), [why]
     for older_place, checksum, *fields in database.execute(

@@ -41,7 +41,7 @@ MAX_COLUMNS = 500
 MAX_COLUMN_CHARACTERS = 100
 
 EXPIRE_INTERVAL = 60.0
-"""Seconds between two searches for results to delete."""
+"""Seconds between two searches for results that are too old, and are deleted."""
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS results(
@@ -142,8 +142,8 @@ async def _wait_for_thread(running: Future[None]) -> None:
 class _StoreFile:
     """A connection to the store's file, and the only thread that uses the connection.
 
-    A disk may block the thread for longer than the outlet waits. The store is opened again only
-    when the thread has closed this connection.
+    A slow disk may block the thread after the outlet has stopped waiting. So the outlet opens a new
+    connection only after the thread has closed this one.
 
     Args:
         name: name of the outlet.
@@ -160,7 +160,7 @@ class _StoreFile:
         self._database: sqlite3.Connection | None = None
         self._columns: dict[
             tuple[str, int], dict[str, str]
-        ] = {}  # columns that are known in one batch
+        ] = {}  # columns that were looked up for the current batch
         self._expired_at = 0.0
         self._identity: object = None  # device and number of the opened file
 
@@ -236,7 +236,8 @@ class _StoreFile:
 
         Raises:
             EntryRefusedError: an entry cannot be written; then none is written.
-            OutletError: the file was moved or deleted meanwhile, so these entries are lost.
+            OutletError: the file was moved or deleted meanwhile, so the entries must be written
+                again to a new file.
         """
         self._columns.clear()  # a layout may have changed, or a transaction been rolled back
         with _transaction(database):
@@ -383,7 +384,7 @@ _REFUSING_ERRORS = (
     ValueError,
     sqlite3.DataError,
 )
-"""Errors that the same entry would cause at each repetition, so that it is refused."""
+"""Errors that writing an entry again would not avoid; so the entry is refused."""
 
 
 def _encodable(value: Any) -> Any:

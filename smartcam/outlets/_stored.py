@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 READ_TIMEOUT = 20.0
-"""Seconds of the timeout of a query."""
+"""Largest number of seconds for one query."""
 
 STEPS_BETWEEN_CHECKS = 10_000
 """Number of steps of SQLite's virtual machine between two checks of the time."""
@@ -52,8 +52,8 @@ class StoredResults(NamedTuple):
         rows: rows, the oldest first: ``id``, ``camera``, ``kind``, ``at``,
             ``application``, ``sequence``, ``latency``, ``error``, ``lost``, ``at_least``,
             ``value``, ``picture``.
-        total: number of results, errors and gaps that match time and cameras, also of those that
-            are not in ``rows``.
+        total: number of results, errors and gaps that match the question's time and cameras,
+            including those that are not in ``rows``.
         failed: number of errors, gaps, and results that did not pass.
         errors: number of errors.
         gaps: number of gaps.
@@ -71,7 +71,7 @@ class StoredResults(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Everything but the rows."""
+        """Return all fields except ``rows``."""
         fields = self._asdict()
         del fields["rows"]
         return fields

@@ -121,7 +121,7 @@ class CloudSite(ThreadedSite):
             self._packing_job = None
 
     async def newer(self, number: int) -> tuple[int, _PackedCloud]:
-        """Wait for a cloud after a number; return its number, and the cloud packed for all viewers.
+        """Wait for a cloud with a higher number; return the number and the packed cloud.
 
         Cancellation: safe; other callers that wait for the cloud still get it.
         """
@@ -152,9 +152,9 @@ def _mark_retrieved(future: asyncio.Future[_PackedCloud]) -> None:
 
 
 def pack_cloud(cloud: Cloud) -> _PackedCloud:
-    """Return a cloud as it is sent, thinned if it is large; call it in a thread.
+    """Return a cloud in the form in which it is sent, thinned if it is large; call it in a thread.
 
-    If that fails, return the reason as what is sent.
+    If packing fails, the returned message has the reason for the page, and no points.
     """
     try:
         return _pack_points(cloud)
@@ -190,7 +190,7 @@ def thin_cloud(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
     if len(cloud) <= most:
         return cloud, None
     extent = float(np.ptp(cloud.points.astype(np.float64), axis=0).max())
-    # not below the precision of float32 at this distance from the origin
+    # a voxel must not be smaller than float32's resolution at the farthest point
     size = max(extent / 1024, 1e-6 * float(np.abs(cloud.points).max()), 1e-9)
     while len(thin := voxel_grid(cloud, size)) > most:
         size *= max(1.05, (len(thin) / most) ** 0.5)  # a surface has about 1 / size**2 voxels
@@ -214,7 +214,11 @@ class CloudViewer(PageSocket):
             self._site.viewers.discard(self)
 
     async def _send_messages(self) -> None:
-        """Send each new cloud when the page has shown the last one; TimeoutError: too slow."""
+        """Send each new cloud when the page has shown the last one.
+
+        Raises:
+            TimeoutError: the page did not show a cloud within :data:`SHOW_TIMEOUT`.
+        """
         number = 0
         while True:
             number, cloud = await self._site.newer(number)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource
 
 MAX_WAITING_REQUESTS: Final = 16
-"""Largest number of requests that wait for a frame at a time: two of each of eight viewers."""
+"""Largest number of requests that may wait for a frame at a time: two from each of 8 viewers."""
 
 MAX_VIEWERS_KEPT: Final = 8
 """Largest number of viewers whose pictures are kept."""
@@ -152,7 +152,7 @@ class ColourSite(ThreadedSite):
         raise RefusedError(409, f"{which} that is not kept any longer", "the one that is shown")
 
     async def work(self, what: Callable[..., T], *args: object) -> T:
-        """Run a function on a frame in a thread.
+        """Return the result of a function that reads a frame; the function runs in a thread.
 
         Raises:
             RefusedError: the frame's bytes are wrong, or the site is stopped.

@@ -1,8 +1,8 @@
-"""Bound the connections of a site: their number, and their time for a request.
+"""Bound the number of a site's connections, and how long each may take to send a request.
 
-The rules are those of every port of smartcam (:mod:`smartcam._accepting`), and apply before the
-token is checked. While a complete request is answered, its connection is not closed in favour of
-another one.
+The rules are the same for every port of smartcam (:mod:`smartcam._accepting`), and apply before the
+token is checked. A connection whose complete request is being answered is never closed to make room
+for another one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _BUSY = (
 
 
 class SiteConnections:
-    """Makes the connections of a site, and knows whether the site is closed.
+    """Creates the connections of a site, and bounds their number.
 
     Args:
         make_protocol: function that returns a new HTTP protocol for a connection.
@@ -65,7 +65,7 @@ class SiteConnections:
 
 
 class SiteConnection(asyncio.Protocol):
-    """A connection, between its transport and its HTTP protocol."""
+    """A connection: passes bytes from the transport to aiohttp's HTTP protocol, within bounds."""
 
     _transport: asyncio.Transport
 
@@ -73,7 +73,7 @@ class SiteConnection(asyncio.Protocol):
         self.keeps_place: bool = False  # whether a complete request is being answered
         self._connections = connections
         self._acceptor = connections.acceptor
-        self._inner: asyncio.Protocol | None = None  # the HTTP protocol; None: refused
+        self._inner: asyncio.Protocol | None = None  # the HTTP protocol; None: connection refused
         self._head: bytearray | None = None  # received part of an unfinished head
         self._awaits_request = (
             False  # whether the last request was answered, and no byte came since
@@ -150,7 +150,7 @@ class SiteConnection(asyncio.Protocol):
 
     @contextlib.contextmanager
     def answering(self) -> Iterator[None]:
-        """Keep the connection open during the block, which answers a complete request."""
+        """Keep the connection from being closed for another one, while the block answers."""
         self.keeps_place = True
         try:
             yield

@@ -1,4 +1,4 @@
-"""Define the emulator's site: its page, and an HTTP call for every action of the page."""
+"""Define the emulator's site: a page for emulated cameras, and an HTTP call for each action."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ MAX_NAMES = 20
 class EmulatorSite(Site):
     """A page and HTTP calls that show and control emulated cameras.
 
-    The site runs in the emulators' own event loop. Emulators may be started and stopped at any
-    time: each call looks up the camera in the mapping.
+    The site runs in the emulators' event loop. Emulators may be started, stopped, added and removed
+    at any time, since each call looks up the camera in ``cameras``.
 
     ::
 
@@ -85,7 +85,9 @@ class EmulatorSite(Site):
     async def wait_for(
         self, request: web.Request, condition: Callable[[], bool], seconds: float
     ) -> None:
-        """Wait until a condition is true, the time is over, or the site or the client is gone.
+        """Wait until a condition is true, at most for some seconds.
+
+        The wait also ends when the site stops or the client disconnects.
 
         Raises:
             RefusedError: 503, :data:`MAX_WAITING_CHANGES` calls wait already.

@@ -1,4 +1,4 @@
-"""Fetch the pictures of a fleet's failures, with or without viewers."""
+"""Fetch a picture from each camera of a fleet whose last result failed, also without viewers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ CAMERA_PERIOD: Final = 10.0
 """Least number of seconds between two pictures of one camera."""
 
 NEWER_RESULT_DELAY: Final = 0.2
-"""Seconds to wait, after a picture, for a newer result that the camera may already have."""
+"""Seconds to wait after fetching a picture: a newer result that arrives meanwhile may belong to the
+picture."""
 
 MAX_BYTES: Final = 1 << 28
 """Largest number of bytes that the pictures of all cameras may have together."""
@@ -63,7 +64,7 @@ class FailurePictures:
                 return
             data = await camera.read_image()
         except SmartCamError:
-            return  # the live page shows the camera's error
+            return  # not reported here: the live page shows the camera's error
         await asyncio.sleep(NEWER_RESULT_DELAY)
         if row.failure != serial:
             return

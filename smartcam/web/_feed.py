@@ -13,18 +13,19 @@ if TYPE_CHECKING:
     from smartcam.emulator import WireCamera
 
 MAX_LOG_NEWS = 200
-"""Largest number of log entries in one event: 2000 messages per second at ten events a second."""
+"""Largest number of log entries in one event; with ten events a second, up to 2000 entries a
+second are sent."""
 
 MAX_FAULTS_TOLD = 100
 """Largest number of faults that one event reports."""
 
 LOOKS_PER_CLOCK = round(1.0 / PERIOD)
-"""Number of looks for changes between two reports of the clock, which come once a second. A report
-also detects a reader that is gone."""
+"""Number of checks for changes between two reports of the clock, so that a report is sent once a
+second. Sending a report also detects that the reader is gone."""
 
 
 class EmulatorWatcher:
-    """Knows what one reader has received about a camera, and finds later changes.
+    """Remembers what one reader has received about a camera, and finds later changes.
 
     ``since``: serial of the first log entry to send; None: only new entries.
     """
@@ -37,7 +38,7 @@ class EmulatorWatcher:
         self._look_count = 0
 
     def find_events(self) -> Iterator[StreamEvent]:
-        """Yield the changes since the last call; the first call yields everything but the log."""
+        """Yield the changes since the last call; the first call yields the whole state."""
         emulator = self._emulator
         log = self._log_event()
         yield from self._event_if_changed("camera", serialize.camera_state(self._name, emulator))

@@ -36,7 +36,7 @@ MAX_CAMERAS: Final = 16
 """Largest number of cameras whose own page is open, or was shortly before."""
 
 LINGER: Final = 30.0
-"""Seconds for which a camera is still followed after its own page has no viewer any more."""
+"""Seconds for which the site still follows a camera after the last viewer of its page has left."""
 
 VIEWER_CHECK_PERIOD: Final = 1.0
 """Seconds between two checks for viewers."""
@@ -149,7 +149,7 @@ class FleetSite(Site):
     # ------------------------------------------------------------------ one camera
 
     def live(self, name: str) -> WatchedCamera:
-        """Return the follower of a camera for its own page; make it if there is none.
+        """Return the camera with this name; begin to follow it for its own page if needed.
 
         Raises:
             RefusedError: 404, no camera has this name; 503, there are :data:`MAX_CAMERAS` already.
@@ -177,7 +177,7 @@ class FleetSite(Site):
         return live
 
     async def _update_live_cameras(self) -> None:
-        """Stop following cameras without viewers; follow the new object of a replaced camera."""
+        """Stop following cameras without viewers; replace objects of cameras that have ended."""
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(VIEWER_CHECK_PERIOD)

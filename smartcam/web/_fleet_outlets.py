@@ -1,4 +1,4 @@
-"""Ask agents for their outlets, once for all viewers of a fleet's page."""
+"""Ask a fleet's agents for the counts of their outlets, and for stored results, for its page."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from smartcam.fleet._inside import ReportedOutlet, ReportedStore
 
 ANSWER_AGE: Final = 2.0
-"""Seconds for which one answer is used for all pages."""
+"""Seconds for which the agents' last answer is reused, for all viewers of the page."""
 
 MAX_STORE_QUESTIONS: Final = 4
-"""Largest number of questions to the stores that are under way."""
+"""Largest number of questions to stores that may run at the same time."""
 
 
 class StoredQuery(BaseModel):
@@ -34,7 +34,7 @@ class StoredQuery(BaseModel):
 
 
 class OutletsView:
-    """Asks agents for their outlets.
+    """Asks a fleet's agents about their outlets.
 
     Args:
         fleet: an open fleet, which the caller closes.
@@ -48,7 +48,7 @@ class OutletsView:
         self._store_questions = asyncio.Semaphore(MAX_STORE_QUESTIONS)
 
     async def accounts(self) -> list[ReportedOutlet]:
-        """Return the accounts of all outlets, at most :data:`ANSWER_AGE` seconds old.
+        """Return the counts of all outlets, at most :data:`ANSWER_AGE` seconds old.
 
         Raises:
             RefusedError: 503, the fleet is closed.
@@ -64,7 +64,7 @@ class OutletsView:
             return self._accounts
 
     async def stored(self, query: StoredQuery) -> list[ReportedStore]:
-        """Return the answers of the stores.
+        """Return the stored results that match a query, from all agents' stores.
 
         Raises:
             RefusedError: 422, the pattern is not valid; 503, the fleet is closed.

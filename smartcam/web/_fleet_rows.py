@@ -1,4 +1,4 @@
-"""Keep the row of a camera in the table of a fleet: its state, its counts, its last result."""
+"""Keep one row of the fleet page's table: a camera's state, its counts and its last result."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MAX_TEXT_CHARACTERS: Final = 160
 """Largest number of characters of a text in a row."""
 
 RATE_SECONDS: Final = 5
-"""Number of seconds from which a rate is computed."""
+"""Number of seconds over which the rate of results is averaged."""
 
 ERROR_MARK_SECONDS: Final = 60.0
 """Seconds for which a row shows an error."""
@@ -169,7 +169,7 @@ class FleetRow:
     # ------------------------------------------------------------------ updates
 
     async def count_results(self, now: float) -> collections.Counter[str]:
-        """Count the new results, and return the numbers of their outcomes; never wait."""
+        """Count the new results, and return how many there are of each outcome; never wait."""
         outcomes: collections.Counter[str] = collections.Counter()
         stream, was_full = self._results, False
         while stream is not None and stream.waiting:
@@ -213,7 +213,7 @@ class FleetRow:
         self.error, self.error_at = error[:MAX_TEXT_CHARACTERS], now
 
     def refresh(self, now: float) -> tuple[bool, bool]:
-        """Update the camera's state; return whether it changed, and whether the camera was lost."""
+        """Update the camera's state; return whether it changed, and whether it was just lost."""
         camera = self.camera
         connected = camera is not None and camera.connected and bool(self.agents)
         lost = self._connected and not connected
@@ -270,14 +270,18 @@ class FleetRow:
         return "running" if state.status & Status.RUNNING else "stopped"
 
     def update_rate(self) -> bool:
-        """Compute the rate, once per second; return whether it will change without new results."""
+        """Compute the rate; call it once a second.
+
+        Returns:
+            Whether the rate will change even without new results.
+        """
         self._counts_by_second.append(self.count)
         self.rate = (self.count - self._counts_by_second[0]) / (len(self._counts_by_second) - 1)
         return self._counts_by_second[0] != self.count
 
     @property
     def failure(self) -> int:
-        """Serial of the newest result if it is a failure; 0 if it is not, or is not counted yet."""
+        """Serial of the newest result if it is a failure; otherwise, or if not counted yet, 0."""
         has_uncounted = self._results is None or self._results.waiting
         return 0 if has_uncounted else self.history.last_failure
 
@@ -383,7 +387,7 @@ def _flags(mode: str, state: RowState, *, has_error: bool) -> frozenset[str]:
 
 
 def line_of(value: Any, units: Any, shown: ShownUnits = SI) -> str:
-    """Return a value in one line.
+    """Return a value as a text of one line.
 
     Args:
         value: value in its JSON form.

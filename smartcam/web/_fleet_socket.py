@@ -1,4 +1,4 @@
-"""Serve the WebSocket of a fleet's page, which gets the changes of the rows in sight."""
+"""Serve the WebSocket of a fleet's page: send the changes of the rows that the page shows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROTOCOL: Final = "smartcam.fleet"
 """Subprotocol of the WebSockets that send the fleet's table."""
 
 MAX_ROWS: Final = 120
-"""Largest number of rows that may be in sight: three times the rows of a tall screen."""
+"""Largest number of rows that a page may show at a time: three times those of a tall screen."""
 
 MAX_SEARCH_CHARACTERS: Final = 100
 """Largest number of characters of a search text."""
@@ -37,7 +37,7 @@ ALIVE_INTERVAL: Final = 5.0
 alive."""
 
 QUICK_INTERVAL: Final = 0.05
-"""Seconds that must pass between two messages to a page that scrolls or searches."""
+"""Least number of seconds between two messages to a page that scrolls or searches."""
 
 ROWS_PER_TURN: Final = 10
 """Largest number of rows that are converted to JSON in one turn of the event loop."""
@@ -85,7 +85,7 @@ class FleetSocket(PageSocket):
         self._versions_sent: dict[str, int] = {}  # versions of the rows that the page has
         self._window: tuple[
             Any, ...
-        ] = ()  # number of found rows, first row and names that the page has
+        ] = ()  # last sent to the page: number of found rows, first shown row, names of the rows
         self._totals: dict[str, Any] = {}
         self._totals_at = -TOTALS_INTERVAL
         self._bars = 0  # start of the last bar of outcomes that the page has

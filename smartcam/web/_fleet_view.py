@@ -1,8 +1,8 @@
 """Keep the data of a fleet's page: follow the fleet once for all viewers.
 
-One task updates the changed rows five times per second, which costs nothing without changes. It
-does not wait for viewers. They ask for rows in an order, and compare versions of rows to find
-changes.
+One task updates the changed rows five times per second; without changes there is no work. The task
+does not wait for viewers. Each viewer asks for rows in an order, and compares the rows' version
+numbers with those that it has, to find changes.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ PERIOD: Final = 0.2
 """Seconds between two updates of the rows, and between two updates of a page."""
 
 MAX_EVENTS: Final = 50_000
-"""Largest number of events of the fleet between two updates; after more, the whole fleet is read
-again."""
+"""Largest number of events of the fleet between two updates; if there are more, the whole fleet is
+read again."""
 
 MAX_UNSHARED: Final = 10_000
-"""Largest number of shown cameras that no agent shares any more. Beyond it, those that are gone for
-the longest time are forgotten."""
+"""Largest number of shown cameras that no agent shares any more. If there are more, the cameras
+that disappeared first are forgotten."""
 
 ITEMS_PER_TURN: Final = 50
 """Largest number of rows or results that are handled in one turn of the event loop."""
@@ -49,8 +49,8 @@ SERIES_DURATION: Final = 600
 """Seconds over which outcomes are kept."""
 
 ORDER_DURATION: Final = 1.0
-"""Seconds for which an order of rows stays although rows change, since jumping rows cannot be
-read."""
+"""Seconds for which the rows keep their order although their values change, since people cannot
+read rows that jump."""
 
 MAX_ORDERS: Final = 64
 """Largest number of orders that are kept for viewers."""
@@ -80,7 +80,7 @@ class RowOrder(NamedTuple):
     """The names of a query's rows, in their order."""
 
     names: list[str]
-    version: int  # version of the view when the order was made
+    version: int  # the view's version number when the order was made
     made_at: float  # time of the loop's clock
 
 
@@ -129,7 +129,7 @@ class FleetView:
     # ------------------------------------------------------------------ start and stop
 
     async def start(self) -> None:
-        """Start to follow the fleet; when this returns, all present cameras are known."""
+        """Start to follow the fleet; return when all cameras that agents share now are known."""
         if self._task is None:
             self.ended = False
             await self._read_fleet()

@@ -3,12 +3,12 @@
 A page of another web site runs in the same browser and can send requests to this machine. It must
 neither read nor change anything here, whatever name it uses for this machine:
 
-- *Host* must name this machine if no token is required; if the site listens on loopback only, by a
-  name of loopback. A foreign name that resolves to this machine (DNS rebinding) is refused.
+- If no token is required, *Host* must be a name of this machine; if the site listens on loopback
+  only, a name of loopback. Other names that resolve to this machine (DNS rebinding) are refused.
 - *Origin*, which a browser sends with each change, must be the site itself; *Sec-Fetch-Site* must
-  not name another.
-- With a token, each call carries it in ``Authorization``; a WebSocket, for which a browser's page
-  can set no header, among its protocols. Pages of other sites do not know it.
+  not name another site.
+- If a token is required, each call carries the token in ``Authorization``. A browser cannot set
+  this header for a WebSocket, so a WebSocket carries the token as a subprotocol.
 """
 
 from __future__ import annotations

@@ -46,9 +46,9 @@ class Failure:
     """Equal failures in a row: failed or unreadable results, or a lost connection.
 
     Attributes:
-        serial: number of the failure, from 1.
-        at: time of the first one, seconds since 1970.
-        until: time of the last one.
+        serial: number of this entry among all failures, from 1.
+        at: time of the first of the equal failures, seconds since 1970.
+        until: time of the last of the equal failures, seconds since 1970.
         number: number of the first failed result; None if no result belongs to the failure.
         what: text of the failure.
         count: number of equal failures.
@@ -66,10 +66,10 @@ class ShiftHistory:
     """The outcomes and failures of one camera during the last shift.
 
     Attributes:
-        version: number of changes.
+        version: number of changes so far, by which a reader detects a change.
         failed_since: time of the first failure after the last pass, seconds since 1970; None if
             the last result with a verdict has passed.
-        in_a_row: number of failed results since the last pass.
+        in_a_row: number of failed results since the last result that passed.
         totals: results of the shift by their outcomes, in the order of :data:`KINDS`.
     """
 
@@ -154,7 +154,7 @@ class ShiftHistory:
         return self._newest_failure > 0 and self._newest_failure not in self._pictures
 
     def attach_picture(self, serial: int, picture: bytes) -> None:
-        """Keep the first picture of a failure; drop those of the oldest failures if necessary."""
+        """Keep a failure's first picture; drop the oldest failures' pictures to make room."""
         if not serial or serial in self._pictures or len(picture) > MAX_PICTURE_BYTES:
             return
         self._pictures[serial] = picture
@@ -199,8 +199,9 @@ class ShiftHistory:
         """Return the short trend, for a row of a table.
 
         ``end`` is the end of the last slot, seconds since 1970. ``places`` has one character for
-        each slot of :data:`SLOT_SECONDS`: the tenths of its results with a verdict that are bad,
-        rounded up (X: all are bad); ``-`` if no result had a verdict, a space without results.
+        each slot of :data:`SLOT_SECONDS`. A digit is the share of failed results and errors, in
+        tenths, rounded up, among these and the results that passed; ``X``: all failed; ``-``: no
+        result had a verdict; a space: no results.
         """
         if not self._bars:
             return {"end": 0, "places": ""}

@@ -1,4 +1,4 @@
-"""Turn a frame into a JPEG for viewers, with its colours at 8 bits."""
+"""Turn a frame of any pixel format into a JPEG with 8 bits per colour, for viewers."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ HUFFMAN_TABLES: Final = b"\xff\xc4"
 a JPEG."""
 
 HEAD_BYTES: Final = 4096
-"""Number of bytes at the start of a JPEG that are searched for the tables."""
+"""Number of bytes at the start of a JPEG in which the Huffman tables are looked for."""
 
 DIRECT_FORMATS: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
-"""Formats that can be encoded as a JPEG without a conversion. Formats of Y, U and V can, too."""
+"""Formats that can be encoded as a JPEG without a conversion, in addition to YUV formats."""
 
 
 def jpeg(frame: Frame, quality: int) -> bytes:
@@ -77,7 +77,8 @@ def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
     """Return the pixels to show: (H, W, 3), red first; (H, W) for a frame without colours.
 
     Raises:
-        FrameFormatError: the frame's bytes are wrong, or ``grey`` is set and it has no brightness.
+        FrameFormatError: the frame's bytes are wrong, or ``grey`` is set and the format has no
+            brightness.
         MissingExtraError: a codec of a compressed format or a Bayer pattern is not installed.
     """
     if frame.format.name in {"PNG", "JPEGXL"}:

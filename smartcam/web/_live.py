@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from smartcam.web._live_camera import ShowsCamera
 
 MAX_NEWS = 20
-"""Largest number of results in one event. With ten events a second the page gets 200 results a
-second, and the number of results that it missed."""
+"""Largest number of results in one event. With ten events a second the page gets up to 200 results
+a second; of further results it gets only the number."""
 
 LOOKS_PER_CLOCK = round(1.0 / PERIOD)
-"""Number of looks for changes between two reports of clock and account, which come once a
-second."""
+"""Number of checks for changes between two reports of the clock and of the counts, so that a report
+is sent once a second."""
 
 
 class LiveSite(Site):
@@ -96,7 +96,7 @@ class LiveSite(Site):
 
 
 class LiveReader:
-    """Knows what one reader has received about a camera, and finds later changes."""
+    """Remembers what one reader has received about a camera, and finds later changes."""
 
     def __init__(self, site: ShowsCamera, since: int | None = None) -> None:
         self._site = site
@@ -125,7 +125,7 @@ class LiveReader:
 
     def _result_events(self) -> Iterator[StreamEvent]:
         view = self._view
-        if self._serial > view.serial:  # the reader's number is of an earlier process
+        if self._serial > view.serial:  # the reader's serial comes from an earlier process
             self._serial = 0
         new = [entry for entry in view.entries if entry.serial >= self._serial]
         missed = (new[0].serial if new else view.serial) - self._serial

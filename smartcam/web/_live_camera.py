@@ -1,4 +1,4 @@
-"""Have the live page show one camera, on every site that has this page."""
+"""Define what the live page needs from a site, and one camera of a fleet's site for this page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ShowsCamera(Protocol):
 
 
 class WatchedCamera:
-    """One camera of a site with many, while it has viewers.
+    """One camera of a site with many cameras, followed while viewers watch it.
 
     Args:
         camera: camera that the caller opens and closes.

@@ -1,4 +1,4 @@
-"""Serve the newest frames of the live page's camera, if that camera has frames."""
+"""Serve the newest frames of the camera that a live page shows, if this camera has frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keep the data of the live page: the last results, their rate, the last picture."""
+"""Keep the data of the live page: a camera's last results, their rate, and the last picture."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ShownResult(NamedTuple):
     serial: int  # counted from 0
     result: Result[Any] | None
     error: str  # reason why a container could not be read, or ""
-    layout: Layout | None = None  # layout that a table's units come from
+    layout: Layout | None = None  # layout with the units of a table's columns
 
     def as_json(self) -> dict[str, Any]:
         """Return the result for the page, as values for JSON."""
@@ -89,7 +89,7 @@ class LiveView:
     Args:
         camera: camera that the caller opens and closes.
         is_watched: function that returns True while a page is open, so that pictures are fetched.
-        history: history that is kept elsewhere; None: the view has its own.
+        history: history of the camera that another object keeps; None: the view keeps its own.
 
     Attributes:
         history: outcomes and failures of the last hours.
@@ -109,7 +109,7 @@ class LiveView:
         self.picture: Picture | None = None
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # time of the last connection or loss
-        self.changed_seen: bool = False  # False: it was before the view began
+        self.changed_seen: bool = False  # False: the change happened before the view was started
         self.loss: str = ""  # reason why the camera is not connected, or ""
         self._end_error: SmartCamError | None = (
             None  # error that ended the camera's events for good
@@ -162,7 +162,7 @@ class LiveView:
         self.start()
 
     def add_result(self, result: Result[Any]) -> None:
-        """Add a result from before the view began."""
+        """Add a result that the camera gave before the view was started."""
         self._add_entry(result)
 
     def request_picture(self) -> None:
@@ -303,7 +303,7 @@ class LiveView:
             self.picture_error = str(exc)
         else:
             self.picture_error = ""
-            # only if no newer result came meanwhile: the picture may be of that one
+            # if a newer result came meanwhile, the picture may belong to that result
             if (
                 self._owns_history
                 and failure == self.history.last_failure

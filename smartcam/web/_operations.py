@@ -1,4 +1,4 @@
-"""Serve an agent's health and numbers over HTTP: ``/healthz``, ``/readyz``, ``/metrics``."""
+"""Serve an agent's health and metrics over HTTP: ``/healthz``, ``/readyz``, ``/metrics``."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ class OperationsSite(Server):
 
 
 def _middleware(names: Collection[str] | None) -> Any:
-    """Return the middleware of all handlers: it bounds connections, and refuses with a text.
+    """Return the middleware of all handlers, which bounds connections and refuses with a text.
 
     Args:
         names: names of this machine that requests may use; None: only loopback names.

@@ -15,8 +15,8 @@ class Page(NamedTuple):
         printed: the command that prints the page's address, as HTML; empty for a page that has its
             own top.
         styles: names of the style sheets before its own.
-        beside: what stands next to the title, as HTML.
-        does: verb in the sentence about the page's calls, ``does`` or ``shows``.
+        beside: HTML that is shown next to the title.
+        does: verb in the page's sentence "everything that this page does (or shows) is a call".
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""Send the newest frames of some sources to viewers, for all pages that have pictures.
+"""Send the newest frames of some sources to viewers; every page with live pictures uses this.
 
 Each viewer of a source has its own reader and WebSocket. The newest picture is sent when the page
 reports that it has shown the last one. So a slow viewer skips pictures, and delays neither the
@@ -41,7 +41,7 @@ FILES: Final = ("pictures.css", "pictures.js")
 """Files that pages with pictures need in addition to their own."""
 
 MAX_VIEWERS: Final = 32
-"""Largest number of WebSockets at a time: eight people who each look at four cameras."""
+"""Largest number of WebSockets at a time, enough for eight people who each watch four cameras."""
 
 PROTOCOL: Final = "smartcam.frames"
 """Subprotocol of the WebSockets that send pictures."""
@@ -51,7 +51,7 @@ MAX_PICTURE_BYTES: Final = 1 << 24
 size."""
 
 ACCOUNT_PERIOD: Final = 1.0
-"""Seconds without a frame after which the page gets the counts of frames without a picture."""
+"""Seconds without a frame after which the page gets only the counts of frames."""
 
 THREADS: Final = 2
 """Number of threads that make JPEGs; more threads would only wait for the processor."""
@@ -61,7 +61,7 @@ REOPEN_BACKOFF: Final = Backoff(initial=0.5, maximum=5.0)
 
 
 def _ignore(_error: SmartCamError | None) -> None:
-    """Ignore the result of an attempt to open a source."""
+    """Do nothing: the default of ``on_attempt``."""
 
 
 class SitePictures:
@@ -169,7 +169,7 @@ class SitePictures:
 
 
 class JpegMaker:
-    """Makes the JPEGs of a source in threads; each frame once for all viewers."""
+    """Makes the JPEGs of a source in threads; all viewers share the JPEG of a frame."""
 
     def __init__(self, threads: ThreadPoolExecutor, quality: int) -> None:
         self._threads = threads
@@ -297,7 +297,11 @@ class Viewer(PageSocket):
     async def _send_picture(
         self, frame: dict[str, Any], account: dict[str, Any], picture: bytes
     ) -> None:
-        """Send JSON and a picture, and wait until the page has shown it; TimeoutError: too late."""
+        """Send JSON and a picture, and wait until the page has shown it.
+
+        Raises:
+            TimeoutError: the page did not show the picture in time.
+        """
         head = json.dumps({"frame": frame, "account": account}).encode()
         self._was_shown.clear()
         async with asyncio.timeout(SHOW_TIMEOUT):
@@ -323,7 +327,7 @@ def _frame_fields(frame: Frame) -> dict[str, Any]:
 
 
 def _account(reader: FrameReader, bad_count: int) -> dict[str, Any]:
-    """Return the counts of a viewer's frames so far, and their time by ``time.monotonic()``."""
+    """Return the counts of a viewer's frames so far, with the time of the count."""
     account = reader.statistics()
     return {
         "at": time.monotonic(),

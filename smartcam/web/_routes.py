@@ -1,7 +1,7 @@
-"""Define HTTP calls by a table: method, path, arguments, handler.
+"""Define a site's HTTP calls in a table: the method, path, arguments and handler of each call.
 
-A call gets a JSON body or a query, which pydantic checks, and answers JSON. Most handlers are plain
-functions, whose effect is complete when they return.
+A call gets a JSON body or a query, which pydantic checks, and answers with JSON. Most handlers are
+plain functions: when such a function returns, the call is done.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _Model = type[BaseModel] | TypeAdapter[Any]
 
 
 class CallBody(BaseModel):
-    """A call's body: only its fields, with exactly their types."""
+    """The base of calls' bodies: refuses unknown fields, and values of other types."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -166,10 +166,10 @@ class Calls(Generic[C]):
     def add(
         self, method: _Method, path: str, *, about: str = "", **options: Any
     ) -> Callable[[Action[C]], Action[C]]:
-        """Make the decorated function a call's handler; its docstring describes the call.
+        """Make the decorated function a call's handler.
 
-        ``about`` describes a call that needs more room; ``options`` are ``query``, ``body``,
-        ``optional`` and ``sample`` of the call.
+        The page describes the call by ``about``, or else by the handler's docstring. ``options``
+        are the fields ``query``, ``body``, ``optional`` and ``sample`` of the call.
         """
 
         def declare(handler: Action[C]) -> Action[C]:
@@ -185,7 +185,7 @@ class Calls(Generic[C]):
         self._rows.append(dataclasses.replace(row, path=path, handler=handler))
 
     def as_json(self) -> list[dict[str, Any]]:
-        """Return the calls as JSON-able rows: ``method``, ``path``, ``about``, ``body``."""
+        """Return a row for JSON of each call: ``method``, ``path``, ``about``, ``body``."""
         return [
             {
                 "method": call.method,
@@ -210,9 +210,10 @@ def routes(calls: Calls[C], site: C) -> list[web.RouteDef]:
 
 
 def middleware(guard: Guard, prefix: str) -> Any:
-    """Return the middleware of all handlers: it bounds connections, checks, and refuses with JSON.
+    """Return the middleware of all handlers.
 
-    The paths of calls begin with ``prefix``.
+    It bounds connections, has ``guard`` check each request, and refuses with JSON. The paths of
+    calls begin with ``prefix``.
     """
 
     @web.middleware
@@ -234,7 +235,7 @@ def middleware(guard: Guard, prefix: str) -> Any:
             refusal = exc
         except web.HTTPException as exc:
             refusal = _translated_error(exc, prefix)
-        except LinkError:  # a ConnectionError, but of a camera and not of the client
+        except LinkError:  # a ConnectionError of a camera, not of the HTTP client
             refusal = _internal_error(request)
         except ConnectionError:
             refusal = RefusedError(400, "a connection that ended", "the whole of a request")

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder
 
 SENSOR = (1280, 1024)
-"""Width and height, in pixels, of the sensor for which the scene is scaled (derived: 1280 is part
-of the type's code)."""
+"""Width and height, in pixels, of the sensor whose picture the scene is scaled to. The width is
+derived from the camera's type code, which contains 1280."""
 
 MAX_HEX_BYTES = 512
 """Largest number of bytes of a payload in a list of log entries; a single entry has all bytes."""
@@ -34,14 +34,14 @@ MAX_VALUES_BYTES = 2048
 shows a result of any size decoded."""
 
 MAX_REPLY_BYTES = 1 << 18
-"""Largest number of shown payload bytes in a list of log entries or faults. The list ends there, so
-that an answer is at most a few megabytes of JSON."""
+"""Largest number of payload bytes that a list of log entries or faults shows. The list ends there,
+so that an answer has at most a few megabytes of JSON."""
 
 MAX_LISTED = 1000
 """Largest number of faults that a list shows."""
 
 TABLE_GENERATORS = {"tangram": False, "tangram_pixels": True}
-"""Names of the generators that use the table; True: it reports pixels instead of metres."""
+"""Names of the generators that use the table, and whether they report pixels instead of metres."""
 
 
 # ---------------------------------------------------------------------- the camera
@@ -56,7 +56,7 @@ OPERATOR_ACTIONS = (
     "set_endian",
     "reboot",
 )
-"""Methods of a device that are an operator's actions; a device may lack some of them."""
+"""Methods of a device that do what an operator can do at a camera; some devices lack some."""
 
 
 def abilities(emulator: WireCamera) -> list[str]:

@@ -1,4 +1,4 @@
-"""Serve a web site in the running event loop: a page, which is a few files, and calls."""
+"""Serve a web site in the running event loop: the files of a page, and HTTP calls."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ API = "/api"
 """First part of the paths of all calls."""
 
 FINISH_TIMEOUT = 0.2
-"""Seconds that unfinished answers have to end when the site stops, and again after they are
-cancelled."""
+"""Seconds for unfinished answers to end when the site stops. Then they are cancelled, and have this
+time again."""
 
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 _ALL_ADDRESSES = frozenset({"", "0.0.0.0", "::"})  # noqa: S104  only compared
 
 
 class Site(Server):
-    """A page and its calls on a port; the handlers of the calls get the site.
+    """A page and its calls on a port; each handler of a call gets the site as an argument.
 
     Args:
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css, and
@@ -87,9 +87,9 @@ class Site(Server):
 
     @property
     def api(self) -> str:
-        """Address before the calls' paths, ``http://HOST:PORT``.
+        """Address to which the calls' paths are appended, ``http://HOST:PORT``.
 
-        It has this machine's name if the site listens on all addresses.
+        HOST is this machine's name if the site listens on all addresses.
         """
         name = socket.gethostname() if self.host in _ALL_ADDRESSES else self.host
         return f"http://{f'[{name}]' if ':' in name else name}:{self._port}"

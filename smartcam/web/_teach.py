@@ -1,4 +1,4 @@
-"""Serve the site on which an application is taught: pictures, regions, tools, their results."""
+"""Serve the page on which people teach an application: they draw regions, and try tools."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from smartcam._meanings import meaning
 from smartcam.models import Localization, jsonable
 
 MAX_JUDGED: Final = 200
-"""Largest number of records of a result whose truth values are looked at."""
+"""Largest number of records of a result that are judged; further records are ignored."""
 
 Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
 """Outcome of a result; a result without a verdict is "other"."""
@@ -60,7 +60,7 @@ def outcome_of(value: Any) -> Outcome:
 
 
 def describe_failures(value: Any) -> str:
-    """Return a text about the truth values that are wrong; "" if none is."""
+    """Return a text that names the truth values that say "failed"; "" if there are none."""
     failures = [row for row in verdicts(jsonable(value)) if row["verdict"] == "fail"]
     texts = []
     for row in failures:

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class WizardSite(Site):
     """A page and HTTP calls that drive the wizards of calibrations.
 
-    It runs in the event loop of the service's actions. Users at the same time share one sequence
-    of steps: each call names its step by a token.
+    The site runs in the event loop in which the service's actions run. Users who work at the same
+    time share one wizard: each call names the step that it answers, by the step's token.
 
     ::
 

@@ -16,7 +16,7 @@ import zxingcpp
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import ToolSetup
 from smartcam.inspection._read import ladder
-from smartcam.inspection._read.ladder import CONFIRMED_KINDS, RUNGS
+from smartcam.inspection._read.ladder import KINDS_TO_CONFIRM, RUNGS
 from smartcam.inspection._read.patterns import TextPattern, TooLongError
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
@@ -308,7 +308,7 @@ def test_each_rung_maps_its_pixels_back(rung: object) -> None:
 def test_weak_kind_counts_only_if_a_second_reading_is_the_same(
     monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    assert kind in CONFIRMED_KINDS
+    assert kind in KINDS_TO_CONFIRM
     grey = picture(kind, codes.CONTENTS[kind], px=8, dots=0.6)
     assert codes.alone(kind, grey) == []
     assert [code.text for code in codes.with_ladder(kind, grey)] == [codes.CONTENTS[kind]]

@@ -1,1 +1,1 @@
-"""The agent: it holds the sessions with its cameras and serves the programs' calls."""
+"""The agent: the process that has the sessions with cameras, and carries out programs' calls."""

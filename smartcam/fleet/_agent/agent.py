@@ -1,8 +1,8 @@
 """Run an agent, which has the sessions with its cameras and carries out programs' calls.
 
-Each call has a number of its program, and is carried out once even if it arrives twice; a call that
-comes after its deadline is not carried out. Every call is a task of the agent, which ends with its
-deadline, with the program's cancellation, and with the program itself.
+Each program numbers its calls, so that the agent carries out a call only once if it arrives twice.
+The agent does not carry out a call that arrives after its deadline. Every running call is a task of
+the agent. It ends at the call's deadline, when the program cancels it, or when the program is lost.
 """
 
 from __future__ import annotations
@@ -70,40 +70,42 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_PROGRAMS_PER_ROLE = 4096
-"""Largest number of programs of each role at a time, so that one role cannot keep the others
-out."""
+"""Largest number of programs of each role at a time, so that the programs of one role cannot keep
+out those of other roles."""
 
 PRESENCE_TIMEOUT = 10.0
-"""Seconds after a program's first call in which its presence must be seen. A program without
-presence is forgotten then, since its end would not be noticed."""
+"""Seconds after a program's first call in which the program must have announced its presence on the
+bus. Otherwise it is forgotten, since the agent would not notice its end."""
 
 MAX_CALLS_PER_PROGRAM = 256
-"""Largest number of running questions of one program, and of its running commands, for each camera
-of the agent."""
+"""Largest number of running questions of one program, and largest number of its running commands,
+for each camera of the agent."""
 
 MAX_QUESTIONS_PER_ROLE = 16 * MAX_CALLS_PER_PROGRAM
 """Largest number of running questions of all programs of one role, for each camera."""
 
 MAX_REMEMBERED_CALLS = 4096
-"""Largest number of remembered calls of each program; an older call is not carried out."""
+"""Number of calls of each program that are remembered, to recognize repetitions. A call that is
+older than these is not carried out."""
 
 MAX_REMEMBERED_CAMERAS = 1000
-"""Largest number of cameras that are no longer shared, whose next numbers are remembered."""
+"""Largest number of cameras that are no longer shared, but whose next message numbers are
+remembered."""
 
 FIRST_ATTEMPT_TIMEOUT = 30.0
 """Seconds to wait at the start for the first attempts to connect to the cameras."""
 
 
 END_NOTICE_DELAY = 0.02
-"""Seconds to wait between the last message about a camera and the end of its presence. Without this
-wait the end of the presence may arrive first."""
+"""Seconds to wait between the last message about a camera and the end of the camera's presence.
+Without this wait, programs may learn of the end first."""
 
 
 class CallNumbers:
-    """Numbers of received calls.
+    """The numbers of the calls that were received from one program.
 
     Args:
-        floor: number up to which all calls count as seen.
+        floor: number up to which all calls count as received.
     """
 
     def __init__(self, floor: int = 0) -> None:
@@ -129,18 +131,18 @@ class CallNumbers:
 
 @dataclass(eq=False)
 class Guest:
-    """A program that calls.
+    """A program that has called this agent.
 
-    Questions and commands have separate bounds, so that neither blocks the other.
+    Questions and commands are bounded separately, so that questions cannot block commands.
 
     Attributes:
         program: name and secret of the program.
         number: number of the program in the results of its triggers.
-        is_present: whether the program's presence was seen.
-        questions, commands: numbers of its received calls, of each kind.
-        tasks: running calls, by kind (True: a command) and number.
-        running_counts: numbers of running questions and commands, by kind.
-        entered: state to restore after each temporary switch of the application.
+        is_present: whether the program has announced its presence on the bus.
+        questions, commands: numbers of the received questions, and of the received commands.
+        tasks: tasks of running calls, by kind (True: a command) and number of the call.
+        running_counts: number of running questions (False) and of running commands (True).
+        entered: state to restore at the end of each temporary switch of the application.
         last_state: number of the last state in the program's replies, by camera.
     """
 
@@ -190,13 +192,13 @@ class Agent:
         on_event: callback for events of the cameras.
         frames: sources of frames, by camera's name, for the cameras with frames.
         observers: observers of all sessions.
-        standby: settings of a standby agent, which takes over cameras of agents that are lost;
-            None: this agent is no standby agent.
-        on_retired: callback for the case that the agent ends because another one has its name.
+        standby: settings of a standby agent, which takes over cameras of lost agents; None: this
+            agent is no standby agent.
+        on_retired: callback that is called if the agent ends because another agent has its name.
         calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Attributes:
-        retired_by: reason why the agent has ended, as another one has its name; None while it runs.
+        retired_by: error that ended this agent because another agent has its name; otherwise None.
     """
 
     def __init__(
@@ -374,7 +376,7 @@ class Agent:
     async def add_camera(
         self, name: str, settings: CameraSettings, frames_of: FrameSupply | None = None
     ) -> None:
-        """Share a further camera, or stand by while another agent has it.
+        """Share a further camera, or stand by for it while another agent has the camera.
 
         Raises:
             ConfigurationError: an option of the camera is wrong; or another agent has it.
@@ -394,7 +396,7 @@ class Agent:
         await self._claims.refuse_taken({name: settings})
 
     async def remove_camera(self, name: str, why: str) -> None:
-        """Stop sharing a camera or standing by for it; bounded. Its programs get ``why``."""
+        """Stop sharing a camera, or standing by for it; bounded. Its programs get ``why``."""
         self._claims.drop_claim(name)
         if name in self.hosts:
             await self.unshare(name, why)
@@ -409,7 +411,8 @@ class Agent:
         Cancellation: takes effect at the end.
         """
         host = self.hosts.pop(name)
-        host.announce_removed(why)  # first, as an end of the presence alone means a lost agent
+        # announced before the presence ends: without this, programs would take the agent for lost
+        host.announce_removed(why)
         self.closing_hosts.add(host)
         token, session_task = self._sharing.pop(name)
         try:
@@ -735,7 +738,7 @@ class Agent:
             return
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
-        if entered is not None:  # the call was carried out, which its program does not know
+        if entered is not None:  # the switch was done, but its program no longer waits for it
             camera, before = entered
             camera.leave_application(before)
 

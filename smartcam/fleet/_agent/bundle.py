@@ -1,8 +1,9 @@
-"""Send results of all cameras of an agent in one message, for programs that receive all.
+"""Send the results of all cameras of an agent in one message (a *bundle*).
 
-A message for each result costs much more than the result itself. An agent therefore also publishes
-the results of all its cameras together on one key, while that key has a subscriber. Bundles are
-numbered: a program that misses one asks the agent for the next number of each camera.
+To send a message takes much more time than to encode the result in it. So for programs that receive
+the results of all cameras, an agent also publishes bundles under one key, while that key has a
+subscriber. Bundles are numbered: a program that misses a bundle asks the agent for the number of
+each camera's next result, and then for the missing results.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ BUNDLE_INTERVAL = 0.005
 """Least seconds between two bundles."""
 
 FULL_BUNDLE_BYTES = 1 << 15
-"""Number of bytes of results that are sent at once, without waiting for BUNDLE_INTERVAL."""
+"""Number of collected bytes of results at which a bundle is sent without waiting for
+BUNDLE_INTERVAL."""
 
 REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
-"""Delays, seconds, of the empty bundles after a bundle; each repeats the next bundle's number."""
+"""Delays, seconds, of the empty bundles that follow a bundle. An empty bundle has the number of the
+next bundle, by which a program notices that it has missed the last one."""
 
 _HEAD = struct.Struct("<4sQQQI")
 _PART = struct.Struct("<HI")
@@ -36,10 +39,9 @@ class ResultBundle(NamedTuple):
     """A decoded bundle.
 
     Attributes:
-        epoch: number of the agent's start.
-        number: number of the bundle; an empty bundle has the number of the next full one.
-        following: number of the next bundle.
-        parts: cameras, and their results in the form of :func:`encode_runs`.
+        epoch: number of the agent's start. number: number of the bundle; an empty bundle has the
+        number of the next bundle with results. following: number of the next bundle with results.
+        parts: name of each camera, and its results in the form of :func:`encode_runs`.
     """
 
     epoch: int
@@ -76,7 +78,7 @@ def decode_bundle(payload: bytes, label: str) -> ResultBundle:
 
 
 class AgentBundle:
-    """Sends the results of an agent's cameras together.
+    """Sends the bundles of one agent.
 
     Args:
         agent: the agent's name.
@@ -95,7 +97,7 @@ class AgentBundle:
         self._reminder: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
-        """Start to check for subscribers."""
+        """Start to check whether the key has subscribers."""
         self._publisher = self._bus.publisher(self._key, self._on_subscribers)
 
     def close(self) -> None:
@@ -108,11 +110,11 @@ class AgentBundle:
 
     @property
     def has_subscribers(self) -> bool:
-        """True if the bundles have a subscriber."""
+        """True if a program subscribes to the bundles."""
         return self._publisher is not None and self._publisher.has_subscribers
 
     def add(self, camera: str, encoded_results: bytes) -> None:
-        """Add a camera's results, which are sent soon with results of other cameras."""
+        """Add a camera's results to the next bundle, which is sent soon."""
         name = camera.encode()
         self._unsent_parts += (_PART.pack(len(name), len(encoded_results)), name, encoded_results)
         self._camera_count += 1
@@ -129,7 +131,7 @@ class AgentBundle:
             )
 
     def flush(self) -> None:
-        """Send the results that were added and not sent yet."""
+        """Send a bundle of the results that were added since the last bundle."""
         if self._flush_handle is not None:
             self._flush_handle.cancel()
             self._flush_handle = None
@@ -156,7 +158,7 @@ class AgentBundle:
             self._reminder = None
 
     def _schedule_reminder(self, step: int) -> None:
-        """Send the next number later; ``step``: number of reminders that were sent before."""
+        """Send an empty bundle later; ``step``: number of empty bundles since the last full one."""
         self._cancel_reminder()
         if step < len(REMINDER_DELAYS):
             loop = asyncio.get_running_loop()

@@ -37,7 +37,7 @@ T = TypeVar("T")
 Answer = tuple[dict[str, Any], list[bytes]]
 EMPTY_ANSWER: Answer = ({}, [])
 MAX_REPLY_BYTES = 1 << 20
-"""Largest number of bytes of results, or of states, in one reply."""
+"""Largest number of bytes of requested results, or of requested states, in one reply."""
 
 
 class ProgramCall(NamedTuple):
@@ -46,12 +46,12 @@ class ProgramCall(NamedTuple):
     Attributes:
         host: camera of the call.
         program: name of the calling program.
-        owner: numbers of the program and of its call.
+        owner: number of the program, and number of the call among the program's calls.
         arguments: arguments of the call, by name.
         blobs: byte strings that came with the call.
         timeout: seconds of the call's timeout.
-        entered: state to restore after each temporary switch of the program, by camera and call.
-        order: the trigger, if the call came in binary form, without ``arguments``.
+        entered: state to restore after each temporary switch of the program, by the call's number.
+        order: the trigger, if the call came in binary form; such a call has no ``arguments``.
         reservation: number of the call that reserved the camera; None outside of a reservation.
     """
 
@@ -88,7 +88,7 @@ class ProgramCall(NamedTuple):
 
 
 def _check_layouts(value: object, name: str, owner: str) -> Any:
-    """Return layouts with a sequence number: one for all applications, or one for each of them."""
+    """Return layouts with a sequence number: one for all applications, or a mapping by id."""
     if not isinstance(value, dict):
         return check_text(value, name, owner)
     try:
@@ -437,5 +437,5 @@ GATED_COMMANDS = COMMANDS - {"reserve", "release", "leave"}
 
 
 def agent_clock() -> float:
-    """Return the time of the agent's clock, which is its event loop's, seconds."""
+    """Return the time of the agent's clock, seconds: the clock of the agent's event loop."""
     return asyncio.get_running_loop().time()

@@ -1,13 +1,14 @@
 """Decide which agent of a fleet has a name and a camera, and when a standby agent takes over.
 
-Two agents of one name see each other's starts. The agent that was started earlier keeps the name;
-the later agent gives up its cameras, and logs that.
+Each agent publishes the time of its start. If two agents have the same name, the agent that was
+started earlier keeps the name; the later agent gives up its cameras, and logs that.
 
-An agent announces a camera by a presence. Another agent with the same camera either refuses to
-start, or stands by: it has no session until that presence ends. After a split of the network two
-agents may share one camera. Then the camera decides, since it serves the newest client: the agent
-that has lost its session asks the other agent, and leaves the camera to it. Both agents may give up
-the camera at the same time. So each of them stands by again when the other no longer has it.
+An agent announces each camera by a presence on the bus, which ends with the agent. Another agent
+with the same camera refuses to start, or stands by: it makes no session until that presence ends.
+After a split of the network two agents may share one camera. Then the camera decides, since it
+serves the newest client: the agent that has lost its session asks the other agent whether that one
+has a session, and if so, leaves the camera to it. In case both agents give up the camera at the
+same time, each of them stands by again when the other agent no longer has the camera.
 """
 
 from __future__ import annotations
@@ -40,25 +41,26 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 HOLD_OFF_DELAY = 0.2
-"""Seconds that a standby agent waits before it takes a camera without agent, times its
-preference."""
+"""Seconds that a standby agent waits before it takes over a camera that has no agent, for each unit
+of the agent's preference; so the agent with the lowest preference is first."""
 
 ASK_TIMEOUT = 0.5
-"""Seconds for another agent's answer, and between two checks of its cameras."""
+"""Seconds for another agent's answer, and between two checks of the other agent's cameras."""
 
 RESOLVE_TIMEOUT = 2.0
 """Seconds to find the addresses of hosts' names."""
 
 RETURN_WAIT = 4.0
-"""Seconds to wait after a loss of the bus for other agents, before their cameras are taken."""
+"""Seconds to wait for other agents to return after the bus was lost; then their cameras are taken
+over."""
 
 CONTEST_TIME = 30.0
-"""Seconds after another agent with the same camera appeared or disappeared. If another client takes
-the camera in this time, it is probably that agent."""
+"""Seconds after another agent with the same camera has appeared or disappeared, in which a client
+that takes the camera is assumed to be that agent."""
 
 TAKE_BACK_INTERVAL = 600.0
-"""Least seconds between two times that this agent takes a camera back from another client.
-Otherwise two clients would take it from each other again and again."""
+"""Least number of seconds between two times that this agent takes a camera back from another
+client. Otherwise two clients could take the camera from each other again and again."""
 
 
 class Claims:
@@ -71,7 +73,7 @@ class Claims:
         standby: settings of a standby agent; None: the agent does not stand by.
 
     Attributes:
-        given_up: errors for cameras that were left to another agent, by the camera's name.
+        given_up: reason why a camera was left to another agent, as an error, by the camera's name.
     """
 
     def __init__(self, agent: Agent, keys: Keys, bus: Bus, standby: Standby | None) -> None:
@@ -95,8 +97,8 @@ class Claims:
         """Raise if another agent has the name; called before the name is used on the bus.
 
         Raises:
-            ConfigurationError: another agent has the name, and its presence lasts longer than that
-                of an agent that has died.
+            ConfigurationError: another agent has the name, and stays present for longer than the
+                bus reports an agent that has died.
         """
         loop, name = asyncio.get_running_loop(), self._agent.name
         give_up_at = loop.time() + LEASE_TIME + 1.0
@@ -109,7 +111,7 @@ class Claims:
             await asyncio.sleep(ASK_TIMEOUT)
 
     async def claim_name(self, timeout: float) -> None:
-        """Take the agent's name, unless an agent that was started earlier has it.
+        """Announce the agent's start, unless an agent of this name was started earlier.
 
         Raises:
             ConfigurationError: another agent has the name.
@@ -122,7 +124,7 @@ class Claims:
         self._name_handles.append(bus.watch(keys.start(name, "*"), self._on_namesake))
 
     def _is_earlier(self, key: str) -> bool:
-        """Return True if another agent of this name was started earlier; there are no ties."""
+        """Return True if another agent of this name was started earlier; starts are never equal."""
         return _start_order(self._keys.tail(key, "presence/start")[-1]) < _start_order(
             self._start_name
         )
@@ -196,8 +198,9 @@ class Claims:
     async def refuse_taken(self, cameras: Mapping[str, CameraSettings]) -> None:
         """Raise if the fleet has one of these cameras under another name.
 
-        A camera serves one client. Between the check of this agent's own cameras and the return
-        there is no await. Two agents that check at the same time do not see each other.
+        The addresses of the cameras are compared, since a camera serves one client. No other task
+        runs between the check of this agent's own cameras and the return. But two agents that check
+        at the same time do not detect each other.
 
         Raises:
             ConfigurationError: an address is taken; the text names the address and its agent.
@@ -257,8 +260,8 @@ class Claims:
     async def _refuse_contested(self) -> None:
         """Raise if another agent has a camera of this agent, and neither of them stands by.
 
-        An agent that does not answer may have died a moment ago: the engine ends its presence only
-        after a lease time. So this waits for as long.
+        An agent that does not answer may have died just before: the bus ends its presence only
+        after a lease time. So this method waits for the lease time.
         """
         loop = asyncio.get_running_loop()
         give_up_at = loop.time() + LEASE_TIME + 1.0
@@ -290,7 +293,10 @@ class Claims:
     # ------------------------------------------------------------------ other agents
 
     def _note_presence(self, key: str, present: bool) -> str:
-        """Note another agent's presence; return its camera, "" if this agent does not claim it."""
+        """Note that another agent announces a camera, or no longer does; return the camera's name.
+
+        The name is "" if this agent does not claim the camera.
+        """
         agent, *chunks = self._keys.tail(key, "presence/camera")
         name = "/".join(chunks)
         if agent == self._agent.name or name not in self._wanted:
@@ -473,5 +479,5 @@ async def _resolve_hosts(hosts: set[str]) -> dict[str, set[str]]:
 
 
 def _is_taken(host: Host) -> bool:
-    """Return True if there will be no further session, since another client has the camera."""
+    """Return True if another client has taken the camera, so that no further session follows."""
     return isinstance(host.camera.trouble, ConnectionTakenError)

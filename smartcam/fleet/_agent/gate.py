@@ -1,4 +1,4 @@
-"""Let commands pass to a camera: from all programs, or only from the one that reserved it."""
+"""Let commands through to a camera: from all programs, or only from one that has reserved it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class GateRequest:
 
     Attributes:
         program: name of the waiting program.
-        reservation: key of the reservation; None for a command.
+        reservation: key of the wanted reservation; None: the request is for a command.
         granted: whether the request was granted.
         future: future that is done when the request is granted; None if no caller waits.
     """
@@ -60,7 +60,7 @@ class Gate:
             await self._wait_turn(program, None, timeout)
 
     def try_enter(self, program: str) -> bool:
-        """Begin a command if it need not wait; return whether it has begun."""
+        """Begin a command if it need not wait; return True if the command has begun."""
         if self._queue or (self.holder is not None and self.holder != program):
             return False
         self._running_commands[program] += 1
@@ -92,7 +92,7 @@ class Gate:
         await self._wait_turn(program, reservation, timeout)
 
     def release(self, reservation: Hashable) -> None:
-        """End a reservation, or the wait for it; does nothing if there is neither."""
+        """End a reservation, or the wait for this reservation; do nothing if there is neither."""
         self._reservations.discard(reservation)
         if not self._reservations:
             self._end_hold("Released")

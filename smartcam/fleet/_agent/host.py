@@ -1,4 +1,4 @@
-"""Manage one camera of an agent: its session, its last state, and the right to command it."""
+"""Manage one camera of an agent: its session, its messages, and which program may command it."""
 
 from __future__ import annotations
 
@@ -51,22 +51,23 @@ if TYPE_CHECKING:
 MAX_STATES_PER_BUNDLE = 1000
 MAX_STATE_BYTES = 1 << 19
 STATUS_DELAY = 0.005
-"""Seconds that a status may wait for further ones, to be sent in one message. A program that
-triggers gets the status with the reply."""
+"""Seconds that a status waits for further statuses, so that all are sent in one message. A program
+that triggers gets the status earlier, with the reply."""
 
 CATCH_UP_DELAY = 0.2
-"""Seconds after a reply with a status until the number of the next state is sent, unless a state is
-sent before. Without this number the loss of the reply would stay unnoticed."""
+"""Seconds after a reply with a status until the number of the next state is published, unless a
+state is published before. Without this number, nobody would notice the loss of the reply."""
 
 RESULTS_INTERVAL = 0.002
-"""Least seconds between two messages with results: faster results are sent together."""
+"""Least number of seconds between two messages with results; results in between are sent
+together."""
 
 FULL_MESSAGE_BYTES = 1 << 16
-"""Number of bytes of results that are sent at once, without waiting for RESULTS_INTERVAL."""
+"""Number of collected bytes of results that are sent without waiting for RESULTS_INTERVAL."""
 
 REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
-"""Seconds after results at which the next number is sent again. Without these messages a loss of
-the last results would stay unnoticed."""
+"""Delays, seconds, of messages without results that follow results, and have the number of the next
+result. Without these messages, no program would notice the loss of the last results."""
 
 
 class Host:
@@ -90,13 +91,13 @@ class Host:
         first_result: number of the first result of this epoch.
         is_only_agent: whether no other agent can take over the camera.
         gate: gate that decides which program's commands may pass.
-        results: the last results.
+        results: the last results of the camera.
         states: the last states of the camera.
-        outcomes: lists to which the runs of running triggers are added, by the trigger's owner.
+        outcomes: lists that collect the results of running triggers, by the trigger's owner.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: error of the last attempt while there was no session yet; None after a session.
-        triggers: numbers of programs' triggers, by outcome: a word of ``OUTCOMES``.
+        failure: error of the last attempt before the first session; None from that session on.
+        triggers: numbers of programs' triggers, by their outcome (a word of ``OUTCOMES``).
     """
 
     def __init__(
@@ -126,7 +127,7 @@ class Host:
         self.first_result: int = 1
         self.is_only_agent: bool = True
         self._report_event, self._bundle, self._observers = on_event, bundle, observers
-        # raises for an invalid ``interpret_as``; programs set the other options
+        # made only to raise for an invalid ``interpret_as``; programs set the other options
         Interpretation(settings.interpret_as, lenient=True, y_down=False)
         self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make_client()
@@ -160,7 +161,7 @@ class Host:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The numbers of the next message."""
+        """Numbers of the next result, state, status and event, with which a later host goes on."""
         topics = self.topics
         return self.results.following, self.states.following, topics.next_status, topics.next_event
 
@@ -236,7 +237,7 @@ class Host:
         """Return the camera.
 
         Raises:
-            LinkError: there is no session; the text says why.
+            LinkError: there is no session; the text has the reason.
         """
         if self.failure is not None or not (self._opened.is_set() or self.connected):
             why = self.failure or "it tries for the first time"
@@ -294,7 +295,7 @@ class Host:
         """Refuse a command of a block whose reservation has ended.
 
         Raises:
-            ReservationLostError: the reservation has ended, or another agent granted it.
+            ReservationLostError: the reservation has ended, or was made by another agent.
         """
         if not self.gate.holds(reservation):
             raise ReservationLostError(
@@ -306,8 +307,8 @@ class Host:
     async def still_holds(self, reservation: Hashable, timeout: float) -> bool:
         """Return True if a reservation still holds, and this agent still has the camera.
 
-        If another agent may take over, a request is sent to the camera. The camera serves one
-        client, so an answer shows that this agent still has it.
+        If another agent may take over the camera, a request is sent to the camera. An answer shows
+        that this agent still has the camera, since a camera answers only one client.
 
         Raises:
             SmartCamError: the camera does not answer.
@@ -345,7 +346,7 @@ class Host:
             status: int | None = int(camera.status)
         except SmartCamError:
             status = None
-        # not camera.connected: results that came before a link's end must be sent first
+        # camera.connected would change too early: results from before a link's end are sent first
         trouble = self.failure or camera.trouble
         fields: dict[str, Any] = {
             "connected": trouble is None,
@@ -360,7 +361,7 @@ class Host:
         return fields
 
     def session_state(self) -> tuple[bool, int | None, int | None, str | None]:
-        """Return the session's state: connected or not, status, application, reason if not."""
+        """Return the session's state: connected, status, application, reason if not connected."""
         camera, trouble = self._camera, self.failure or self._camera.trouble
         try:
             status: int | None = int(camera.status)
@@ -400,7 +401,7 @@ class Host:
     def _on_event(self, event: CameraEvent) -> None:
         self._report_event(event)
         if isinstance(event, StatusChanged):
-            return  # a status message reports it
+            return  # reported by a status message
         self.topics.on_event(event)
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
@@ -441,7 +442,7 @@ class Host:
         self.topics.on_state()
 
     def _on_results(self, results: Sequence[Result[RawValue]], current: bool, late: bool) -> None:
-        """Keep results that arrived together, and send them soon with later ones."""
+        """Keep results that arrived together, and send them soon, together with later results."""
         first = results[0]
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (LATE if late else 0)
@@ -489,7 +490,7 @@ class Host:
         return unsent[max(0, since - self.states.following + len(unsent)) :]
 
     def drop_unsent_states(self) -> None:
-        """Drop the states that were not sent yet, since the only program has them by its reply."""
+        """Drop the unsent states: the only program of the agent gets them with a reply."""
         self._states_timer.clear()
         self._unsent_states.clear()
         self._next_number_timer.set(asyncio.get_running_loop().time() + CATCH_UP_DELAY)
@@ -531,7 +532,7 @@ class Host:
             self._schedule_reminder(0)
 
     def _schedule_reminder(self, step: int) -> None:
-        """Send the next number later; ``step``: number of reminders that were sent before."""
+        """Send the number of the next result later; ``step``: number of such messages before."""
         if self._reminder is not None:
             self._reminder.cancel()
             self._reminder = None

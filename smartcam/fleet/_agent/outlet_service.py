@@ -1,4 +1,4 @@
-"""Serve an agent's outlets over the bus: their accounts, and rows of their stores."""
+"""Answer programs' questions about an agent's outlets: counts of results, and stored results."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ ROW_BYTES = 300
 
 
 class ReportedOutlet(NamedTuple):
-    """An outlet's account from its agent: ``results == delivered + spooled + sum of dropped``.
+    """An outlet's counts from its agent: ``results == delivered + spooled + sum of dropped``.
 
     Attributes:
         agent: name of the agent.
         outlet: name of the outlet.
         results: number of results and errors that came.
         delivered: number of delivered results and errors.
-        spooled: number of waiting results and errors.
-        dropped: numbers of dropped results and errors, by the reason.
+        spooled: number of results and errors that wait for delivery.
+        dropped: numbers of dropped results and errors, by reason.
         trouble: reason why nothing is delivered or spooled now; "" if there is no trouble.
     """
 

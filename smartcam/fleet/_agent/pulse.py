@@ -1,8 +1,8 @@
-"""Measure for how long an agent was stopped, and messages may have waited for it.
+"""Measure for how long an agent was stopped, and received messages may have waited unread.
 
-A process that is stopped, or whose event loop is blocked, does not see when a message arrives: a
-message that has waited in the system for 3 s looks like a new one. But the clock shows that the
-process did nothing for 3 s.
+A process that is stopped, or whose event loop is blocked, cannot tell when a message arrived: a
+message that has waited in the system for 3 s looks like a new message. But a clock that is read
+regularly shows that the process did nothing for 3 s.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ STOPPED_AFTER: Final = 0.25
 """Seconds between two readings beyond which the agent counts as stopped."""
 
 BACKLOG_TIME: Final = 1.0
-"""Seconds after a stop in which messages may still come that waited in the system's buffers."""
+"""Seconds after a stop in which messages may still be read that waited in the system's buffers."""
 
 
 class Pulse:

@@ -1,8 +1,8 @@
 """Reload a fleet file in a running agent; unchanged cameras are not touched.
 
-First the file is read and checked completely, and new emulated cameras are started. If this fails,
-nothing is changed. The changes themselves cannot fail. They run in an own task, which continues if
-the caller is cancelled.
+First the file is read and checked completely, and new emulated cameras are started. If one of these
+steps fails, nothing is changed. The changes that follow cannot fail. They run in a task of their
+own, which continues if the caller is cancelled.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 REMOVED, CHANGED = "it was removed from the fleet file", "its entry in the fleet file has changed"
-"""Reasons why a reload ends a camera, for the camera's programs."""
+"""Reasons why a reload ends the session with a camera, as texts for the camera's programs."""
 
 READ_TIMEOUT = 10.0
 """Seconds for reading a file and the files that it names; they may be on a network drive."""
@@ -77,7 +77,7 @@ class CameraSource(NamedTuple):
     Attributes:
         settings: settings of the client that has the session.
         frames: source of the camera's frames; None for none.
-        emulator: stack that closes the emulated camera; None if it is not emulated.
+        emulator: exit stack that stops the emulated camera; None for a real camera.
     """
 
     settings: CameraSettings
@@ -91,8 +91,8 @@ class LoadedFleet(NamedTuple):
     Attributes:
         file: contents of the fleet file.
         plan: cameras of the file, by name.
-        fingerprints: values by camera's name that differ if the camera has changed: its entry, and
-            digests of the files that the entry names.
+        fingerprints: values by the camera's name, which differ if the camera has changed: the
+            camera's entry, and digests of the files that the entry names.
     """
 
     file: FleetFile
@@ -121,7 +121,7 @@ def load_cameras(file: FleetFile, folder: Path) -> LoadedFleet:
 
     def fingerprint(planned: PlannedCamera) -> object:
         entry, emulated = planned.entry, planned.entry.emulated
-        if emulated is not None:  # the number of cameras does not change a single one
+        if emulated is not None:  # another number of emulated cameras changes none of them
             emulated = emulated.model_copy(update={"count": 1})
             entry = entry.model_copy(update={"emulated": emulated})
         files = [entry.ros2.calibration, entry.ros2.hand_eye]
@@ -146,7 +146,7 @@ def _files_in(fields: object, folder: Path) -> list[str | None]:
 
 
 class Reloader:
-    """Reloads the file of a running agent, once at a time.
+    """Reloads the file of a running agent; one reload at a time.
 
     Args:
         folder: folder of relative paths, if a file's contents are given and not its path.

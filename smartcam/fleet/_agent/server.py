@@ -68,9 +68,9 @@ class FleetServer(Server):
         file: path of a fleet file, or the contents of one.
         bus: end of a bus to use instead of the bus in the file.
         folder: folder of the file's relative paths, if ``file`` is not a path itself.
-        restore: whether application and run state of a camera are restored after a reconnect, if
-            its entry does not set that; None: if ``ros2`` in the file has nodes that become active
-            by themselves.
+        restore: whether application and run state of a camera are restored after a reconnect, for
+            cameras whose entry does not set that. None: True if ``ros2`` in the file has nodes that
+            become active by themselves.
 
     Attributes:
         file: contents of the fleet file.
@@ -122,7 +122,7 @@ class FleetServer(Server):
         section = self.file.ros2
         self._restores = (section is not None and section.autostart) if restore is None else restore
         self.calibrations: CalibrationDesks | None = None
-        # settings of all cameras for ROS, also of those that a reload adds
+        # settings of all cameras for ROS; a reload adds those of new cameras
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
         self._device_sources: dict[str, Callable[[], Awaitable[FrameSource]]] = {}
@@ -278,7 +278,7 @@ class FleetServer(Server):
 
     @contextlib.asynccontextmanager
     async def _without_ros_nodes(self) -> AsyncIterator[None]:
-        """Close the nodes during the block: a new session would lose their latched messages."""
+        """Close the ROS nodes during the block: a new session would lose their latched messages."""
         await self._leave_ros()
         yield
         while True:
@@ -335,9 +335,9 @@ class FleetServer(Server):
     async def reload(self, file: str | Path | FleetFile | None = None) -> FleetChanges:
         """Read the fleet file again, and apply its changes; unchanged cameras are not touched.
 
-        Those keep their sessions and running calls. A changed camera is closed and opened again, a
-        new one is shared at once, connected or not. Only ``cameras`` can be changed; other fields
-        need a restart. Several calls at a time are carried out one after the other.
+        Unchanged cameras keep their sessions and running calls. A changed camera is closed and
+        opened again; a new camera is shared at once, connected or not. Only ``cameras`` can be
+        changed; other fields need a restart. Reloads at the same time run one after the other.
 
         Args:
             file: another file, or the contents of one; None for the server's own.
@@ -456,10 +456,10 @@ class FleetServer(Server):
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[CameraEvent]:
-        """Subscribe to the events of all cameras: :meth:`smartcam.Camera.events` of each.
+        """Subscribe to the events of all cameras, like :meth:`smartcam.Camera.events` of each.
 
         The stream ends with a :exc:`~smartcam.exceptions.ConfigurationError` if another agent of
-        the same name was started earlier: then this one has no cameras.
+        the same name was started earlier: then this agent gives up its cameras.
         """
         stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
         self._events.add(stream)
@@ -483,7 +483,7 @@ class FleetServer(Server):
 
     @property
     def reached(self) -> bool:
-        """True if the agent is on the bus now: started, and not cut off from its router."""
+        """True if the agent is started, and connected to its router."""
         return self._agent is not None and self._bus.reached
 
     @property

@@ -1,7 +1,8 @@
 """Define an agent's client of a shared camera, which does not interpret the results.
 
-Each program interprets containers by itself. So the value of a result has only the owner of its
-trigger here; its bytes are in ``raw``. A layout is used only for its ``@sequence``.
+Each program interprets containers by itself. So at the agent, the value of a result is only the
+owner of the result's trigger; the container's bytes are in ``raw``. If a program's layout has a
+field ``@sequence``, the agent reads this field.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class RawValue(NamedTuple):
 
 
 class AgentInterpretation(Interpretation):
-    """An interpretation that does not read the container; its ``layouts`` are for ``@sequence``.
+    """An interpretation that reads at most ``@sequence`` from a container.
 
     Args:
         owner: owner of the trigger of the results.
@@ -101,7 +102,7 @@ class AgentCallbacks(NamedTuple):
 
 
 class AgentListeners(Listeners):
-    """The listeners of an agent's client, which also call the agent's callbacks."""
+    """The listeners of an agent's client; events and results also go to the agent's callbacks."""
 
     wants_all_changes = True
     callbacks: AgentCallbacks | None = None
@@ -152,7 +153,7 @@ class SharedCamera(SmartCamera[RawValue]):
     """A camera that its agent shares.
 
     Args:
-        settings: validated options; only programs use their interpretation.
+        settings: validated options; ``interpret_as`` in them is not used here, but by programs.
         callbacks: the agent's callbacks for the session.
         observers: observers of the session; a result's value is a :class:`RawValue`.
     """
@@ -203,8 +204,9 @@ class SharedCamera(SmartCamera[RawValue]):
             application: application that must run for the trigger; None for any.
             timeout: seconds of the timeout.
 
-        The camera may still have queued input data of a trigger without a result. If so, and this
-        trigger has input data, the application is first loaded again, which empties the queue.
+        The camera may still have queued the input data of an earlier trigger that had no result. If
+        so, and this trigger has input data, the application is loaded again first, which empties
+        the camera's queue.
         """
         if not self._has_observers and request.input_data is None:
             return await self._trigger(application, request, timeout)
@@ -247,7 +249,7 @@ class SharedCamera(SmartCamera[RawValue]):
         await self._lock.go_back_and_wait(before)
 
     async def refresh_status(self, timeout: float) -> bool:
-        """Make sure that the last status is current; return whether the camera was asked."""
+        """Make sure that the known status is current; return whether the camera was asked."""
         deadline = self._deadline(timeout)
         self._require_session()
         await self._status.refresh(deadline)

@@ -1,4 +1,4 @@
-"""Summarize all cameras of an agent in one answer, from what the agent knows about them."""
+"""Answer questions about the state of all cameras of an agent, without asking the cameras."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _read_cameras(payload: bytes) -> Iterable[ReportedCamera]:
 def best_by_name(
     cameras: Iterable[ReportedCamera], sort_key: Callable[[ReportedCamera], Any]
 ) -> dict[str, Any]:
-    """Return one camera for each name: if two agents have it, the one with the highest key."""
+    """Return one summary for each name: of a camera's agents, that with the highest sort key."""
     reported: dict[str, ReportedCamera] = {}
     for camera in cameras:
         known = reported.get(camera.summary.camera)

@@ -1,7 +1,7 @@
-"""Keep tasks that carry out one trigger after another.
+"""Keep tasks (*workers*) that carry out one trigger after another.
 
-A new task takes its first step in the next turn of the event loop. A waiting worker begins at once,
-so that the camera is triggered in the same turn in which the call came.
+A new task takes its first step only in the next turn of the event loop. A waiting worker begins at
+once, so that the camera is triggered in the turn in which the call arrived.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
 MAX_IDLE_WORKERS = 16
-"""Largest number of workers that are kept for further work; others end with their work."""
+"""Largest number of idle workers that are kept for further work; further workers end."""
 
 
 class TriggerWorker:

@@ -1,11 +1,11 @@
 """Define the bus of a fleet, on which programs and agents exchange messages under keys.
 
-A key is chunks joined by ``/``; in a pattern ``*`` is one chunk and ``**`` any number of them. A
-message reaches each subscriber in the order of sending, or not at all: a bus may lose messages, and
-never waits. So senders number messages whose loss matters.
+A key consists of chunks joined by ``/``; in a pattern ``*`` stands for one chunk, and ``**`` for
+any number of chunks. Messages reach a subscriber in the order in which they were sent. But sending
+never waits, and messages may be lost. So senders number the messages whose loss matters.
 
 :class:`MemoryBus` is the bus inside a process; :mod:`smartcam.fleet._bus.zenoh` has the bus between
-processes. Everything here belongs to one event loop, and every callback runs in it.
+processes. An end of a bus belongs to one event loop, in which all its callbacks run.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Data = bytes | bytearray | memoryview
 
 
 def never(_: str) -> bool:
-    """Return False: no key is patient."""
+    """Return False: no question may wait until other messages were received."""
     return False
 
 
 def always(_: str) -> bool:
-    """Return True: each key is patient."""
+    """Return True: each question may wait until other messages were received."""
     return True
 
 
@@ -62,8 +62,8 @@ class Bus(abc.ABC):
     """One end of a bus, of a program or an agent.
 
     Attributes:
-        local: whether all ends are in this event loop: then parts are passed on without a copy, and
-            all ends share one clock.
+        local: whether all ends of the bus are in this event loop. Then large data are passed on
+            without a copy, and all ends share one clock.
         identity: identity in the certificate of this end; None without a certificate.
     """
 
@@ -94,13 +94,13 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def put(self, key: str, payload: bytes) -> None:
-        """Send a message that a receiver waits for; never blocks."""
+        """Send a message for which a receiver waits, such as a call or a reply; never block."""
 
     @abc.abstractmethod
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         """Send a part of large data after all other messages, with a head that describes the part.
 
-        It is dropped if there is no room; never blocks. ``data`` must not be changed later.
+        The part is dropped if there is no room in the queue. ``data`` must not be changed later.
         """
 
     @abc.abstractmethod
@@ -119,9 +119,10 @@ class Bus(abc.ABC):
 
         Args:
             key: key of the messages.
-            on_subscribers: callback for whether the key has subscribers, when that changes.
-            urgent: whether messages wait in one queue with messages of :meth:`put`; else after
-                them.
+            on_subscribers: callback that is called with True when the key gets its first
+                subscriber, and with False when the last subscriber has left.
+            urgent: True: messages wait in the same queue as messages of :meth:`put`; False: they
+                wait until that queue is empty.
         """
 
     @abc.abstractmethod
@@ -133,7 +134,8 @@ class Bus(abc.ABC):
         Args:
             pattern: pattern of the keys.
             on_message: the callback.
-            patient: whether messages wait until all others were received, within an own bound.
+            patient: whether messages wait until all messages of other subscriptions were received.
+                The waiting messages have a bound of their own.
         """
 
     @abc.abstractmethod
@@ -149,8 +151,8 @@ class Bus(abc.ABC):
         Args:
             pattern: pattern of the keys.
             answer: the callback.
-            patient: function, called in any thread, that returns whether a question with a key
-                waits like a message, see :meth:`subscribe`.
+            patient: function that returns whether a question under a key waits until other messages
+                were received, as in :meth:`subscribe`. It may be called in any thread.
         """
 
     @abc.abstractmethod
@@ -167,14 +169,14 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
-        """Call ``on_presence(key, present)`` for present ends, and for later changes."""
+        """Call ``on_presence(key, present)`` for all ends that are present, and at each change."""
 
 
 class BusQuestion(abc.ABC):
-    """A question on the bus, waiting for its answer.
+    """A received question that is not answered yet.
 
     Attributes:
-        key: requested key, or a pattern.
+        key: key or pattern to which the question was sent.
         payload: bytes of the question.
     """
 
@@ -183,9 +185,9 @@ class BusQuestion(abc.ABC):
 
     @abc.abstractmethod
     def reply(self, key: str, payload: bytes) -> None:
-        """Send an answer; more than once if several keys are asked for.
+        """Send an answer; call it once for each key if the question asks for several keys.
 
-        Answers may be sent only when the question is closed.
+        The bus may hold the answers back until the question is closed.
         """
 
     @abc.abstractmethod
@@ -219,7 +221,7 @@ P = TypeVar("P", bound=_Patterned)
 
 
 class _PatternTable(Generic[P]):
-    """The declarations of one kind at an end, by pattern, so that a key's are found fast."""
+    """The declarations of one kind at an end, stored by pattern to find those of a key fast."""
 
     def __init__(self) -> None:
         self._exact_keys: dict[str, dict[P, None]] = {}
@@ -252,7 +254,7 @@ class _PatternTable(Generic[P]):
         self._wildcards.clear()
 
     def matching(self, pattern: str) -> list[P]:
-        """Return the entries whose patterns overlap with a pattern or a key."""
+        """Return the entries whose pattern can match the same key as the given pattern or key."""
         if "*" in pattern:
             return [entry for entry in self if patterns_overlap(entry.pattern, pattern)]
         wild = [entry for entry in self._wildcards if patterns_overlap(entry.pattern, pattern)]

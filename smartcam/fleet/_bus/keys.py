@@ -39,7 +39,8 @@ COMMANDS = frozenset(
 """Calls that change something, or reserve the camera; all other calls are questions."""
 
 RESERVED_COMMANDS = COMMANDS - {"release", "leave"}
-"""Commands that name the reservation in whose block they are called, and fail if it is lost."""
+"""Commands that name the reservation in whose block they are called. They fail if the reservation
+is lost."""
 
 
 @lru_cache(maxsize=4096)

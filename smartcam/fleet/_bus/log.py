@@ -1,8 +1,8 @@
 """Keep numbered messages of one camera at its agent, and put them in order at their receiver.
 
-An agent numbers its messages without gaps and keeps the last ones (:class:`AgentLog`). A receiver
-(:class:`Feed`) takes each number once and in order: it drops repetitions, and asks for missing
-messages. Messages that the agent no longer has are counted as missed.
+An agent numbers its messages without gaps, and keeps the last messages (:class:`AgentLog`). A
+receiver (:class:`Feed`) passes on each number once, in order: it drops repetitions, and asks the
+agent for missing messages. Messages that the agent no longer has are counted as missed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class Numbered(Protocol):
 
 
 _LogEntry = tuple[int, int, float, bytes]
-"""An entry of a log: its first number, the number after its last, its clock time, and its bytes."""
+"""An entry of a log: its first number, the number after its last one, the time by the agent's clock
+at which it was added, and its bytes."""
 
 
 class LogPart(NamedTuple):
@@ -66,7 +67,7 @@ class AgentLog:
 
     Args:
         max_messages: largest number of kept messages.
-        max_bytes: largest number of kept bytes; the last entry is always kept.
+        max_bytes: largest number of kept bytes. The last entry is kept even if it is larger.
 
     Attributes:
         following: number of the next message, from 1.
@@ -138,14 +139,16 @@ class Feed(Generic[NumberedT]):
     """Puts the messages of one camera's agent in order.
 
     Args:
-        on_message: callback for each message, once, in order of the numbers.
-        on_missed: callback for missed messages: their count, and the message after them or None.
-        on_gap: callback for a missing message. The feed's owner then asks the agent for messages
-            from ``expected`` on, and adds them by :meth:`fill`.
-        max_held_bytes: largest number of bytes of messages that wait for a missing one; further
-            messages are dropped, and requested later.
-        resumes_epochs: whether an epoch that begins again after another epoch goes on at its next
-            number; then messages that are missing when an epoch ends are reported as missed.
+        on_message: callback that gets each message once, in the order of the numbers.
+        on_missed: callback for messages that are lost for good. It gets their number, and the
+            message that follows them, or None.
+        on_gap: callback that is called when a message is missing. The feed's owner then asks the
+            agent for messages from ``expected`` on, and adds them by :meth:`fill`.
+        max_held_bytes: largest number of bytes of messages that are held until a missing message
+            has come. Further messages are dropped, and requested later.
+        resumes_epochs: whether the feed remembers its position in an epoch (one run of an agent)
+            when another epoch begins, and goes on there if the epoch returns. Messages that are
+            missing when an epoch ends are then reported as missed.
 
     Attributes:
         epoch: number of the agent's start; 0 before the first.
@@ -174,13 +177,13 @@ class Feed(Generic[NumberedT]):
         self._expected_in_epoch: dict[int, int] = {}  # next expected number, by earlier epoch
         self._following_in_epoch: dict[
             int, int
-        ] = {}  # the agent's next number, by epoch that did not begin here
+        ] = {}  # the agent's next number, by epochs for which begin() was not called yet
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
         """Begin an epoch of the agent, with ``expected`` as the number of its first message.
 
-        In a known epoch the expected number stays. ``following`` is the agent's next number:
-        missing messages before it are requested.
+        If the epoch was begun before, the expected number of that time is used. ``following`` is
+        the number of the agent's next message: missing messages before it are requested.
         """
         if epoch != self.epoch or not self.expected:
             if self._resumes_epochs and self.expected:
@@ -194,7 +197,7 @@ class Feed(Generic[NumberedT]):
         self._take_held(following)
 
     def _end_epoch(self) -> None:
-        """End the current epoch: take its held messages, and report its missed ones."""
+        """End the current epoch: pass on its held messages, and report its missing messages."""
         held = self._held_in_epoch()
         while held:
             message = held.popleft()
@@ -241,7 +244,8 @@ class Feed(Generic[NumberedT]):
         held = self._held_in_epoch()
         expected, first_held = self.expected, held[0].number if held else following
         if first <= expected and not messages:
-            first = max(following, first_held)  # the agent announces more, but sends nothing
+            # the agent sent nothing, although it has announced messages: they are lost
+            first = max(following, first_held)
         if first > expected:
             self._on_missed(first - expected, messages[0] if messages else None)
             self.expected = first
@@ -251,7 +255,7 @@ class Feed(Generic[NumberedT]):
         self._take_held(following)
 
     def interrupt(self) -> None:
-        """Hold messages until :meth:`begin`, since no agent can be asked for missing ones."""
+        """Hold messages until :meth:`begin`: there is no agent to ask for missing messages."""
         self.has_gap = True
 
     def stop(self) -> None:
@@ -268,7 +272,7 @@ class Feed(Generic[NumberedT]):
         self._on_message(new_part)
 
     def _take_held(self, following: int) -> None:
-        """Take held messages that are next in order; report a gap before further ones."""
+        """Pass on held messages that are next in order; report a gap before the other ones."""
         self.has_gap = False
         if following > self._highest_following:
             self._highest_following = following
@@ -285,7 +289,7 @@ class Feed(Generic[NumberedT]):
             self._on_gap()
 
     def _held_in_epoch(self) -> collections.deque[NumberedT]:
-        """Return the held messages if they are of this epoch; those of the next epoch stay held."""
+        """Return the held messages if they belong to this epoch, else an empty queue."""
         return self._held if self._held_epoch == self.epoch else collections.deque()
 
     def _hold(self, epoch: int, message: NumberedT) -> None:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 def reply_grace(timeout: float) -> float:
     """Return the seconds for which a program awaits a reply beyond a call's timeout.
 
-    So the agent gives up first, and its reply arrives in time. The agent expects that a call needs
-    up to half of this time to arrive, and does not take that from the call's timeout.
+    So the agent gives up before the program does, and the agent's reply arrives in time. The agent
+    allows up to half of this time for the call's way to it, without shortening the call's timeout.
     """
     return min(0.25, 0.02 + 0.1 * timeout)
 
@@ -124,8 +124,8 @@ def decode(payload: bytes, label: str) -> BusMessage:
 # ---------------------------------------------------------------------- results
 
 CURRENT, LATE = 1, 2
-"""Flags of a run. CURRENT: not known to belong to an older trigger. LATE: of a trigger that had
-timed out before."""
+"""Flags of a run. CURRENT: the results are not known to belong to an older trigger. LATE: the
+results belong to a trigger that had timed out before they came."""
 
 _RUN = struct.Struct("<QIqIBxxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
@@ -143,8 +143,8 @@ class ResultRun(NamedTuple):
         application: application of the containers; below 0 if the camera does not report it.
         endian: the byte order in the camera's last status.
         flags: the flags ``CURRENT`` and ``LATE``, which hold for all containers.
-        owner: the agent's number of the program whose trigger brought the containers; otherwise 0.
-        call: number of the trigger's call at its program; otherwise 0.
+        owner: number, at the agent, of the program that triggered; 0 if no program did.
+        call: number of the trigger among the calls of that program; 0 if no program triggered.
         clock: time of the arrival by the agent's monotonic clock, seconds.
         at: time of the arrival, seconds since 1970, UTC.
         triggered_at: time at which the trigger was sent, seconds since 1970; NaN without a trigger.

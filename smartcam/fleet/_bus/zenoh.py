@@ -1,9 +1,9 @@
 """Define the bus between processes and hosts, over Zenoh, which calls back in its own threads.
 
-Received messages are put into one queue, and a burst wakes the event loop once. A message that is
-sent waits for room in the engine's buffers for at most a millisecond. After that, the engine drops
-results, states and parts of frames; their receivers find the gap by the numbers. Calls and replies
-are not lost in this way: if one took so long, a thread sends it again, and waits for room.
+Received messages are put into one queue; many messages at once wake the event loop only once. To
+send a message, Zenoh (the *engine*) waits at most a millisecond for room in its buffers, and then
+drops the message. Receivers notice lost results, states and parts of frames by their numbers. Calls
+and replies are not lost: if sending one took so long, a thread sends it again, and waits for room.
 """
 
 from __future__ import annotations
@@ -44,28 +44,30 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MAX_DIRECT_BYTES = 1 << 16
-"""Largest size of a message that the loop sends itself; a thread sends larger ones."""
+"""Largest size, bytes, of a message that the event loop sends; a thread sends larger messages."""
 
 LINK = re.compile(r"\w+/(?P<host>[0-9.]+|\[[^]]+\]):(?P<port>[0-9]+)")
 """Address of the other end of a connection, in the engine's form."""
 
 BURST_PERIOD = 0.01
-"""Seconds in which only :data:`MAX_EXPRESS_MESSAGES` messages are sent without delay."""
+"""Period, seconds, in which only :data:`MAX_EXPRESS_MESSAGES` messages are sent without delay."""
 
 MAX_EXPRESS_MESSAGES = 8
-"""Messages of a burst that are each sent as an own packet, without delay. The engine has room for
-16 such packets. Further messages share packets, which are sent up to a millisecond later."""
+"""Number of messages in :data:`BURST_PERIOD` that are each sent as a packet of its own, without
+delay. The engine has room for 16 such packets. Further messages share packets, which are sent up to
+a millisecond later."""
 
 MAX_FREQUENT_KEYS = 64
-"""Largest number of keys with an own publisher, since routers have to know each publisher."""
+"""Largest number of keys that have a publisher; it is bounded since routers store each
+publisher."""
 
 IDLE_KEY_TIMEOUT = 10.0
-"""Seconds without use after which a key's publisher may be closed, for another key. An earlier end
-of the publisher could overtake its messages that still wait for room."""
+"""Seconds without use after which a key's publisher may be closed to make room for another key's.
+If it were closed earlier, that could overtake its messages that still wait to be sent."""
 
 SENDER_THREADS = 8
-"""Number of threads for messages that may have to wait for room. A program that does not read
-blocks one of them."""
+"""Number of threads that send messages which may have to wait for room. Each program that does not
+read its messages blocks one thread."""
 
 
 class ZenohEnd(ZenohSession, Bus):
@@ -83,7 +85,7 @@ class ZenohEnd(ZenohSession, Bus):
         self._senders: dict[int, ThreadPoolExecutor] = {}
         self._sending_bytes = 0
         self._uncertain_count = (
-            0  # messages that may have been dropped, and were not sent again yet
+            0  # number of messages that may have been dropped, and were not sent again yet
         )
         self._waiting_in_threads: collections.Counter[str] = collections.Counter()
         self._burst_began_at, self._burst_count = -BURST_PERIOD, 0
@@ -202,7 +204,7 @@ class ZenohEnd(ZenohSession, Bus):
         session = self._session
         if session is None:
             return False
-        # the engine drops a lost link earlier than the lost router
+        # the engine notices a lost link before it notices that the router is gone
         return bool(self._link.mode != "client" or session.info.links())
 
     def connected_addresses(self) -> set[tuple[str, int]] | None:
@@ -253,9 +255,9 @@ class ZenohEnd(ZenohSession, Bus):
         return "" if self._link.mode == "client" else key
 
     def _publisher_of(self, key: str, now: float) -> Any:
-        """Return the engine's publisher of a key that is used again; None for other keys.
+        """Return the engine's publisher of a key that was used before; None for a new key.
 
-        The engine then need not look for the key's subscribers at each message.
+        With a publisher, the engine need not look up the key's subscribers at each message.
 
         Raises:
             ZError: the session ends meanwhile.
@@ -301,7 +303,7 @@ class ZenohEnd(ZenohSession, Bus):
         *,
         may_be_dropped: bool = False,
     ) -> None:
-        """Let a thread send a message, and later ones of the same queue until this one is sent.
+        """Have a thread send a message, and all later messages of its queue until it is sent.
 
         Args:
             queue: name of the queue whose messages are sent in order.
@@ -309,10 +311,10 @@ class ZenohEnd(ZenohSession, Bus):
             key: key of the message.
             payload: the message.
             express: whether the message is sent as an own packet, without delay.
-            may_be_dropped: whether the message was sent before, and took so long that the engine
-                may have dropped it. The engine then drops further messages, too, until it has room
-                again. So threads send all messages until this one is sent. A receiver recognizes
-                a repeated message by its number.
+            may_be_dropped: whether the loop has sent the message before, and this took so long that
+                the engine may have dropped it. The engine may then drop further messages, too. So
+                threads send all messages until this one is sent. A receiver that gets the message
+                twice recognizes the repetition by the message's number.
         """
         size = len(payload)
         if self._sending_bytes + size > MAX_WAITING_BYTES:
@@ -458,7 +460,7 @@ class ZenohEnd(ZenohSession, Bus):
                 keys_present.pop(key, None)
             on_presence(key, present)
 
-        def on_session_lost() -> None:  # a new session reports no ends that left meanwhile
+        def on_session_lost() -> None:  # a new session does not report which ends left meanwhile
             for key in [*keys_present]:
                 note_presence(key, False)
 

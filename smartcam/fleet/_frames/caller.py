@@ -1,4 +1,4 @@
-"""Request frames of a fleet's camera at a program: single frames and streams."""
+"""Request frames of a fleet's camera from its agent: single frames and streams."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ OPEN_TIMEOUT = 15.0
 """Seconds that an agent has to open its device."""
 
 ANSWER_TIMEOUT = 2.0
-"""Seconds that the agent's reply may come after a trigger's timeout."""
+"""Seconds after a trigger's timeout until which the agent's reply may still arrive."""
 
 MAX_LENSES = 16
 
 
 class StreamCounts:
-    """The counts in a stream's last reply."""
+    """The counts of frames in the agent's last reply about a stream."""
 
     def __init__(self) -> None:
         self._last: tuple[int, int, int, int] | None = None
@@ -56,7 +56,7 @@ class StreamCounts:
         )
         return skipped, lost + max(
             0, sent - received_count
-        )  # frames that were sent, but did not arrive
+        )  # number of frames that were sent, but did not arrive
 
 
 class FrameCaller:

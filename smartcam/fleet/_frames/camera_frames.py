@@ -1,10 +1,10 @@
 """Share a camera's frames at its agent: one source for all programs.
 
-A program with a stream requests one frame after the other. The request arrives before the next
-frame, so it costs no time; a program that stops requesting gets no frames. Between two requests the
-agent keeps a reader for the program, which skips and counts frames like any reader. The agent
-closes the reader when the program leaves, or after a time without a request. The device stops with
-the last reader.
+A program with a stream requests one frame after the other. Usually a request arrives before the
+next frame, so that the frame is not delayed; a program that stops requesting gets no frames.
+Between two requests the agent keeps a reader for the program, which skips and counts frames like
+any reader. The agent closes the reader when the program leaves, or after some time without a
+request. When the last reader is closed, the device stops streaming.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ MAX_STREAMS_PER_PROGRAM = 16
 """Largest number of streams of one camera that one program may have."""
 
 MAX_FRAME_CALLS_PER_PROGRAM = 16
-"""Largest number of calls for frames of one camera that one program may have pending: each may hold
-a frame."""
+"""Largest number of unanswered calls for frames of one camera that one program may have, since each
+call may hold a frame in memory."""
 
 MAX_ENCODINGS = 16
 """Number of encodings whose last frame is kept for other programs with the same encoding."""

@@ -1,4 +1,4 @@
-"""Collect the bytes of frames at a program, from parts in order, while a call waits for them."""
+"""Put frames together from their parts at a program, while a call waits for the frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encode an agent's frames: the one place that knows the codecs."""
+"""Encode an agent's frames; no other module of the agent uses the codecs."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Choose the next frame of a stream, so that frames do not wait for the link.
+"""Choose the next frame of a stream, so that no frame waits for a busy network link.
 
-A frame that arrives while the link is busy must wait up to one period before it can be sent. So it
-is skipped, and the following frame is sent as soon as it arrives. This lowers the frame rate, but
-the delay of each frame is only the duration of its own transfer.
+A frame that the camera gives while the link is busy would have to wait, up to one frame period. So
+this frame is skipped, and the following frame is sent as soon as the camera gives it. This lowers
+the frame rate, but each frame is delayed only by its own transfer.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MAX_WAIT_PERIODS = 1.25
 
 
 class FramePace:
-    """Pace of one stream. All times are from one clock."""
+    """Chooses the frames of one stream. All times are from one clock."""
 
     def __init__(self) -> None:
         self._sent_at: float | None = None

@@ -1,9 +1,9 @@
-"""Send an agent's frames, never more bytes at a time than a program's window allows.
+"""Send an agent's frames in parts, and bound the bytes that are on the way to each program.
 
-The window limits the sent bytes that a program has not confirmed yet. A program confirms received
-bytes, and then gets more. So a program that is slow, stopped or dead fills only its own queue,
-delays no other program, and skips frames that it does not take in time. No task does this: each
-confirmation sends the next part.
+A program confirms received bytes. Its *window* is the largest number of sent bytes that it has not
+confirmed yet; at this number, sending waits. So a program that is slow, stopped or dead fills only
+its own queue, delays no other program, and skips frames that it does not take in time. There is no
+task for this: each received confirmation sends the next part.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ WINDOW_BYTES = 3 * PART_BYTES
 queue."""
 
 MAX_UNCOUNTED_BYTES = 1 << 16
-"""Largest number of bytes of a frame that is sent as one packet. It is neither confirmed nor
-counted in the window."""
+"""Largest number of bytes of a frame that is sent as one packet. Such a frame is neither confirmed
+nor counted in the window."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes of frames that may wait for one program; beyond it the oldest frame that
-has not been sent in part is dropped."""
+"""Largest number of bytes of frames that may wait for one program. If there are more, the oldest
+frame of which no part was sent is dropped."""
 
 CONFIRMATION_TIMEOUT = 10.0
 """Seconds without a confirmation after which a frame is dropped."""

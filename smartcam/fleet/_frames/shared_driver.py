@@ -1,4 +1,4 @@
-"""Read the frames of a fleet's camera as a source: one request after the other."""
+"""Read the frames of a fleet's camera as a source of frames, by one request after the other."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 ANSWER_TIMEOUT = 4.0
-"""Seconds for encoding and transfer that a stream's request has beyond its wait for a frame."""
+"""Seconds that a request may take for encoding and transfer, in addition to waiting for a frame."""
 
 MAX_UNANSWERED_REQUESTS = 3
 """Number of consecutive requests without an answer after which a stream has ended."""

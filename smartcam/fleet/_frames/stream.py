@@ -1,4 +1,4 @@
-"""Define streams of frames at an agent, which choose the next frame for a program."""
+"""Define the streams of frames at an agent: a stream chooses the next frame for one program."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class FrameStream(ABC):
 
 @dataclass(eq=False)
 class PictureStream(FrameStream):
-    """A stream of independent frames, of which the newest is next.
+    """A stream of independent frames; older frames are skipped.
 
     Args:
         reader: reader of the source.

@@ -2,8 +2,9 @@
 
 Programs that request the same settings share one encoder. To decode a frame of H.264, a program
 needs all frames since the last key frame. So the agent keeps the last few encoded frames, and a
-program gets all frames after its last one. A program that lags too far gets nothing until the next
-key frame. It is made for this program, but at most once in :data:`MIN_KEY_INTERVAL` seconds.
+program gets all frames after the last one that it has. A program that lags too far gets nothing
+until the next key frame. The agent then requests a key frame from the encoder, at most once in
+:data:`MIN_KEY_INTERVAL` seconds.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import H264Encoder
 
 MAX_LAG = 0.3
-"""Largest age of an encoded frame that is still sent, unless it is the newest, seconds."""
+"""Largest age, seconds, of an encoded frame that is still sent; the newest frame may be older."""
 
 MAX_UNITS_KEPT = 64
 

@@ -1,8 +1,8 @@
 """Encode and decode frames on the bus: their fields, and the parts of their bytes.
 
-The reply to a call for a frame has all its fields, without its bytes. The bytes are sent under
-their own key, in parts, since the engine drops messages that are longer than its queue. If the
-queue is full, a part is dropped; it never waits.
+The reply to a call for a frame has all fields of the frame, but not its bytes. The bytes are sent
+separately under another key, in parts, since the engine drops messages that are longer than its
+queue. If the queue is full, a part is dropped: sending a part never waits.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Serve programs without smartcam: list an agent's cameras, and carry out services.
 
-An agent answers every question, except those about another agent's cameras. A service runs in a
-task of the agent, which is cancelled after the service's timeout, or when the agent ends.
+An agent answers every question, except questions about another agent's cameras. Each service runs
+in a task of the agent. The task is cancelled after the service's timeout, or when the agent ends.
 """
 
 from __future__ import annotations
@@ -54,25 +54,25 @@ MAX_REQUEST_BYTES = 1 << 18
 """Largest number of bytes of a request."""
 
 MAX_CONCURRENT_CALLS = 256
-"""Largest number of running commands of one camera, and of running questions."""
+"""Largest number of running commands of one camera, and largest number of its running questions."""
 
 MAX_WAITING_REPEATS = 16
-"""Largest number of questions that wait for the answer of one call."""
+"""Largest number of repetitions of a call that wait for its answer."""
 
 MAX_ANSWERS_REMEMBERED, MAX_ANSWER_BYTES_REMEMBERED = 4096, 1 << 24
-"""Largest number of remembered answers of commands with an id, and of their bytes. Answers of
-questions have the same bounds, but separately, so that a viewer cannot displace those of
-commands."""
+"""Largest number of remembered answers to commands that had an id, and largest number of bytes of
+these answers. Answers to questions are bounded in the same way, but separately, so that a program
+that only asks cannot displace the answers to commands."""
 
 MAX_CAMERAS_ADDED = 100
 """Largest number of cameras that Setup adds."""
 
 CANCEL_GRACE = 0.5
-"""Seconds after a service's timeout at which its task is cancelled."""
+"""Seconds after a service's timeout when the service's task is cancelled."""
 
 SETUP_WAIT = 600.0
-"""Largest number of seconds for which Setup waits for a camera; mostly its own timeout is
-shorter."""
+"""Largest number of seconds for which Setup waits for a camera; the timeout in its request is
+usually shorter."""
 
 PRESENCE_TIMEOUT = 2.0
 """Seconds for the answer to a question about presences on the bus."""
@@ -139,7 +139,7 @@ class _PlainCall:
 
 
 class _KnownAnswers:
-    """Calls with an id, running or remembered; of commands, or of questions."""
+    """Running and remembered calls that have an id: either the commands, or the questions."""
 
     def __init__(self) -> None:
         self._calls: dict[tuple[str, str], _PlainCall] = {}  # oldest first
@@ -330,7 +330,7 @@ class PlainServices:
     # ------------------------------------------------------------------ other cameras
 
     async def _answer_unknown_camera(self, question: BusQuestion, order: _ServiceQuestion) -> None:
-        """Answer a question for a camera that no agent has, if this agent is to answer it."""
+        """Answer a question for a camera that no agent has, if this agent's name sorts first."""
         try:
             answers = await self._answers_for_all(order.camera)
         except BaseException:

@@ -1,4 +1,4 @@
-"""Serve programs without smartcam: JSON in, JSON out. ``docs/bus.md`` describes them."""
+"""Define the JSON services for programs that do not use smartcam; see ``docs/bus.md``."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ Interpret = Annotated[str, Field(max_length=10_000)]
 
 
 class PlainRequest(BaseModel):
-    """A request; these fields every request may have."""
+    """A request with the fields that every request may have."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
 

@@ -1,4 +1,7 @@
-"""Serve the camera services of the thesis' interface in JSON, on the fleet's bus."""
+"""Serve the thesis' camera services in JSON on the fleet's bus.
+
+The thesis is the one on smart cameras that defined these services for ROS.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Publish topics in JSON for programs without smartcam; each only while it has a subscriber."""
+"""Publish results, states and events in JSON for programs that do not use smartcam."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def as_json(fields: Mapping[str, object]) -> bytes:
 class Topics:
     """The topics of one agent's cameras.
 
-    For each kind of messages, one publisher for all cameras shows whether there is a subscriber.
-    Only then a camera's own publisher is created. So a thousand cameras cost nothing without
-    subscribers.
+    A message is published only while somebody subscribes to it. For each kind of messages, one
+    publisher for all cameras finds out whether there is any subscriber. A publisher of a single
+    camera is created only then. So a thousand cameras without subscribers need no publishers.
 
     Args:
         agent: the agent's name.

@@ -1,8 +1,8 @@
 """Convert an agent's numbers to Prometheus' families and their text.
 
-The text of a thousand cameras takes a tenth of a second, and a thread for it would block the event
-loop for 5 ms at a time. So it is written in the event loop, in steps of half a millisecond. Each
-step writes one family of a few cameras.
+To write the text for a thousand cameras takes a tenth of a second. A thread that writes it would
+block the event loop for 5 ms at a time (Python's switch interval). So the event loop writes the
+text itself, in steps of half a millisecond: one family of a few cameras in each step.
 """
 
 from __future__ import annotations

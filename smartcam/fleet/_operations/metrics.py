@@ -1,6 +1,7 @@
-"""Collect an agent's numbers from counts that it has.
+"""Collect the numbers for an agent's metrics from the counts that the agent keeps.
 
-The agent belongs to its event loop, so its counts are read there, a few cameras at a time.
+The counts may be read only in the agent's event loop. They are read for a few cameras at a time, so
+that the loop is not blocked.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
         "bus_bytes": server.bus_bytes,
     }
     reloads = server.reloads
-    # without await in between, so that each camera counts once: here or among removed cameras
+    # no await from here on, so that each camera counts once: here, or among the removed cameras
     cameras = [numbers for host, numbers in numbers_read if agent.hosts.get(host.name) is host]
     totals = Totals(agent.past_totals)
     totals.add(host.camera.statistics() for host in agent.closing_hosts)

@@ -59,11 +59,16 @@ SUMS: Final = (
     *("empty_slots", "extra_results", "inspections_by_others", "ignored_datagrams"),
     *("unknown_ids", "unexpected_messages", "long_bodies"),
 )
-"""Counters that are reported as sums of all cameras."""
+"""Names of the counters that are reported as sums over all cameras."""
 
 
 class Totals:
-    """Sums over all cameras, also over cameras that were removed, so that they never decrease.
+    """Sums of counters over an agent's cameras.
+
+    Cameras that were removed stay in the sums, so that the sums never decrease.
+
+    Args:
+        start: sums to begin with; None: zero.
 
     Attributes:
         counts: sums of the counters in :data:`SUMS`.
@@ -75,16 +80,16 @@ class Totals:
         self.processing: Histogram = empty if start is None else start.processing
         self.round_trip: Histogram = empty if start is None else start.round_trip
 
-    def add(self, accounts: Iterable[Statistics]) -> None:
-        """Add the counts of cameras."""
-        statistics = [*accounts]
+    def add(self, statistics: Iterable[Statistics]) -> None:
+        """Add the counters of some cameras."""
+        cameras = [*statistics]
         for name in SUMS:
-            self.counts[name] += sum(getattr(account, name) for account in statistics)
+            self.counts[name] += sum(getattr(camera, name) for camera in cameras)
         self.processing = _sum_histograms(
-            [self.processing, *(account.processing for account in statistics)]
+            [self.processing, *(camera.processing for camera in cameras)]
         )
         self.round_trip = _sum_histograms(
-            [self.round_trip, *(account.round_trip for account in statistics)]
+            [self.round_trip, *(camera.round_trip for camera in cameras)]
         )
 
 
@@ -94,6 +99,6 @@ def _sum_histograms(histograms: list[Histogram]) -> Histogram:
 
 
 def cumulative_bins(histogram: Histogram) -> list[tuple[str, float]]:
-    """Return the bins in Prometheus' form: each counts all values up to its bound."""
+    """Return (bound, count) for each bin; as in Prometheus, a bin counts all values up to it."""
     bounds = [*map(str, histogram.bounds), "+Inf"]
     return list(zip(bounds, map(float, itertools.accumulate(histogram.counts)), strict=True))

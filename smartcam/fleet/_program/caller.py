@@ -1,4 +1,4 @@
-"""Find and call the agent of a fleet's camera; track its presence and its clock."""
+"""Find the agent of a fleet's camera, make calls to it, and estimate the agent's clock."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ if TYPE_CHECKING:
     from smartcam.protocols._inside import Counters
 
 MAX_DRIFT_RATIO = 1e-4
-"""Largest drift between two clocks, seconds per second."""
+"""Largest drift between the program's and the agent's clock, seconds per second."""
 
 HELLO_TIMEOUT = 2.0
-"""Seconds for the answer to a hello; after that, the hello is sent again if the agent is
-present."""
+"""Seconds for the answer to a hello (a program's first call to an agent). After that, the hello is
+sent again if the agent is still present."""
 
 
 NAMES_FOR_USERS = {"ensure": "switch_application", "enter": "switch_application"}
-"""Names in texts for users of calls that have another name on the bus."""
+"""The names that texts for users give to calls whose name on the bus is another one."""
 OTHER_AGENT_INTERVAL = 0.25
-"""Seconds between two searches for another agent that has a session, if the current one has
+"""Seconds between two searches for an agent that has a session, while the current agent has
 none."""
 
 SESSION_QUESTION_INTERVAL = 5.0
-"""Seconds between two questions to an agent whether it has a session now. Its message about a new
-session may be lost, and a camera without triggers causes no further messages."""
+"""Seconds between two questions to an agent whether it has a session by now. The agent's message
+about a new session may be lost, and a camera that is not triggered causes no further messages."""
 
 MAX_AGENTS_REMEMBERED = 16
 """Largest number of agents of a camera that are remembered."""
@@ -80,7 +80,7 @@ class MetAgent:
 
 
 class Lease:
-    """A reservation whose block has not ended.
+    """A reservation of the camera by this program, while its ``async with`` block runs.
 
     Attributes:
         epoch: number of the start of the agent that made the reservation.
@@ -115,7 +115,7 @@ class Caller:
         camera: the camera's name in the fleet.
         program: program that makes the calls.
         counters: counters of the messages.
-        on_met: callback for an agent that has answered, before any other call.
+        on_met: callback that is called when an agent has answered the hello, before other calls.
         on_lost: callback for the loss of the agent, with its error.
         on_lease_lost: callback for the loss of this program's reservations, once for each loss.
 
@@ -125,7 +125,7 @@ class Caller:
         final_error: reason why there will be no further agent.
         has_session: whether the agent had a session with the camera when it last reported.
         leases: the reservations whose blocks run, oldest first, by the numbers of their calls.
-        streams_results: whether this program takes all results of the camera.
+        streams_results: whether this program subscribes to all results of the camera.
     """
 
     def __init__(
@@ -312,7 +312,7 @@ class Caller:
         self._accept_agent(best)
 
     async def _greet_again(self, met: MetAgent) -> None:
-        """Greet the agent again, and take over its state if it has a session now."""
+        """Send the agent another hello, and use the state in its answer if it has a session now."""
         with contextlib.suppress(SmartCamError):
             reply = await self._greet_agent(met.name)
             if self.agent is met and not self.has_session and reply.hello.get("connected"):
@@ -358,7 +358,7 @@ class Caller:
     # ------------------------------------------------------------------ the clock
 
     def sample_clock(self, clock: float) -> None:
-        """Estimate the agent's clock from its time in a message that has just arrived."""
+        """Improve the estimate of the agent's clock by its time in a message just received."""
         now = asyncio.get_running_loop().time()
         min_lead = self._min_clock_lead - MAX_DRIFT_RATIO * (now - self._min_lead_at)
         self._min_clock_lead, self._min_lead_at = max(min_lead, clock - now), now
@@ -568,7 +568,7 @@ class Caller:
         agent: str,
         met: MetAgent | None,
     ) -> Reply:
-        """Send a call, and wait for the reply until ``deadline``, which the agent does not know."""
+        """Send a call, and wait for the reply until ``deadline``, a time of this program's loop."""
         self._check_allowed(do)
         program, key = self.program, self._key_of_call(agent, do)
         reply_future = program.expect_reply(number, self, deadline)
@@ -614,7 +614,7 @@ class Caller:
     def _send_until_confirmed(self, key: str, fields: dict[str, Any]) -> None:
         """Send a message now, and repeatedly until the agent confirms it.
 
-        Stop when the agent is lost: it has then ended the program's work by itself.
+        Sending stops when the agent is lost, since a lost agent's work for the program has ended.
         """
         program, met = self.program, self.agent
 

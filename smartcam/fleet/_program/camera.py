@@ -1,4 +1,4 @@
-"""Use a camera that an agent shares."""
+"""Define the camera object with which a program uses a camera that an agent shares."""
 
 from __future__ import annotations
 
@@ -72,10 +72,12 @@ if TYPE_CHECKING:
     from smartcam.settings import Address, CameraSettings
 
 QUESTION_TIMEOUT = 2.0
-"""Seconds for the answer to a question; after that, it is asked again until its deadline."""
+"""Seconds for the answer to a question; after that, the question is sent again, until its
+deadline."""
 
 REACH_TIMEOUT = 0.5
-"""Seconds to wait for the events that the agent sent before a reply; later ones count as lost."""
+"""Seconds to wait for events that the agent sent before a reply. Events that have not arrived by
+then count as lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +85,7 @@ class ReservationLost(CameraEvent):
     """A program has lost its reservation of the camera before its block has ended.
 
     Attributes:
-        by: the program in words, as in errors: ``robot1 on host7, pid 31``.
+        by: the program that had the reservation, such as ``robot1 on host7, pid 31``.
     """
 
     by: str
@@ -92,15 +94,15 @@ class ReservationLost(CameraEvent):
 class FleetCamera(Camera[ValueT]):
     """A camera that an agent of a fleet shares with other programs.
 
-    It is made by :func:`smartcam.connect` with a fleet URL, and by a
-    :class:`~smartcam.fleet.Fleet`. The agent carries out commands, each once; results are read
-    in this process.
+    :func:`smartcam.connect` makes it for a fleet URL, and a :class:`~smartcam.fleet.Fleet` for each
+    camera. The agent carries out each command once; this process interprets the results.
 
-    If the agent or the link to it is lost, this raises a :exc:`~smartcam.ConnectionLostError` that
-    names the agent. It is then unknown whether a running call was carried out.
+    If the agent or the link to it is lost, running calls raise a
+    :exc:`~smartcam.ConnectionLostError` that names the agent. It is then unknown whether these
+    calls were carried out.
 
     Args:
-        settings: validated options; options of the session with the camera are the agent's.
+        settings: validated options; the agent's file has the options of the camera's session.
         camera: name of the camera in the fleet.
         program: program with an end of the bus.
         shared: whether other cameras use this program, too; then this camera does not close it.
@@ -194,7 +196,7 @@ class FleetCamera(Camera[ValueT]):
     # ------------------------------------------------------------------ open and close
 
     def _release_unreferenced(self) -> bool:
-        # the bus refers to the camera until it is closed; its own bus is dropped with it
+        # a shared bus refers to the camera until the camera is closed; an own bus ends with it
         attributes = vars(self)
         opened = attributes.get("_opened", False) and attributes.get("_closed") is None
         return opened and not attributes.get("_shared", True)
@@ -259,7 +261,7 @@ class FleetCamera(Camera[ValueT]):
             self._change_queues.discard(queue)
 
     def _check_session(self) -> None:
-        """Raise the reason why there is no session, or no usable one."""
+        """Raise the error that tells why there is no session, or why it cannot be used."""
         if self._closed is not None:
             raise self._closed.with_traceback(None)
         if self._layout_error is not None:
@@ -382,7 +384,7 @@ class FleetCamera(Camera[ValueT]):
         known = self._agent_facts.get("capabilities")  # an agent's camera may have no session yet
         self._agent_facts = hello if known is None else {"capabilities": known, **hello}
         self._use_agents_layout(hello)
-        # later events are newer; the missed ones bring everything in order
+        # missed events are requested, and bring the state in their order
         if not self._receiver.misses_states(met):
             self._on_state({"kind": "Hello", **hello})
         self._receiver.begin_agent(met)
@@ -454,7 +456,7 @@ class FleetCamera(Camera[ValueT]):
             queue.put_nowait(what)
 
     def _on_state(self, state: dict[str, Any]) -> None:
-        """Process an event of the camera, with its present state."""
+        """Process an event of the camera; the message also has the camera's state at that time."""
         if self._closed is not None:
             return
         if state["kind"] == "Status" and self._is_status_change_only(state):
@@ -518,7 +520,7 @@ class FleetCamera(Camera[ValueT]):
         self._listeners.publish(event)
 
     def _report_reservation_lost(self, program: str, at: datetime) -> None:
-        """Publish the agent's report of a lost reservation; this program's only once."""
+        """Publish the agent's report of a lost reservation; of one's own, publish it only once."""
         if program == self._program.name and self._caller.leases:
             self._caller.report_leases_lost()
         else:

@@ -1,8 +1,9 @@
-"""Subscribe once for many cameras, instead of once for each.
+"""Share one subscription between many cameras of a fleet.
 
-A camera of a fleet subscribes to its own keys. For many cameras, :meth:`Exchange.subscribe_all`
-declares one common subscription, and this module distributes the messages by their keys. This
-costs less than many subscriptions, both here and at the agents.
+The object of each camera subscribes to the keys of this camera. For many cameras,
+:meth:`Exchange.subscribe_all` declares one common subscription instead, and distributes the
+messages to the cameras by their keys. This takes less time than many subscriptions, here and at the
+agents.
 """
 
 from __future__ import annotations

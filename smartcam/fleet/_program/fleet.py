@@ -1,4 +1,4 @@
-"""A fleet at a program: all its cameras, or the cameras of a pattern."""
+"""Define the fleet object with which a program uses all cameras of a fleet together."""
 
 from __future__ import annotations
 
@@ -58,21 +58,23 @@ if TYPE_CHECKING:
     from smartcam.models import Result, SubscriberStatistics
 
 MAX_CAMERAS_MET = 256
-"""Largest number of cameras of a fleet that are met when it is opened. To meet a camera is to ask
-its agent for its state. In a larger fleet each camera is met when it is used."""
+"""Largest number of cameras of a fleet that are met when the fleet is opened. To meet a camera is
+to ask its agent for the camera's state. In a larger fleet each camera is met when it is first
+used."""
 
 MAX_CAMERAS_AT_ONCE = 100
 """Largest number of cameras that are met, or closed, at the same time."""
 
 MAX_CAMERAS_SUBSCRIBED = 64
-"""Largest number of cameras that have a subscription each. For more cameras, if they are more than
-half of the fleet, there is one subscription for all."""
+"""Largest number of cameras that each have their own subscription. More cameras, if they are more
+than half of the fleet, share one subscription to all cameras."""
 
 STATUS_TIMEOUT = 5.0
 """Seconds of the timeout for the answers of all agents."""
 
 STORE_TIMEOUT = 30.0
-"""Seconds of the timeout for the answers of all stores of results, which read a file."""
+"""Seconds of the timeout for the answers of all stores of results. Stores read files, which is
+slow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +235,7 @@ class FleetResults(Generic[ValueT]):
 
 
 def _sum_accounts(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
-    """Return the sum of the counters of a camera's queues, which followed each other."""
+    """Return the sum of the counters of a camera's queues, each of which replaced the last one."""
     *_, last = accounts
     counts = ("offered", "taken", "dropped", "queued", "queued_bytes", "missed")
     return dataclasses.replace(
@@ -251,7 +253,7 @@ class Fleet:
         bus: end of the bus, for this fleet alone.
         address: address of the fleet; None if it is in this process.
         fleet: name of the fleet; None for the only one on the bus.
-        around: context that is entered while the fleet is open.
+        around: context manager that is entered before the fleet is opened, such as its agent.
         timeout: seconds of the timeout for connecting to the fleet.
         options: options of the cameras, as for :func:`smartcam.connect`.
         guest: whether another object opens and closes the end of the bus.
@@ -283,7 +285,7 @@ class Fleet:
         self._results: list[tuple[str, weakref.ref[FleetResults[Any]]]] = []
         self._stack = contextlib.AsyncExitStack()
         self._state: Literal["new", "open", "closed"] = "new"
-        self._meets_all_at_open = True  # as there are few cameras
+        self._meets_all_at_open = True  # False in a fleet of many cameras
         self._meeting_slots = asyncio.Semaphore(MAX_CAMERAS_AT_ONCE)
         self._make_camera("camera")  # raises for wrong options now
 
@@ -355,7 +357,7 @@ class Fleet:
         await self.close()
 
     def __del__(self) -> None:
-        # an open bus refers to its fleet, so a fleet is collected only together with the bus
+        # an open bus refers to its fleet, so an open fleet is collected only together with its bus
         if vars(self).get("_state") == "open":
             warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
 
@@ -451,8 +453,9 @@ class Fleet:
     async def meet(self, pattern: str = "**") -> list[FleetCamera[Any]]:
         """Return the cameras of a pattern after their agents have answered, or timed out.
 
-        A fleet of up to 256 cameras is met when it is opened; in a larger one each camera is met
-        when it is first used. Its commands wait for that; its known state is returned at once.
+        In a fleet of up to 256 cameras, all cameras are met when the fleet is opened; in a larger
+        fleet, each camera is met when it is first used. Commands to a camera wait until it is met;
+        properties return the state that is known so far.
 
         Raises:
             ConfigurationError: the pattern is not valid.
@@ -505,7 +508,7 @@ class Fleet:
         return {name: best[name].summary for name in sorted(best)}
 
     async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ReportedOutlet]:
-        """Return the accounts of all agents' outlets, by agent and name.
+        """Return the counts of all agents' outlets, sorted by agent and outlet.
 
         Args:
             timeout: seconds for the answers of all agents; agents that do not answer are left out.
@@ -566,7 +569,7 @@ class Fleet:
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[FleetEvent]:
-        """Subscribe to agents and cameras that come and go; present ones come first."""
+        """Subscribe to events of agents and cameras; the first events report those present now."""
         stream = Subscription[FleetEvent]("events", max_queue=max_queue, overflow=overflow)
         if self._state == "closed":
             stream.end(None)

@@ -1,4 +1,4 @@
-"""A program on the bus: its calls, and the replies to them."""
+"""Define a program's end of the bus, which sends calls to agents and receives the replies."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ class CalledCamera(Protocol):
     """A camera that receives calls.
 
     Attributes:
-        streams_results: whether this program takes all results of the camera. They are then passed
-            on before a trigger returns.
+        streams_results: whether this program subscribes to all results of the camera. The results
+            of a trigger are then passed to the subscribers before the trigger returns.
     """
 
     streams_results: bool
 
 
 class Pending(NamedTuple):
-    """A call whose reply has not come.
+    """A call whose reply has not arrived yet.
 
     Attributes:
         camera: the camera that is called.

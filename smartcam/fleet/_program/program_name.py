@@ -1,8 +1,8 @@
 """A program's name, and the secret by which an agent recognizes the program.
 
-The name begins with the role of the program's certificate, which the engine's rules check, and ends
-with a digest of the secret. The name is public; the secret is sent only to agents. So no program
-can call, cancel or be present as another program, of any role.
+The name begins with the role in the program's certificate, and ends with a digest of the secret.
+The bus checks the role; an agent checks the digest. The name is public; the secret is sent only to
+agents. So no program can make or cancel calls, or announce its presence, as another program.
 """
 
 from __future__ import annotations

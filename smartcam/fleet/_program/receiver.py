@@ -1,4 +1,4 @@
-"""Receive a fleet camera's states and results, each once and in order, for its listeners."""
+"""Receive the states and results of a fleet's camera, and pass on each of them once, in order."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def read_state(data: bytes) -> StateMessage:
 
 
 class FleetListeners(Listeners):
-    """Listeners of a fleet's camera, which get only results that came after their own start."""
+    """Listeners of a fleet's camera. Each one gets only results that came after its own start."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -101,7 +101,8 @@ class FleetListeners(Listeners):
     def report_missed(self, count: int, following: ResultRun | None) -> None:
         """Report to the streams that ``count`` results before ``following`` are missed.
 
-        A stream that subscribed within this gap cannot know how many it has missed: it counts all.
+        A stream that was started while these results came cannot know how many of them it should
+        have got: it counts all of them.
         """
         self.results.horizon = math.inf if following is None else following.clock
         for stream in self.results:
@@ -154,7 +155,7 @@ class Receiver:
         self._name, self._camera, self._caller = name, camera, caller
         self._listeners, self._counters = listeners, counters
         self._interpretation, self._on_state, self._expected = interpretation, on_state, expected
-        self._program = 0  # the agent's number for this program
+        self._program = 0  # the number that the agent has given this program
         self._states: Feed[StateMessage] = Feed(
             self._take_state, _ignore_missed, lambda: self._fetch_soon("states")
         )
@@ -189,7 +190,7 @@ class Receiver:
         self._wake_waits(every_wait=True)
 
     def misses_states(self, met: MetAgent) -> bool:
-        """Return True if the same agent has sent states meanwhile that were not received."""
+        """Return True if the agent is the same as before, and has sent states not received here."""
         feed = self._states
         return feed.epoch == met.epoch and 0 < feed.expected < int(met.hello["states"])
 
@@ -201,7 +202,7 @@ class Receiver:
         self._states.begin(met.epoch, states, states)
         if "results" not in self._handles:
             return
-        if self._results.expected:  # after a restart or takeover of the agent: all its results
+        if self._results.expected:  # of a restarted or new agent, all results are wanted
             self._results.begin(met.epoch, int(hello.get("began", 1)), results)
         else:
             self._start_task("find", self._find_first_result())
@@ -317,7 +318,7 @@ class Receiver:
                 messages = _decode_messages(kind, reply)
             except (ProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! what was missing cannot be read: %s", self._name, exc)
-                first = following = feed.expected + 1  # skip it, to not request it forever
+                first = following = feed.expected + 1  # skip the message, not to request it forever
                 messages = []
             feed.fill(epoch, first, following, messages)
             self._wake_waits()

@@ -1,1 +1,1 @@
-"""Security of a fleet: rights, certificates, their authority, and the agent's access check."""
+"""Security of a fleet: the rights of roles, certificates, and a filter for connections."""

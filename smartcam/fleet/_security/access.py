@@ -1,7 +1,7 @@
-"""Define the rights of each role, and the engine's rules for them.
+"""Define the rights of each role, and convert them to rules for Zenoh (the bus's *engine*).
 
-A program's role is its certificate's common name. Only :data:`RIGHTS` are allowed;
-``docs/access.md`` is generated from them.
+A program's role is the common name in its certificate. The engine allows only what :data:`RIGHTS`
+list; ``docs/access.md`` is generated from this list.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
         ("liveliness_token", "egress"),
     ),
 }
-"""Zenoh's messages for each kind of use, and their direction: ingress is to Zenoh."""
+"""Zenoh's messages for each kind of use, and their direction; ``ingress``: from a program to the
+engine."""
 
 
 class Right(NamedTuple):

@@ -1,4 +1,4 @@
-"""Make certificates with a plant's own authority, which is in a folder."""
+"""Make certificates with a plant's own certificate authority, whose files are in a folder."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ LIFETIME = timedelta(days=365)
 AUTHORITY_LIFETIME = timedelta(days=3650)
 
 RENEWAL_TIME = timedelta(days=30)
-"""Remaining lifetime at which a certificate is renewed; or a third of its lifetime, if that is
-less."""
+"""A certificate is renewed when less than this remains of its lifetime, or less than a third of its
+lifetime if that is shorter."""
 
 START_MARGIN = timedelta(days=1)
 """Time by which a certificate's validity begins before now, since clocks in a plant differ."""

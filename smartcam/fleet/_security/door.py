@@ -1,15 +1,16 @@
 """Filter connections to an agent's port, since the engine accepts every connection.
 
-The engine has no bounds: a silent connection stays for 10 s, and after each failed handshake the
-engine accepts no connection for 0.1 s. So a filter on the listening socket makes the system drop
-requests for a further connection:
+Zenoh (the *engine*) does not bound connections: a silent connection stays for 10 s, and after each
+failed handshake the engine accepts no connection for 0.1 s. So a packet filter on the listening
+socket makes the system drop requests for a new connection:
 
-- from an address that has many half-open connections, whose handshake has not ended;
+- from an address with many half-open connections, that is, connections whose handshake is not
+  complete;
 - from all addresses while few file descriptors are left, since cameras and the health page need
-  them.
+  the rest.
 
-Existing connections are not affected; TCP repeats a dropped request by itself. The filter cannot
-look at contents, since connections inherit it from the listening socket.
+Existing connections are not affected; a client's TCP repeats a dropped request by itself. The
+filter must not look at contents, since accepted connections inherit it from the listening socket.
 """
 
 from __future__ import annotations
@@ -40,16 +41,16 @@ HostPort = tuple[str, int]
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 DESCRIPTOR_CHECK_INTERVAL, CALM_CHECK_INTERVAL = 0.01, 0.05
-"""Seconds between two checks of the free descriptors: in general, and if hardly more were in use
-than at the check before."""
+"""Seconds between two checks of the free file descriptors: usually, and after a check at which
+hardly more were in use than at the check before."""
 
 CHECK_INTERVAL = 0.25
 """Seconds between two checks of connections while some are half-open. A new connection causes a
 check at once."""
 
 CHECK_PAUSE_FACTOR = 4.0
-"""Pause after a check of connections, in multiples of its duration. A check reads every descriptor,
-and an agent may have thousands of cameras."""
+"""Pause after a check of connections, in multiples of the check's duration. A check looks at every
+file descriptor, and an agent may have thousands of cameras."""
 
 MAX_CALM_GROWTH = 8
 """Largest growth of used descriptors since the last check that counts as calm."""
@@ -59,22 +60,23 @@ CHECKS_PER_SEARCH = 50
 certificates change them."""
 
 RESERVED_DESCRIPTORS: Final = 256
-"""Number of descriptors that the port leaves to cameras and health; at most a quarter of all."""
+"""Number of file descriptors that are kept for cameras and the health page, at most a quarter of
+all."""
 
 MAX_HALF_OPEN_CONNECTIONS: Final = 16
-"""Number of half-open connections of an address from which on it gets no further connection."""
+"""Number of half-open connections at which an address is blocked: it gets no further connection."""
 
 RESUMING_HALF_OPEN: Final = 4
-"""Number of half-open connections at which a blocked address gets connections again."""
+"""Number of half-open connections at which a blocked address is unblocked."""
 
 MAX_BLOCKED_ADDRESSES: Final = 256
-"""Largest number of blocked addresses: those with the most half-open connections."""
+"""Largest number of blocked addresses; those with the most half-open connections are blocked."""
 
 BACKLOG: Final = 64
 """Number of connections that the system keeps for the engine. The filter cannot drop these."""
 
 MAX_DESCRIPTORS: Final = 65_536
-"""Number of descriptors that an agent requests from the system, as far as that is allowed."""
+"""Limit of file descriptors that an agent requests from the system, which may allow fewer."""
 
 ATTACH_FILTER, DETACH_FILTER = 26, 27
 """Linux' SO_ATTACH_FILTER and SO_DETACH_FILTER."""

@@ -1,4 +1,4 @@
-"""Use renewed certificates in an agent without a restart."""
+"""Make a running agent use renewed certificates, without a restart of the agent."""
 
 from __future__ import annotations
 
@@ -34,15 +34,14 @@ RETRY_DELAY = 1.0
 class CertificateWatch:
     """Opens an agent's end of the bus again when its certificates have changed.
 
-    This is only needed for an end that listens: the engine reads its files only at the start. For
-        an
-    end that only connects, the engine reads the files at each connection.
+    This is needed only for an end that listens: its engine reads the files only at the start. For
+    an end that only connects, the engine reads the files at each connection.
 
     Args:
         end: the agent's end of the bus, open.
         listens: whether the end listens.
         busy: function that returns whether a command runs.
-        without_nodes: context for the time of opening again; it closes the nodes of ROS.
+        without_nodes: context manager that closes the nodes of ROS while the end is opened again.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A software camera in this process: a client with a device of its own."""
+"""Define the client of a software camera: it runs the camera, too, in the same process."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 class SoftwareCamera(SmartCamera[ValueT]):
     """A camera whose pictures are inspected in this process: ``software:cell.yaml#line1/cam1``.
 
-    The client starts and stops a device in this process, so triggers, statuses, errors and streams
-    work as with a camera on the network. Results are read by the programs' layouts unless
-    ``interpret_as`` gives others. An application is given by number or by name.
+    The client runs an emulated device in this process, so triggers, statuses, errors and streams
+    work as with a camera on the network. Results are interpreted by the programs' layouts unless
+    ``interpret_as`` gives others. An application is named by its number or its name.
 
     Args:
         url: address of the camera, ``software:FILE#CAMERA``.
@@ -137,8 +137,8 @@ class SoftwareCamera(SmartCamera[ValueT]):
     ) -> bytes:
         """Return the picture from which a result was made, as a PNG's bytes.
 
-        The pictures of the last 8 results are kept. A recorder among the camera's observers keeps
-        all.
+        The pictures of the last 8 results are kept. To keep all pictures, add a recorder to the
+        camera's observers.
 
         Args:
             result: result of this camera.

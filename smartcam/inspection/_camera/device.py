@@ -1,4 +1,4 @@
-"""A software camera as a device on a port: an emulated camera that inspects frames."""
+"""Define the device of a software camera: an emulated camera that inspects real frames."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ _RECORDING_ADDRESS: Final = re.compile(r"^(?:[A-Za-z]:[\\/]|(?![A-Za-z][A-Za-z0-
 class SoftwareDevice(Server):
     """A device that inspects the frames of a source, with a smart camera's protocol.
 
-    The device starts in run mode. A lost source is a System Error until it is back. The device is
-    BUSY during an inspection; a trigger during this time is Overtriggered.
+    The device starts in run mode. While the source of frames is lost, the device reports System
+    Error. During an inspection it reports BUSY; a trigger during this time is Overtriggered.
 
     Args:
         camera: programs of the camera, and the address of the frames.
@@ -182,7 +182,7 @@ class SoftwareDevice(Server):
     async def start(self) -> None:
         """Open the source of the frames, then the port.
 
-        A missing source is a System Error.
+        If the source cannot be opened, the device starts with System Error.
 
         Raises:
             ConfigurationError: the device cannot listen on the port.
@@ -287,7 +287,7 @@ def _as_mapping(record: Any) -> dict[str, Any]:
 
 
 def make_source(address: str, *, recorded: bool) -> FrameSource:
-    """Return the source of an address, not open; a recording is read as fast as runs need pictures.
+    """Return the unopened source of an address; a recording is read as fast as runs need pictures.
 
     Raises:
         ConfigurationError: the address is wrong.

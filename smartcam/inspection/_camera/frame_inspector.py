@@ -40,7 +40,7 @@ TOOLS_TIMEOUT: Final = 60.0
 """Longest time, seconds, that a program's tools may take; then the result is not ok."""
 
 MAX_HUNG_THREADS: Final = 4
-"""Largest number of threads with hanging tools; at this number, new runs wait for a thread."""
+"""Largest number of threads in which tools hang; at this number, new runs wait for a thread."""
 
 THREAD_GRACE: Final = 1.0
 """Longest time, seconds, that closing the camera waits for a running tool."""
@@ -103,7 +103,7 @@ class FrameInspector(Inspector):
 
     Attributes:
         name: name of the camera.
-        judged: the last inspected picture; None before the first.
+        judged: the last inspected picture, with its findings; None before the first.
         viewers: functions that are called with each inspected picture.
         format: format of the source's frames; None before it was opened.
         trouble: reason why there are no frames; "" if they come.
@@ -189,7 +189,7 @@ class FrameInspector(Inspector):
         deadline = loop.call_later(FRAME_WAIT, self._end_without_frame)
         self._run = _OrderedRun(order, on_exposed, on_done, time.monotonic(), deadline)
         self._frame_wanted.set()
-        if self.trouble:  # a restart of the device has cleared the condition there
+        if self.trouble:  # report it again, since a restart of the device has cleared the condition
             loop.call_soon(self._set_trouble, self.trouble)
 
     def cancel(self) -> None:
@@ -239,7 +239,7 @@ class FrameInspector(Inspector):
                 except StopAsyncIteration:
                     return has_frames
                 has_frames, kept_frame = True, None
-                if self._recorded and frame.lost:  # a run with a damaged picture has no result
+                if self._recorded and frame.lost:  # a damaged picture gives its run no result
                     kept_frame = dataclasses.replace(frame, lost=0)
                     why = f"{frame.lost} damaged pictures before picture {frame.sequence}"
                     self._report_frames_lost(why)

@@ -33,8 +33,9 @@ class _SentContainer(NamedTuple):
 class JudgedResults(Observer):
     """Find the picture of each result that a client gets from a device in this process.
 
-    Device and client both count the containers of a session, since all containers arrive, and in
-    order. A result gets no picture if its bytes differ from the container with the same count.
+    All containers of a session arrive, in order. So device and client both count them, and a result
+    belongs to the picture with the same count. If the result's bytes differ from the container with
+    this count, the result gets no picture.
 
     Args:
         session: function that returns the number of the device's session (0: no session), and the

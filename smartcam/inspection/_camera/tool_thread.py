@@ -1,4 +1,4 @@
-"""A thread for tools; the process can exit while it runs."""
+"""Run tools in a thread of their own, which does not keep the process from exiting."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Locate taught parts: any angle and scale, to a fraction of a pixel, with a true covariance."""
+"""Locate taught parts at any angle and scale, to a fraction of a pixel, with a covariance."""

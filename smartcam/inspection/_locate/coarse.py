@@ -1,9 +1,10 @@
-"""Find places where a part may be, by the directions of gradients, from coarse to fine.
+"""Find candidate places of a part, by the directions of gradients, from coarse to fine.
 
-The gradient of a pixel of a pyramid level has one of sixteen directions. A map for each direction
-gives the agreement of the pixels around a place with this direction. The agreement of a part's
-points is read from these maps, for all places at once, one rotation of the part after the other.
-The best places are refined at the larger levels of the pyramid.
+The picture is reduced to a pyramid of smaller and smaller pictures, its *levels*. In each level,
+the gradient of a pixel is rounded to one of sixteen directions. A map for each direction tells how
+well the pixels around a place agree with this direction. The agreement of a part's points is read
+from these maps, for all places at once, one rotation of the part after the other. This is done at
+the smallest level; the best places are refined at the larger levels.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ AGREEMENT: Final = (np.uint8(4), np.uint8(3), np.uint8(1))
 """Agreement of two directions that are 0, 1 or 2 steps apart; 0 for more steps."""
 
 MAX_TOP_POINTS: Final = 44
-"""Largest number of points of a part that are compared at all places: each adds 4 at most to the
-agreement, so that the sum fits into a byte."""
+"""Largest number of points of a part that are compared at all places. Each point adds 4 at most to
+the agreement, so that the sum fits into a byte."""
 
 MAX_POINTS: Final = 150
 """Largest number of points of a part that are compared at the places that are refined."""
@@ -44,8 +45,8 @@ MAX_LEVELS: Final = 6
 """Largest number of levels of the pyramid."""
 
 MAX_STACK_BYTES: Final = 1 << 26
-"""Largest number of bytes of the agreement of all places and rotations at the smallest level that
-is kept at a time."""
+"""Largest number of bytes of agreement values (one for each place and rotation at the smallest
+level) that are in memory at a time."""
 
 MAX_CANDIDATES: Final = 100
 """Largest number of places of a part, for each scale, that are refined down the pyramid."""
@@ -57,7 +58,8 @@ LOWER_STEP_PX: Final = 1.0
 """Motion of the farthest point, pixels, between two rotations at other levels."""
 
 TOP_SHARE, LOWER_SHARE = 0.8, 0.85
-"""Shares of the least score from which places are refined, at the smallest and at other levels."""
+"""Shares of the least score that a place must reach to be refined further: at the smallest level,
+and at the other levels."""
 
 EDGE_RESPONSE: Final = 2.2
 """Response of Sobel's operator to an edge of one grey level in a pyramid level."""
@@ -341,7 +343,7 @@ class _AgreementTable:
 
 
 def _thin_out(points: Array, normals: Array, most: int) -> tuple[Array, Array]:
-    """Return ``most`` of the points, evenly spread, or all if they are fewer."""
+    """Return ``most`` of the points, evenly spread, or all points if there are fewer."""
     if len(points) <= most:
         return points, normals
     chosen = np.linspace(0, len(points) - 1, most).round().astype(int)

@@ -1,4 +1,4 @@
-"""Find the edges of a taught picture as segments, with their place, direction and height."""
+"""Find the edges of a taught picture, and divide them into segments with place and direction."""
 
 from __future__ import annotations
 
@@ -51,21 +51,22 @@ BLURRED_FITS: Final = 3
 """Number of iterations of the fit of segments to a blurred picture."""
 
 MAX_SHIFT_PX: Final = 1.5
-"""Largest distance, pixels, by which a fit may move a segment; beyond it lies another edge."""
+"""Largest distance, pixels, by which a fit may move a segment; an edge farther away is another
+one."""
 
 MAX_BLUR_PX: Final = 3.0
 """Largest blur of an edge whose place is measured, in pixels."""
 
 MISFIT_NOISES, MAX_MISFIT = 2.0, 0.08
-"""Largest RMS residual of a band, as a multiple of the noise, and as a share of the edge's height,
-up to which the edge is a step whose place can be measured to a fraction of a pixel."""
+"""Largest RMS residual of the step that is fitted to an edge: as a multiple of the noise, and as a
+share of the edge's height. With a larger one, the place is not known to a fraction of a pixel."""
 
 MAX_SIGMA_PX: Final = 0.3
 """Largest standard deviation of the place of a taught edge, pixels."""
 
 STEP_SLOPE: Final = 8 / (math.sqrt(2 * math.pi) * 1.5)
-"""Response of Sobel's operator to an edge of one grey level with a blur of 1.5 pixels, which the
-picture and the Gaussian have together."""
+"""Response of Sobel's operator to an edge of one grey level with a blur of 1.5 pixels: the
+picture's own blur and that of the Gaussian together."""
 
 
 class EdgePoints(NamedTuple):
@@ -165,7 +166,7 @@ def _fit_segment(points: Array, normals: Array) -> tuple[Array, Array, float, fl
     middle = points.mean(axis=0) + tangent * (along.max() + along.min()) / 2
     along = (points - middle) @ tangent
     columns = np.column_stack([np.ones(len(along)), along, 0.5 * along**2])
-    # the change of the normals along the segment determines its bend better than the points do
+    # how the normals turn along the segment determines its bend better than the points do
     normal_rows = np.column_stack([np.zeros(len(along)), -np.ones(len(along)), -along])
     rows = np.vstack([columns, 4.0 * normal_rows])
     values = np.concatenate([(points - middle) @ normal, 4.0 * (normals @ tangent)])

@@ -28,28 +28,30 @@ if TYPE_CHECKING:
     from smartcam.inspection._picture import Picture
 
 CONTRAST_SHARE: Final = 0.12
-"""Least contrast of a found edge, as a share of its taught contrast, unless another one is set."""
+"""Default of the least contrast of a found edge, as a share of the edge's taught contrast."""
 
 MIN_CONTRAST: Final = 8.0
-"""Least contrast of a found edge, grey levels of 255, unless another one is set."""
+"""Default of the least contrast of a found edge, grey levels of 255."""
 
 MAX_FITS: Final = 12
 """Largest number of places that are fitted, in addition to four for each wanted part."""
 
 SCORE_MARGIN: Final = 0.1
-"""Score by which a fit may raise the coarse score. Once enough parts are found, a place whose
-coarse score is lower than theirs by more than this is not fitted."""
+"""Largest amount by which a fit is expected to raise a place's coarse score. Once enough parts are
+found, places whose coarse score is lower than the parts' scores by more than this are not
+fitted."""
 
 EQUAL_SCORE_DIFFERENCE: Final = 0.02
 """Largest difference of two scores that count as equal."""
 
 RANGE_MARGIN: Final = math.radians(1.0)
-"""Margin, in radians and as a share of the scale, by which a fitted pose may exceed the ranges."""
+"""Margin by which a fitted pose may exceed the searched ranges: in radians for the angle, and the
+same number as a share of the scale."""
 
 
 SIZE_MARGIN: Final = 0.03
-"""Share of the size by which a part may be larger or smaller if only one size is wanted; its pose
-has its true size."""
+"""Share of the size by which a found part may be larger or smaller if only one size is searched.
+The pose has the part's true size."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,11 +94,11 @@ class LocatedPart:
         noise: standard deviation of the picture's noise, grey levels.
         blur: standard deviation of the edges' blur, pixels.
         chi_square: ratio of the edges' squared residuals to the squares that noise explains.
-        refusal: why the part counts as not found; "" for a found part.
-        doubt: why the rotation may be another one; mostly "".
+        refusal: reason why the part counts as not found; "" for a found part.
+        doubt: reason why the part may be rotated in another way; "" if there is no doubt.
         hull: convex hull of the part, (K, 2), pixels of the picture.
-        contours: polygons (K, 2) along its edges, pixels of the picture, to be drawn; empty for a
-            refused part.
+        contours: polygons (K, 2) to be drawn along the part's edges, pixels of the picture; empty
+            for a refused part.
     """
 
     name: str
@@ -143,8 +145,8 @@ def locate(
 ) -> Located:
     """Return the parts in a picture.
 
-    ``box`` (left, top, right, below): area of their references; ``allowed``: function that returns
-    whether a reference may be at a place in the area.
+    ``box`` (left, top, right, below): area in which the references of the parts may be;
+    ``allowed``: function that returns whether a reference may be at a place in this area.
     """
     deadline = time.monotonic() + search.seconds
     searched: dict[tuple[int, int, int, int], _SearchedPicture] = {}
@@ -250,7 +252,7 @@ class _SearchedPicture:
         search: PartSearch,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> LocatedPart:
-        """Fit the part at a place; the part has a refusal if it does not count as found."""
+        """Fit the part at a place; return it, with a refusal if it does not count as found."""
         start = PixelPose(place.x, place.y, place.angle, place.scale)
         fine = self._fit(model, start, search)
         if fine is None:

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 FIRST_BLURS_PX: Final = (3.0, 2.0)
-"""Blurs of the first iterations of a fit, pixels: with a large blur, farther edges are found."""
+"""Blurs, pixels, of the steps that the first iterations fit: a wide step also finds edges that are
+farther away."""
 
 MAX_ITERATIONS: Final = 12
 """Largest number of iterations of a fit."""
@@ -49,17 +50,18 @@ MAX_BLUR_PX: Final = 4.0
 """Largest blur of edges that are fitted, pixels."""
 
 MAX_DEVIATION_SIGMAS: Final = 4.0
-"""Distance of an edge from the segment, in standard deviations, above which it is another edge."""
+"""Distance of an edge from its segment, in standard deviations, above which it is taken for another
+edge."""
 
 EDGE_SIGNIFICANCE: Final = 4.0
 """Least height of an edge, standard deviations of the height."""
 
 SCORED_DISTANCE_PX: Final = 1.0
-"""Distance of an edge from the segment, pixels beyond the noise, from which the segment adds
-nothing to the score."""
+"""Distance of an edge from its segment, pixels in addition to the noise, from which on the segment
+adds nothing to the score."""
 
 MAX_MISFIT: Final = 0.3
-"""Largest RMS residual of an edge's step beyond the noise, as a share of the step's height."""
+"""Largest RMS residual of a fitted step, less the noise, as a share of the step's height."""
 
 MIN_SEGMENTS: Final = 6
 """Least number of segments that determine a pose."""
@@ -80,15 +82,15 @@ GROWTH_SIGMA_PX: Final = 0.3
 or a camera with little contrast in bright levels, bright areas look larger."""
 
 CHANGE_SIGNIFICANCE: Final = 3.0
-"""Least significance, in standard deviations, of a change of the part's shape that is fitted. With
-1.0 a bolt's errors were 1.32 times the bound, since each fitted change costs certainty."""
+"""Least size of a change of the part's shape, in standard deviations, to be fitted. Each fitted
+change makes the pose less certain: with 1.0 instead, a bolt's errors were 1.32 times the bound."""
 
 FIRST_CHANGES_ITERATION: Final = 2
 """Number of the first iteration that also fits changes of the part's shape."""
 
 MAX_INVERSE: Final = 1e8
-"""Largest element of the inverse of the scaled equations; above it the edges do not determine the
-pose."""
+"""Largest element of the inverse of the scaled normal equations; if one is larger, the edges do not
+determine the pose."""
 
 
 class FineSettings(NamedTuple):
@@ -301,7 +303,7 @@ def _shift_sigmas(
     fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blurs: Array
 ) -> Array:
     """Return the standard deviation of each shift, from both pictures' noise and from misfits."""
-    # a scatter larger than by chance shows another structure than the step
+    # pixels that scatter more than chance explains show a structure other than the step
     has_structure = fit.variances > noise**2 * (1 + 2.5 * np.sqrt(2 / fit.freedoms))
     variances = np.where(has_structure, fit.variances, noise**2)
     # the structure may move the edge by its height over the step's steepest slope
@@ -451,7 +453,7 @@ def _solve_final(
         freedom = max(int(inliers.sum()) - 4, 1)
         chi_square = float((sigmas_off[inliers] ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
-    # beyond this, the part differs from the taught one
+    # with a larger chi-square, the part differs from the taught one
     exceeds_chance = chi_square > 1 + 4 * math.sqrt(2 / freedom)
     inlier_equations = rows[inliers], shifts[inliers], weights[inliers]
     solved = _solve_with_changes(inlier_equations, free, deviations, sigmas, max(chi_square, 1.0))

@@ -1,8 +1,9 @@
-"""Fit steps whose sides have no constant level, such as edges of a part on a textured background.
+"""Fit edges on a textured background, where the grey level beside an edge is not constant.
 
-Changes of the level *along* an edge do not move the step, so they can be measured by themselves. A
-texture changes the level across the edge by as much, and there it does move the step. So each side
-gets an unknown slope, which is not larger than the slopes along neighbouring edges.
+A texture changes the grey level along an edge and across it by about the same. Changes along the
+edge do not move the fitted step, so they can be measured. Changes across the edge do move the step.
+So the fit gives each side of an edge an unknown slope, whose expected size is that of the slopes
+measured along neighbouring edges.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ if TYPE_CHECKING:
     from smartcam.inspection._locate.segments import BandPixels, Segments
 
 GROUND_SQUARE: Final = 4.0
-"""Squared slope along an edge, as a multiple of its variance by noise: a quarter of the edges has
-at least this much if the background has no constant level. By noise alone it is 1.3."""
+"""Squared slope along an edge, as a multiple of its variance from noise. If a quarter of the edges
+has more than this, the background is not constant. From noise alone, that quarter has 1.3."""
 
 MIN_BANDS: Final = 12
 """Least number of bands from which the background's slopes are computed."""
 
 GROUND_DISTANCE_PX: Final = 10.0
-"""Standard deviation of the Gaussian that weights other bands by their distance, pixels of the
-taught picture, where the background's slopes near a band are measured."""
+"""Standard deviation, pixels of the taught picture, of the Gaussian by which the slopes of other
+bands are weighted by their distance from a band."""
 
 COMMON_PX, COMMON_DIRECTION = 24.0, 0.5
-"""Distance in pixels, and cosine of the angle between the normals, of edges that may have errors in
-common."""
+"""Edges may have an error in common if they are nearer than this, pixels, and the angle between
+their normals has at least this cosine."""
 
 COMMON_ERROR_SIGMAS: Final = 3.0
 """Agreement of neighbours' errors, in standard deviations, above which they have a common error."""

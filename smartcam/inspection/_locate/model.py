@@ -1,4 +1,4 @@
-"""Models of taught parts: made from a region of a picture, or from an outline; kept in files."""
+"""Define the model of a taught part, made from a picture or a drawn outline, and kept in a file."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ MAX_FILE_BYTES: Final = 1 << 21
 """Largest number of bytes of a model's file."""
 
 MAX_SEGMENTS: Final = 400
-"""Largest number of segments of a model, evenly chosen; more cost time and hardly improve poses."""
+"""Largest number of segments of a model; of more, some are chosen evenly. More segments would take
+more time, and hardly improve poses."""
 
 MAX_REGION_PX: Final = 25_000_000
 """Largest number of pixels of a taught region."""
@@ -73,13 +74,14 @@ MIN_TOP_POINTS: Final = 16
 """Least number of points of a part at the smallest level of the pyramid."""
 
 BORDER_PX: Final = 3.0
-"""Distance from the region's border, pixels, within which an edge is left out."""
+"""Edges that are nearer than this to the region's border, pixels, are left out."""
 
 MAX_BORDER_SHARE: Final = 0.1
 """Largest share of the edges that may lie at the region's border."""
 
 MIN_ACROSS: Final = 0.02
-"""Least share of the edges across the main direction, which determine the place along it."""
+"""Least share of the edges that must run across the main direction, since only such edges determine
+the part's place along the main direction."""
 
 LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
 """Cosine of the largest angle between a level's gradient and a visible segment's normal."""
@@ -108,7 +110,7 @@ MAX_LEVEL: Final = 255.0
 """Largest contrast or noise that a caller may give, grey levels of 255."""
 
 DEFAULT_CONTRAST: Final = 12.0
-"""Least contrast of a taught edge, grey levels of 255, unless another one is set."""
+"""Default of the least contrast of a taught edge, grey levels of 255."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,7 +292,7 @@ class PartModel:
         )
 
     def bands_at(self, scale: float) -> Bands:
-        """Return the bands of the segments; wider for a smaller part: pixels must suffice."""
+        """Return the bands of the segments, wider for a smaller part to have enough pixels."""
         step = min(max(round(-2 * math.log2(scale)), 0), MAX_BAND_STEP)
         if step not in self._bands:
             self._bands[step] = make_bands(self.segments, self.outline, BAND_PX * 2 ** (step / 2))

@@ -1,7 +1,7 @@
-"""Read outlines of parts from files of DXF and SVG, and draw a picture of such a part.
+"""Read outlines of parts from DXF and SVG files, and draw a picture of such a part.
 
-The libraries ezdxf and fontTools read the curves. This module joins lines whose ends meet to loops.
-A loop inside a loop is a hole.
+The libraries ezdxf and fontTools read the curves. This module joins lines whose ends meet, and so
+makes closed loops. A loop inside another loop is a hole.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ MARGIN_PX: Final = 12
 """Margin around the part in its picture, pixels."""
 
 SUBROWS: Final = 16
-"""Number of lines through each row of pixels along which the outline's area is measured."""
+"""Number of lines through each row of pixels along which the area inside the outline is
+measured."""
 
 DARK, CONTRAST, NOISE, BLUR_PX = 60.0, 130.0, 1.0, 0.8
 """Grey level of the darker side, difference to the brighter one, noise in grey levels, and blur in
@@ -474,7 +475,7 @@ def _pixel_shares(loops: list[Array], shape: tuple[int, int]) -> Array:
     row, across = np.concatenate(rows), np.concatenate(crossings)
     order = np.lexsort((across, row))
     row, across = row[order], across[order]
-    # crossings of a row enter and leave the part in turn; each changes all pixels to its right
+    # crossings of a line alternately enter and leave the part; each changes all pixels to its right
     signs = np.where(np.arange(len(row)) % 2, -1.0, 1.0) / SUBROWS
     first = np.floor(across).astype(int)
     canvas = np.zeros((shape[0], shape[1] + 2))

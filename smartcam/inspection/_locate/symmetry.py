@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from smartcam.inspection._locate.segments import Segments
 
 MIN_SAME_SHARE: Final = 0.97
-"""Least share of the outline that a symmetry's turn brings onto the outline."""
+"""Least share of the outline that a turn (rotation) of a symmetry must bring onto the outline."""
 
 MIN_ALIKE_SHARE: Final = 0.75
 """Least share of the outline for a turn by which a part may be mistaken for the unturned part."""
 
 MAX_FOLD: Final = 24
-"""Largest fold of a symmetry that is distinguished from a round part."""
+"""Largest fold (number of turns in the full circle) that is distinguished from a round part."""
 
 OUTLINE_DISTANCE_PX: Final = 1.5
 """Largest distance of a turned point from the outline, pixels."""
@@ -40,7 +40,8 @@ MIN_PAIRED_SEGMENTS: Final = 8
 """Least number of turned segments with a partner."""
 
 COMMON_FOLDS: Final = (2, 3, 4, 5, 6, 8)
-"""Folds whose centre is always searched for: a notch may move the reference away from it."""
+"""Folds whose centre is always searched; for other folds, only if enough of the outline matches
+about the reference. A notch in the part may have moved the reference away from the centre."""
 
 MAX_POINTS: Final = 1000
 """Approximate number of edge pixels that are turned."""
@@ -112,7 +113,7 @@ def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Sy
 
 
 def _min_share(shares: Array, count: int) -> float:
-    """Return the least share of the outline that a turn of a fold brings onto itself."""
+    """Return the least share that matches after a turn of the fold ``count``; 0: any turn."""
     if count == 0:
         return float(shares.min())
     turns = np.rint(ANGLE_COUNT * np.arange(1, count) / count).astype(np.intp)

@@ -1,1 +1,1 @@
-"""Measure subpixel edges, lines, circles, lengths and angles in pictures."""
+"""The tool `measure`: find edges, lines and circles, and compute lengths and angles from them."""

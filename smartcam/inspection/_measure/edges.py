@@ -1,7 +1,8 @@
-"""Find edges in strips with subpixel accuracy and a standard deviation.
+"""Find edges in strips of a picture, to a fraction of a pixel and with a standard deviation.
 
-The derivative of a Gaussian along the profile of a strip finds edges; a fit of blurred steps to the
-strip's pixels locates them exactly. The fit does not interpolate pixels, so their noise stays
+First the profile of grey levels along a strip is filtered by the derivative of a Gaussian; its
+peaks are rough places of edges. Then blurred steps are fitted to the strip's pixels, which locates
+the edges exactly. The fit does not interpolate pixels, so that the noise of the pixels stays
 independent.
 """
 
@@ -70,12 +71,13 @@ MAX_GROUP_GAP_BLURS = 7.0
 """Distance, in blurs, below which two edges are fitted together."""
 
 MIN_SIDE_BLURS = 1.5
-"""Least visible length on each side of an edge, in blurs, from which the fit gets its levels."""
+"""Least length of the strip, in blurs, on each side of an edge; the fit needs it to determine the
+levels."""
 
 FIT_REACH_BLURS, FIT_REACH_PX = 4.0, 8.0
 """Reach of a fit to each side of an edge, in blurs and in pixels; the larger one is used. Compared
-with 15 pixels, sigma is 8 % larger with 3 pixels, and 2 % larger with 8. Farther away the levels
-may differ."""
+with a reach of 15 pixels, sigma is 8 % larger with 3 pixels, and 2 % larger with 8 pixels. A longer
+reach may include other grey levels."""
 
 FIRST_FIT_REACH_PX = 12.0
 """Reach of the first fit to each side of an edge, pixels, while the blur is unknown."""
@@ -104,8 +106,8 @@ MIN_BRIGHT_NOISE_SHARE = 0.5
 """Least ratio of the bright side's noise to the dark side's: a tone curve reduces it."""
 
 MAX_PLATEAU_CHANCE = 1e-4
-"""Probability of the pixels at the largest level without saturation, below which they are
-saturated."""
+"""If so many pixels at the largest level would occur without saturation with less than this
+probability, they are saturated."""
 
 ROUNDING: Final = math.sqrt(1 / 12)
 """Standard deviation of rounding a grey level, the least noise of a picture."""
@@ -535,7 +537,7 @@ def _plateau_shares(pixels: StripPixels, fits: StepFits) -> Array:
 
 
 def _is_plateau(pixels: StripPixels, fits: StepFits, strip: int) -> bool:
-    """Return True if so many pixels at the largest level cannot come from the dark side's noise."""
+    """Return True if noise like the dark side's cannot explain the pixels at the largest level."""
     used = pixels.weights[0] > 0
     levels, across = pixels.levels[0][used], pixels.across[0][used]
     along = pixels.along[0][used] - float(fits.tilts[strip]) * across

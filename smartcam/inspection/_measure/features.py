@@ -1,7 +1,7 @@
 """Find edges, lines and circles in a picture's regions.
 
-Regions and edges are in pixels. ``values`` maps the edges to a plane, and fits points, lines and
-circles there.
+Regions and edges are in pixels of the picture. The module ``values`` maps the edges to the
+measuring plane, and fits points, lines and circles there.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ MIN_FOUND_SHARE = 0.5
 """Least share of the strips of a line or a circle that must have an edge."""
 
 OWN_NOISE_FACTOR = 2.0
-"""Ratio of an edge's noise to the median noise, above which the edge's own noise is used."""
+"""Ratio of an edge's noise to the median of all edges' noise. If it is larger, the edge's sigma is
+computed from the edge's own noise, else from the median."""
 
 
 class FoundPoint(NamedTuple):

@@ -202,7 +202,7 @@ def _best_start(edges: Edges, curves_through: Callable[[Array], Array], min_edge
     if math.comb(edge_count, min_edges) <= MAX_STARTS:
         samples = np.array(list(itertools.combinations(range(edge_count), min_edges)))
     else:
-        # a fixed seed, so that results are repeatable; each edge comes from another section
+        # a fixed seed, so that results are repeatable; the edges come from different sections
         generator = np.random.default_rng(edge_count)
         samples = np.argsort(generator.random((MAX_STARTS, edge_count)), axis=1)[:, :min_edges]
     with np.errstate(all="ignore"):

@@ -1,12 +1,13 @@
 """Define the planes in which lengths are measured: the picture, in pixels, or a calibrated plane.
 
-Edges are mapped to the plane, and lengths are measured in it, in millimetres for a calibrated
-plane. So the camera's tilt does not change lines or lengths. Nor does the lens' distortion if the
+Edges are mapped to the plane, and lengths are measured there, in millimetres for a calibrated
+plane. So lines and lengths do not depend on the camera's tilt, nor on the lens' distortion if the
 calibration has a lens.
 
-A calibration has errors that are common to all edges of a picture. They are described by
-independent components, each with the size of one standard deviation. A component's effect on a
-result is the difference between the result with and without this component in the map.
+A calibration's errors are common to all edges of a picture. They are described by independent
+components. Each component is a variant of the map that differs by one standard deviation. Its
+effect on a result is the difference between the result with this variant and the result with the
+map.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Plane(NamedTuple):
     unit: str  # "px" or "mm"
     # function from pixels (N, 2) to points of the plane (N, 2)
     map: Callable[[Array], Array]
-    # maps, each of which includes one component of the calibration's error
+    # variants of the map; each of them differs by one component of the calibration's error
     variants: tuple[Callable[[Array], Array], ...] = ()
     # description of errors that are unknown
     remark: str = ""

@@ -1,10 +1,11 @@
 """Fit blurred steps to the pixels of many strips at once.
 
-The model is a step between two grey levels, blurred by the lens as by a Gaussian of width ``s``,
-and averaged over the area of square pixels. Projected along an edge at an angle, a pixel's area is
-a trapezoid: the convolution of two boxes with the widths sine and cosine of the angle. The share of
-a pixel that lies after a step at distance d is the trapezoid convolved with the Gaussian's
-integral. It has a closed form: differences of the Gaussian's second integral.
+The fitted model is a step between two grey levels, blurred by a Gaussian of width ``s``, as the
+lens does, and averaged over the area of square pixels. A pixel's area, projected along an edge at
+an angle, has the profile of a trapezoid: the convolution of two boxes whose widths are the sine and
+the cosine of the angle. The share of a pixel that lies after a step at distance d is this trapezoid
+convolved with the Gaussian's integral. It has a closed form: differences of the Gaussian's second
+integral.
 
 The fit is by Levenberg and Marquardt. Its covariance is the Cramer-Rao bound with the noise of the
 residuals; no unbiased estimate can be better.

@@ -86,8 +86,8 @@ class Tolerance(NamedTuple):
     def complaint(self, value: float, sigma: float, guard: float) -> str:
         """Return the reason why a value is not good; "" if it is good.
 
-        The value must be inside by ``guard`` times its sigma, since it may be outside otherwise.
-        Degrees are compared modulo 360.
+        The value must be inside the limits by ``guard`` times its sigma; nearer to a limit, the
+        true value may be outside. Degrees are compared modulo 360.
         """
         if self.unit == "deg" and all(map(math.isfinite, (self.least, self.most, value))):
             middle = (self.least + self.most) / 2

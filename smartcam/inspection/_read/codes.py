@@ -1,4 +1,4 @@
-"""Read codes by zxing-cpp."""
+"""Read barcodes and two-dimensional codes in a picture, by the library zxing-cpp."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ReadCode:
             None: none.
         level: error correction level, such as ``H``; "" if the kind has none.
         version: size of the symbol, such as ``12x26``; "" if the kind has none.
-        prepared: name of the preparation with which the picture was read; "": none.
+        prepared: name of the preparation of the picture in which the code was read; "": none.
     """
 
     kind: str

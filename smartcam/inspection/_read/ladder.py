@@ -1,8 +1,8 @@
-"""Retry after a miss with the same reader on differently prepared pictures.
+"""Read codes that a first reading has missed: prepare the picture in several ways, and read again.
 
-A *rung* is one way to prepare the picture. Each rung reads codes of the measured sets that the
-earlier rungs miss; the rungs are ordered by the codes that they gain per time.
-``tests.inspection.proofs.codes`` measures them.
+A *rung* is one way to prepare the picture, such as sharpened or twice as large. Each rung reads
+some codes of the test pictures that the rungs before it miss. Rungs that read more additional codes
+per second come first; ``tests.inspection.proofs.codes`` measures that.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
     Prepared = tuple[NDArray[np.uint8], Affine]
 
 MAX_RUNG_PIXELS: Final = 16_000_000
-"""Largest number of pixels of a prepared picture; larger rungs are left out."""
+"""Largest number of pixels of a prepared picture; rungs that would make a larger one are
+skipped."""
 
-CONFIRMED_KINDS: Final = frozenset(
+KINDS_TO_CONFIRM: Final = frozenset(
     {
         *("Codabar", "Code32", "Code39", "Code39Ext", "Code39Std", "Code93", "Code128"),
         *("DXFilmEdge", "EAN13", "EAN8", "EANUPC", "ISBN", "ITF", "ITF14", "PZN", "UPCA", "UPCE"),
@@ -37,15 +38,16 @@ CONFIRMED_KINDS: Final = frozenset(
         *("PDF417", "CompactPDF417", "MicroPDF417"),
     }
 )
-"""Kinds with a weak or missing checksum, and kinds of stacked rows, each of which may be misread.
-In prepared pictures they need a second, equal reading: by another rung, or by the same rung on a
-smaller picture."""
+"""Kinds of codes that may be misread: those with a weak checksum or none, and those of stacked
+rows. In a prepared picture, such a code counts only if it is read twice, with equal contents: by
+another rung, or by the same rung in a smaller picture."""
 
 CONFIRMING_SCALE: Final = 0.9
-"""Scale of the picture for the second reading, which moves its samples."""
+"""Scale of the picture for the second reading by the same rung, so that its pixels are at other
+places of the code."""
 
 MAX_SAME_PLACE: Final = 0.5
-"""Largest distance between two readings of one code, as a share of its longest edge."""
+"""Largest distance between two readings of one code, as a share of the code's longest edge."""
 
 
 class Rung(NamedTuple):
@@ -71,30 +73,30 @@ class CodeSearch(NamedTuple):
     Attributes:
         grey: picture, (H, W).
         formats: wanted kinds.
-        origin: place of the first pixel in the picture of the corners.
+        origin: place of the first pixel of ``grey`` in the picture to which corners refer.
         is_in_region: function that returns whether a code lies in the region.
     """
 
     grey: NDArray[np.uint8]
     formats: Any
     origin: tuple[float, float]
-    counts: Callable[[ReadCode], bool]
+    is_in_region: Callable[[ReadCode], bool]
 
 
 def read_again(
     search: CodeSearch, codes_read: Sequence[ReadCode], least: int, deadline: float, expected: float
 ) -> list[ReadCode]:
-    """Try rungs until enough codes are read; return the codes, with those found before.
+    """Try rungs until enough codes are read; return ``codes_read`` and the additional codes.
 
     Args:
         search: the picture and the wanted codes.
-        codes_read: codes found before.
+        codes_read: codes that the first reading has found.
         least: number of codes that is enough.
-        deadline: ``time.monotonic()`` after which no rung may end; rungs that take longer are left
-            out.
-        expected: duration of reading without preparation, seconds.
+        deadline: time of ``time.monotonic()`` at which this function must end; rungs that would
+            probably take longer are skipped.
+        expected: duration of the first reading, seconds, from which a rung's is estimated.
     """
-    grey, counts = search.grey, search.counts
+    grey = search.grey
     codes = list(codes_read)
     unconfirmed: list[ReadCode] = []
     for rung in RUNGS:
@@ -105,9 +107,9 @@ def read_again(
             continue
         codes_in_smaller: list[ReadCode] | None = None
         for code in _read_with_rung(rung, search):
-            if not counts(code) or any(_is_same_code(code, other) for other in codes):
+            if not search.is_in_region(code) or any(_is_same_code(code, other) for other in codes):
                 continue
-            if code.kind in CONFIRMED_KINDS and not any(
+            if code.kind in KINDS_TO_CONFIRM and not any(
                 _is_same_code(code, other) for other in unconfirmed
             ):
                 if codes_in_smaller is None:

@@ -1,4 +1,4 @@
-"""Regular expressions with a time limit for every pattern and text."""
+"""Match texts with regular expressions of users, within a time limit."""
 
 from __future__ import annotations
 

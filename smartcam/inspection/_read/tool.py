@@ -142,7 +142,7 @@ class ReadTool(Tool[ReadSettings]):
 
         Args:
             grey: the picture, (H, W), contiguous.
-            origin: place of the first pixel in the coordinates of the corners.
+            origin: place of the first pixel of ``grey`` in the picture to which corners refer.
             is_in_region: function that returns whether a code lies in the region.
         """
         started = time.monotonic()

@@ -1,5 +1,6 @@
 """Cameras as machine-vision systems of OPC UA, according to OPC 40100-1.
 
-The nodeset beside these modules, ``MachineVision.NodeSet2.xml.gz``, is the OPC Foundation's,
-version 1.0.0 of 2019-07-11, under its MIT licence, which stands in the file and beside it.
+The nodeset in this folder, ``MachineVision.NodeSet2.xml.gz``, defines the types and nodes of OPC
+40100-1. The OPC Foundation published it (version 1.0.0 of 2019-07-11) under its MIT licence; the
+file contains the licence, and so does this folder.
 """

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.jobs import VisionResult
 
 MAX_BOOK_CHARACTERS = 1 << 28
-"""Largest total length of the values, as JSON, of all results that a server keeps, characters."""
+"""Largest number of characters that the JSON texts of all kept results may have together."""
 
 MAX_HANDLES = 10_000
 """Largest number of handles that clients have not released; the oldest beyond it are removed."""
@@ -34,7 +34,9 @@ class KeptResult(NamedTuple):
 
 
 class ResultBook:
-    """The last results, by their ids, and the handles that clients have on them.
+    """The last results, and the handles of clients.
+
+    A client gets a handle with an answer, and releases the handle when it has read the answer.
 
     Args:
         max_results: largest number of results; the oldest beyond it are removed.

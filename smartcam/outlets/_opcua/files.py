@@ -1,4 +1,4 @@
-"""Serve pictures of results, which clients read as temporary files."""
+"""Serve the pictures of results to clients, as OPC UA's temporary files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Define jobs, their results, and the error numbers of methods."""
+"""Define jobs (clients' orders to take one or more pictures), their results, and error numbers."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ ERRORS: tuple[tuple[type[BaseException], int], ...] = (
     (LinkError, -5),
     (TimeoutError, -4),
 )
-"""Numbers of errors in a method's output ``Error``; the first class that matches decides."""
+"""The number in a method's output ``Error`` for each class of errors; the first match decides."""
 
 NOT_FOUND = -7
 """Number of the error for a result, handle or picture that is unknown or no longer kept."""
@@ -71,10 +71,9 @@ class VisionJob:
         product: id of the product, as the client gave it; None without one.
         application: application that was ready when the job began.
         started_at: time of the job's start, UTC.
-        triggered_at: time of the job's trigger, from the camera's client, which the result has,
-            too.
+        triggered_at: time of the job's trigger, by which the job's result is recognized.
         result_published: event that is set when the job's result is published.
-        ended_at: time of the event loop at the job's end; None while the job is under way.
+        ended_at: loop time of the job's end; None while the job runs.
         task: task that carries out the job.
     """
 

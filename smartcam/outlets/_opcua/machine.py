@@ -1,4 +1,4 @@
-"""Keep the states of a vision system, which change only by transitions of the nodeset."""
+"""Keep the states of a vision system, and allow only the transitions that the nodeset defines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class WrongStateError(OutletError):
 
 
 class VisionStates:
-    """The states of both state machines of a vision system.
+    """The states of a vision system's two state machines: the whole system's, and that for jobs.
 
     Attributes:
         vision: name of the state of the whole system.
@@ -60,7 +60,7 @@ class VisionStates:
             if states[transition.machine] != transition.source or transition.cause != cause:
                 continue
             if (transition.machine, transition.target) not in sources:
-                continue  # Preoperational to Initialized leads into the other machine
+                continue  # Preoperational to Initialized belongs to the other state machine
             if target in ("", transition.target):
                 return transition
         return None

@@ -30,11 +30,11 @@ MAX_TEXT_CHARACTERS = 1000
 """Largest number of characters of an id or a text that a client gives."""
 
 MAX_LISTED = 100
-"""Largest number of results or recipes in one answer; a client requests the others by
+"""Largest number of results or recipes in one answer; a client requests further ones with a larger
 ``StartIndex``."""
 
 CALL_TIMEOUT = 700.0
-"""Seconds after which a call is cancelled; it is longer than all timeouts of cameras."""
+"""Seconds after which a call is cancelled, which is longer than every timeout of a camera."""
 
 _PYTHON_TYPES = {1: bool, 6: int, 7: int}
 """Python types of arguments, by the numbers of OPC UA's types."""
@@ -51,9 +51,9 @@ class Method(NamedTuple):
     """A method that a client may call.
 
     Attributes:
-        carry_out: function that carries out the method with plain arguments, and returns its
-            outputs without the error.
-        failed_outputs: outputs of a call that failed, without the error.
+        carry_out: function that carries out the method with plain Python arguments, and returns
+            the outputs except for the last one, ``Error``.
+        failed_outputs: outputs of a call that failed, except for ``Error``.
     """
 
     carry_out: Callable[..., Awaitable[list[ua.Variant]]]
@@ -126,7 +126,7 @@ class Methods:
     async def call(
         self, method: Method, types: Sequence[int], arguments: Sequence[ua.Variant]
     ) -> ua.CallMethodResult | ua.StatusCode | list[ua.Variant]:
-        """Carry out a method, and return its outputs; the last one is the error's number.
+        """Carry out a method, and return the outputs; the last output is the error's number.
 
         Args:
             method: the method.
@@ -378,7 +378,7 @@ def _argument(argument: ua.Variant, kind: int) -> Any:
 
 
 def _text(value: Any) -> str:
-    """Return the text of an id, which is a structure, a plain text, a number, or None.
+    """Return the text of a client's id, which may be a structure, a text, a number, or None.
 
     Raises:
         MethodArgumentError: the id is of another type, or too long.

@@ -1,4 +1,4 @@
-"""Define the nodes of a camera, which clients browse and read, and which raise events."""
+"""Make the OPC UA nodes of a camera, and publish the camera's values and events by these nodes."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ _PLAIN_VARIABLES: Mapping[str, tuple[ua.VariantType, Any]] = {
     "Value": (ua.VariantType.String, ""),
     "Count": (ua.VariantType.UInt32, 0),
 }
-"""Plain variables of a camera, with their initial values; of each result ``Count`` is written
-last."""
+"""Plain variables of a camera, with their initial values. For each result, ``Count`` is written
+after all other variables."""
 
 
 _TEXT = ua.VariantType.String
@@ -71,11 +71,12 @@ _PLAIN_METHODS: Mapping[str, tuple[Sequence[tuple[str, ua.VariantType]], ...]] =
         (("ResultState", ua.VariantType.Int32), ("Value", _TEXT), ("ErrorText", _TEXT)),
     ),
 }
-"""Methods for clients that do not support structures: arguments and outputs, without the error."""
+"""Methods for clients that do not support structures, with their arguments and their outputs except
+for ``Error``."""
 
 
 class CameraNodes:
-    """The nodes of one camera; methods return at once, and changes are published in order.
+    """The nodes of one camera. Methods return at once; changes are published later, in order.
 
     Args:
         server: server of asyncua, with the nodeset.
@@ -101,7 +102,7 @@ class CameraNodes:
         self._columns: dict[str, tuple[Column, ...]] = {}
 
     def id(self, path: str) -> ua.NodeId:
-        """Return the id of a node by its path of names below the camera's node."""
+        """Return the id of the node at a path of names below the camera's node."""
         return ua.NodeId(f"{self.name}.{path}" if path else self.name, self._own_index)
 
     async def make_nodes(self, states: VisionStates) -> None:
@@ -191,7 +192,7 @@ class CameraNodes:
         self._publish_queue.put(publish)
 
     def show_acquisition(self, job: VisionJob) -> None:
-        """Raise the event that a job's picture is taken."""
+        """Raise the event that reports that a job's picture is taken."""
         kind = "AcquisitionDoneEventType"
         fields = self._job_fields(kind, job, self.prepared)
         self._publish_queue.put(lambda: self._emit(kind, f"job {job.id} has its picture", fields))
@@ -243,7 +244,7 @@ class CameraNodes:
         self._publish_queue.put(publish)
 
     def show_trouble(self, why: str) -> None:
-        """Show as a condition why the camera cannot be used; "" if it can be used."""
+        """Show the reason why the camera cannot be used, as a condition; "" if it can be used."""
         self._trouble, self._is_confirmed = why, not why
         self._publish_queue.put(lambda: self._publish_trouble(why, confirmed=not why))
 

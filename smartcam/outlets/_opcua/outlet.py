@@ -1,4 +1,4 @@
-"""Define the outlet that runs a server of OPC UA in an own thread."""
+"""Define the outlet that runs an OPC UA server in a thread of its own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ MAX_STATES = 1_000
 class OpcUaOutlet(Outlet[OpcUaSettings]):
     """Serves cameras as vision systems; a result counts as delivered when the server has it.
 
-    The server has a thread, so that neither its nodeset nor its clients block the cameras.
+    The server runs in its own thread, so that loading the nodeset and serving clients do not delay
+    the cameras' event loop.
     """
 
     settings_class = OpcUaSettings

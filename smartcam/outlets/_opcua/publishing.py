@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_FAILURES = 100
-"""Number of consecutive failures to publish after which the server is opened again."""
+"""Number of consecutive calls that fail to publish, after which the server is restarted."""
 
 
 class PublishQueue:
-    """A queue of calls that publish something, in an own task.
+    """A queue of calls that publish something; a task makes these calls in order.
 
-    The queue has no bound of its own: methods and batches wait in :meth:`wait_published`.
+    The queue is not bounded: whoever adds calls then waits in :meth:`wait_published`.
     """
 
     def __init__(self) -> None:

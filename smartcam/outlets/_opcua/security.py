@@ -34,7 +34,7 @@ CERTIFICATE_DAYS = 3650
 """Number of days for which a certificate that the server makes is valid."""
 
 MAX_FAILED_LOGINS = 10
-"""Number of failed logins of an address within FAILED_LOGIN_TIME from which on it is refused."""
+"""Number of failed logins within FAILED_LOGIN_TIME after which an address is refused."""
 
 FAILED_LOGIN_TIME = 60.0
 """Seconds for which a failed login counts."""
@@ -79,7 +79,7 @@ class Users:
         folder: folder to which relative paths refer.
 
     Raises:
-        ConfigurationError: a password is not at the place that the settings name.
+        ConfigurationError: a password does not exist where the settings say.
     """
 
     def __init__(self, settings: OpcUaSettings, folder: Path) -> None:
@@ -122,7 +122,10 @@ class Users:
 
 
 class ProvenCertificate(bytes):
-    """A certificate whose user has proved to have the key; not only that of the channel."""
+    """A certificate whose user has signed with its private key when logging in.
+
+    The certificate of the encrypted channel, in contrast, identifies only a program.
+    """
 
 
 class FailedLogins:
@@ -169,7 +172,7 @@ class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are
         self.failed_logins: FailedLogins = FailedLogins()
 
     def decrypt_user_token(self, isession: Any, token: Any) -> tuple[str, str]:
-        """Return name and password, if they are right."""
+        """Return the client's name and password; raise an error if they are wrong."""
         with self.failed_logins.counting_attempt(_address(isession)):
             name, password = super().decrypt_user_token(isession, token)
             if self.user_manager.get_user(self, name, password) is None:
@@ -177,7 +180,7 @@ class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are
         return name, password
 
     def verify_x509_token(self, isession: Any, token: Any, signature: Any) -> ProvenCertificate:
-        """Return a user's certificate, if it is known and its key has signed."""
+        """Return a user's certificate; raise an error if it is unknown, or not signed with."""
         with self.failed_logins.counting_attempt(_address(isession)):
             if signature.Algorithm == _SHA1:
                 raise ServiceError(ua.StatusCodes.BadSecurityPolicyRejected)

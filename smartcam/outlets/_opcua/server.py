@@ -1,4 +1,4 @@
-"""Run the server, which shows cameras as vision systems to clients."""
+"""Run the OPC UA server, which presents each camera to clients as a vision system."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class VisionServer:
         self.files: TransferFiles | None = None
 
     async def start(self) -> None:
-        """Listen.
+        """Open the port, and load the nodeset.
 
         Raises:
             ConfigurationError: a secret, a certificate or a key does not exist.
@@ -105,7 +105,7 @@ class VisionServer:
         await server.start()
 
     async def _link_types(self) -> None:
-        """Let clients call a camera's methods also by the methods' nodes in the types."""
+        """Have a camera's methods also carried out if a client names the node in the type."""
         for kind in METHOD_TYPES:
             type_node = self.server.get_node(ua.NodeId(node_ids()[kind], self.spaces[0]))
             for method in await type_node.get_methods():
@@ -137,7 +137,7 @@ class VisionServer:
         await self.publish_queue.wait_failed()
 
     def new_job_id(self) -> str:
-        """Return a new id for a job, which differs from all ids of this run and of earlier runs."""
+        """Return a new id for a job; no other job has it, also not before a restart."""
         return f"{self._run_id}-{next(self._jobs)}"
 
     # ------------------------------------------------------------------ from cameras
@@ -165,7 +165,7 @@ class VisionServer:
             if entry.camera and entry.camera not in self.cameras:
                 await self._make_camera(entry.camera)
             views = [self.cameras[entry.camera]] if entry.camera else [*self.cameras.values()]
-            for view in views:  # a gap may concern all cameras
+            for view in views:  # several views: a gap may concern all cameras
                 view.system.accept_entry(entry)
         await self.publish_queue.wait_published()
 
@@ -252,7 +252,7 @@ class CameraView:
         self.nodes.show_transition(transition, job, why)
 
     def show_acquisition(self, job: VisionJob) -> None:
-        """Raise the event that a job's picture is taken, so that the part may move."""
+        """Raise the event that a job's picture is taken, after which the part may move."""
         self.nodes.show_acquisition(job)
 
     def show_result(self, result: VisionResult) -> None:

@@ -43,16 +43,16 @@ RESULT_WAIT = 5.0
 """Seconds to wait after a trigger for its result from the spool."""
 
 COMMAND_GRACE = 30.0
-"""Seconds that a command may take beyond its own timeout, for the way to the camera."""
+"""Seconds that a command may take beyond its own timeout, since it passes another thread."""
 
 PREPARE_WAIT = 0.3
 """Seconds that PrepareRecipe waits for the camera; after that, it returns "not completed"."""
 
 CONTINUOUS_RESULT_WAIT = 5.0
-"""Seconds after continuous execution in which its last results may arrive from the spool."""
+"""Seconds after the end of continuous execution in which its last results may still arrive."""
 
 LATE_RESULT_WAIT = 60.0
-"""Seconds after an aborted job in which its result may still arrive."""
+"""Seconds after the abort of a job in which the job's result may still arrive."""
 
 
 class VisionView(Protocol):
@@ -62,7 +62,7 @@ class VisionView(Protocol):
         """Show a transition, and raise its events."""
 
     def show_acquisition(self, job: VisionJob) -> None:
-        """Raise the event that a job's picture is taken, so that the part may move."""
+        """Raise the event that a job's picture is taken, after which the part may move."""
 
     def show_result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""
@@ -135,7 +135,7 @@ class VisionSystem:
     # ------------------------------------------------------------------ the camera's state
 
     def camera_changed(self, state: Mapping[str, Any]) -> None:
-        """Update the states after a change of the camera's connection or active application."""
+        """Update the states after the camera's connection or active application has changed."""
         connected, was_connected = bool(state.get("connected")), self._connected
         self._connected, self.application = connected, state.get("application")
         if connected:
@@ -151,7 +151,7 @@ class VisionSystem:
                 self._move("Error", why=why)
 
     def _update_states(self) -> None:
-        """Make the transitions that follow from the camera's state."""
+        """Move to the states that correspond to the camera's state."""
         states = self.states
         if not self._connected:
             if self._connected is False and states.vision == "Preoperational":
@@ -301,7 +301,7 @@ class VisionSystem:
             self._become_ready("PrepareRecipe")
         except (SmartCamError, TimeoutError) as exc:
             prepared.set_exception(exc)
-            prepared.exception()  # mark the error as retrieved, if the caller no longer waits
+            prepared.exception()  # no caller may wait any more: mark the error as retrieved
         else:
             prepared.set_result(None)
         finally:
@@ -382,7 +382,7 @@ class VisionSystem:
             return await self._command(self.name, verb, arguments)
 
     async def _start_camera(self) -> None:
-        """Start the camera; do nothing if it has no such command, since it always runs."""
+        """Start the camera; do nothing if the camera always runs, and has no such command."""
         with contextlib.suppress(UnsupportedError):
             await self._carry_out("start", timeout=self.settings.switch_timeout)
         self._was_stopped = False
@@ -519,7 +519,7 @@ class VisionSystem:
             job.result_published.set()
 
     def _job_of(self, fields: Mapping[str, Any], at: datetime) -> VisionJob | None:
-        """Return the job of a result; None if there is none, or it is uncertain."""
+        """Return the job that a result belongs to; None if none does, or it is uncertain."""
         trigger = _parse_time(fields.get("triggered_at"))
         if trigger is not None:
             job_of_trigger = self._jobs_by_trigger.pop(trigger, None)

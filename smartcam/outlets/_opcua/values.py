@@ -1,4 +1,4 @@
-"""Make values of OPC UA: ids, results, and structures for records of a layout."""
+"""Convert ids, results and records to OPC UA's values and structures."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ _BINARY_IDS = {
     "RecipeIdInternalDataType": 5268,
     "ConfigurationIdDataType": 5090,
 }
-"""Types of ids that add no fields to their base type, and the ids of their encodings. They need
-classes, or asyncua would send the abstract base type instead."""
+"""Types of ids that add no fields to their base type, and the node ids of their binary encodings.
+Each type needs a Python class, since asyncua would otherwise send the abstract base type."""
 
 
 def variant_type(kind: str) -> ua.VariantType:
@@ -206,7 +206,7 @@ class VisionValues:
     ) -> Structure:
         """Make the nodes of a structure; their ids depend on its fields.
 
-        So a client never decodes values of a new layout by the structure of an earlier layout.
+        So a client that has read an earlier layout's structure never decodes new values with it.
         """
         versions = sum(known[:2] == (camera, application) for known in self._structures)
         name = f"{camera}.App{application}" + f"v{versions + 1}" * bool(versions)
