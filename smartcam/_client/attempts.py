@@ -44,7 +44,7 @@ class Attempt:
             begin a session alike.
         transport: ``tcp`` or ``udp``.
         step: name of the last step that was begun.
-        outcome: text on the end of the attempt.
+        outcome: text that says how the attempt ended.
         received: number of bytes received.
         hung_up: True if the other side ended the link without a byte.
         error: reason why there is no session, None if there is one.

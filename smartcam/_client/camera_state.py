@@ -111,7 +111,7 @@ class CameraState:
         return same and self.active == application
 
     def note_usual_statuses(self, report: StatusReport) -> None:
-        """Handle the two statuses around a result; the second equals the present status."""
+        """Handle the two statuses around a result; the second one equals the last known status."""
         self.statuses_received += 2
         self.status = report.status
 
@@ -156,7 +156,7 @@ class CameraState:
             )
 
     def note_switch(self, application: int) -> None:
-        """Note that the camera has done a switch by this client."""
+        """Note that the camera has loaded an application as this client asked."""
         self.want_application(application)
         self._loaded_by_us = True
 

@@ -1,4 +1,4 @@
-"""Poll the status while it is needed, in dialects that do not send it by themselves (``bid``).
+"""Request the status repeatedly while it is needed, if the camera does not send it (``bid``).
 
 One timer runs while a trigger or a wait for a status is pending, or while statuses or events are
 subscribed to. It sends a request only if no request for the status is open; an
