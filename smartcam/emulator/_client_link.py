@@ -67,7 +67,7 @@ class CameraMachine(Protocol):
         ...
 
     def send(self, message: Any) -> None:
-        """Send a message; LocalProtocolError: not now."""
+        """Send a message; raise LocalProtocolError if the state forbids it."""
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""
@@ -122,7 +122,7 @@ class LinkOwner(Protocol):
         ...
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
-        """Note a message that passed or is lost, as faults have changed it."""
+        """Note a message that passed or was lost, in the form that faults gave it."""
         ...
 
 

@@ -74,7 +74,7 @@ class Port:
         self._close_socket()
 
     async def wait_closed(self) -> None:
-        """Wait until all is closed; :meth:`close_with_links` must be called before."""
+        """Wait until the port and all links are closed; call :meth:`close_with_links` before."""
         opening, self._opening = self._opening, None
         if opening is not None:
             await asyncio.wait({opening})
