@@ -113,7 +113,7 @@ MAX_DECLARED_AT_ONCE = 32
 
 _RING = (1).to_bytes(8, sys.byteorder)
 
-_CALLBACK_FAILED = "%s ! what came from the bus was not taken"
+_CALLBACK_FAILED = "%s ! a message from the bus was not handled: its callback failed"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from smartcam._client.listeners import Listeners
     from smartcam.protocols.messages import StatusReport
 
-# as plain integers: operations of an IntFlag cost more than the rest of handling a status
+# as plain integers: an IntFlag's operations cost more than all else that is done with a status
 _BUSY = int(Status.BUSY)
 _RUNNING_OR_BUSY = int(Status.RUNNING | Status.BUSY)
 

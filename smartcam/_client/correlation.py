@@ -51,7 +51,7 @@ MAX_OWED = 1024
 
 
 class TriggerEvidence:
-    """Evidence that the camera accepted a trigger; this base class needs none.
+    """Evidence that the camera accepted a trigger; this base class takes it for granted.
 
     It is for UDP, where statuses and their order may be lost, and for cameras that handle commands
     one after the other, so that an answer needs no proof (In-Sight).

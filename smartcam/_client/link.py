@@ -245,7 +245,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """Write several messages: one write on TCP, a datagram each on UDP.
 
         Raises:
-            LocalProtocolError: the state forbids a message; those before it were written.
+            LocalProtocolError: the state forbids a message; the messages before it were written.
             ConnectionLostError: the link is gone.
         """
         if self._loss_reason is not None:
@@ -642,7 +642,7 @@ async def open_link(
         port: port of the camera.
         name: name of the camera in logs.
         max_length: bytes of the largest payload that is accepted.
-        trace: function that is called with the frames of each delivery, and with those sent.
+        trace: function that is called with the frames of each delivery, and with sent frames.
         liveness_timeout: see :class:`Link`.
 
     Raises:

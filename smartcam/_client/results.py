@@ -207,7 +207,7 @@ class Results:
                 pending,
                 OvertriggeredError(
                     f"{self._name}: it cannot be told whose the result is: something else has "
-                    "triggered the camera at the same time, or an answer of it is missing"
+                    "triggered the camera at the same time, or an answer of the camera is missing"
                 ),
             )
         else:
@@ -243,7 +243,7 @@ class Results:
         elif risen & Status.OVERTRIGGERED:
             error = OvertriggeredError(
                 f"{self._name}: the camera dropped a trigger while ours was under way; "
-                "it cannot be told whose"
+                "it cannot be told whose trigger"
             )
         elif risen & Status.INPUT_CONTAINER and pending.has_input:
             error = InputContainerError(

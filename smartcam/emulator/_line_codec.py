@@ -264,7 +264,7 @@ class LineFramer:
         self._buffer += data
 
     def next_frame(self) -> Frame | None:
-        """Return the next line, None if it is incomplete; FrameError: it is too long."""
+        """Return the next line, None if it is incomplete; raise FrameError if it is too long."""
         codec = self._codec
         match = codec.ends.search(self._buffer, self._search_start)
         size = len(self._buffer) if match is None else match.start()

@@ -109,7 +109,7 @@ class Port:
                 self._socket = self._socket or self._bind()
                 await self._hand_over(self._socket)
             except OSError as exc:
-                _log.warning("! %s: port %d is not to be had: %s", self._name, self.number, exc)
+                _log.warning("! %s: port %d cannot be opened yet: %s", self._name, self.number, exc)
                 await asyncio.sleep(RETRY_PAUSE)
             else:
                 return

@@ -126,7 +126,7 @@ class TicketedFramer(LineFramer):
         self._ticketed_codec = codec
 
     def next_frame(self) -> Frame | None:
-        """Return the next frame, None if it is incomplete; FrameError: it is too long."""
+        """Return the next frame, None if it is incomplete; raise FrameError if it is too long."""
         codec = self._ticketed_codec
         match = codec.header.match(self._buffer)
         if match is None:

@@ -271,8 +271,8 @@ class Layout:
     def wire_records(self, payload: Payload, byte_order: ByteOrder = "little") -> Rows:
         """Return the unconverted values of each record of :meth:`parse_records`.
 
-        Units are those of the wire, texts are bytes as the camera sent them, bools are unchecked
-        numbers from 0 to 255.
+        Numbers have their unit on the wire, texts are bytes as the camera sent them, bools are
+        unchecked numbers from 0 to 255.
 
         Raises:
             InterpretationError: the payload's size does not fit.

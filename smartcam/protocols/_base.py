@@ -360,7 +360,7 @@ def load_protocol(name: str) -> Protocol:
         PluginError: the name is unknown, or the protocol failed to load.
         ConfigurationError: the entry point gives no :class:`Protocol`.
     """
-    from smartcam.registry import PROTOCOLS  # imported late: it logs
+    from smartcam.registry import PROTOCOLS  # imported late, since it imports logging
 
     protocol = PROTOCOLS.load(name)
     if not isinstance(protocol, Protocol):

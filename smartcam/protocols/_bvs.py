@@ -370,14 +370,15 @@ BVS: _Bvs = _Bvs(
     machine=Machine,
     parameters={
         SHOWS_TRIGGERS: (
-            "`no`: the camera's status does not tell of each trigger that it takes. Then a result "
-            "needs no proof that it is of this trigger, and a late or a stranger's one may be taken"
+            "`no`: the camera's status does not show each trigger that it accepts. Then the client "
+            "takes a result without proof that it belongs to this trigger: it may be a late result "
+            "or another client's"
         ),
     },
     detection={
         # The manuals show the dialects with a magic number over UDP only, and for TCP nothing but
-        # 16 bits. Three documents and a published test vector support the framing of handbook, one
-        # description supports the framing of thesis.
+        # 16 bits. Three documents and a published test vector support the framing of the dialect
+        # handbook, one description that of the dialect thesis.
         Transport.TCP: (_16_BIT_KIN, (HANDBOOK,), (THESIS,)),
         Transport.UDP: ((HANDBOOK,), _16_BIT_KIN, (THESIS,)),
     },

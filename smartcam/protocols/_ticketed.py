@@ -140,7 +140,10 @@ class HeaderReader(LineReader):
         self.take(self._header_bytes)
         body = self.take(length) or b""
         if not body.endswith(b"\r\n") or not body.startswith(form[1]):
-            raise FrameError(f"frame {form[1].decode()} does not hold what it says", data=body[:64])
+            raise FrameError(
+                f"frame {form[1].decode()} does not repeat its ticket, or does not end with CR LF",
+                data=body[:64],
+            )
         return body[:-2].decode(ENCODING)
 
     def _may_begin(self, header: bytes) -> bool:

@@ -41,8 +41,8 @@ SMART_CAMERA = Behaviour()
 def behaviour_of(dialect: FramedDialect, quirks: Quirks) -> Behaviour:
     """Return the behaviour of a camera that speaks ``dialect``.
 
-    Source: BVS ID guide p. 52, 58, 206, 210, 227 (published for ``bid``); the quirks have the
-        sources of the rest.
+    Source: BVS ID guide p. 52, 58, 206, 210, 227 (published for ``bid``); the quirks name the
+        sources of the other facts.
     """
     if not dialect.has(m.TriggerAnswer):
         return Behaviour(coded="code" in dialect.quirks)

@@ -161,7 +161,7 @@ class Device:
         self._now = 0
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
-        self._session = False
+        self._has_session = False
         self.sessions: int = 0
         self._switch_answer_due = False  # an answer to a switch is due in this session
         self.last_report: LastReport | None = None
@@ -217,7 +217,7 @@ class Device:
     @property
     def connected(self) -> bool:
         """True while a client has a session."""
-        return self._session
+        return self._has_session
 
     @property
     def endian(self) -> int:
@@ -281,10 +281,10 @@ class Device:
         if isinstance(message, m.Connect):
             self.connect()
         elif isinstance(message, m.Disconnect):
-            is_answered = self._session and self.behaviour.answers_disconnect
+            is_answered = self._has_session and self.behaviour.answers_disconnect
             self.disconnect()
             self._output = [m.DisconnectAnswer()] if is_answered else []
-        elif self._session:
+        elif self._has_session:
             self._handle_request(message)
         self._advance(self._now)
 
@@ -293,7 +293,7 @@ class Device:
 
         Source: SC manual p. 28, 29 (published); that ``bid`` sends no status is inferred.
         """
-        self._session, self._switch_answer_due = True, False
+        self._has_session, self._switch_answer_due = True, False
         self.sessions += 1
         self._note_entered(DeviceState.CONNECTED)
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
@@ -308,9 +308,9 @@ class Device:
 
         Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
         """
-        if self._session:
+        if self._has_session:
             self._note_entered(DeviceState.DISCONNECTED)
-        self._session = self._switch_answer_due = False  # only the asking client gets an answer
+        self._has_session = self._switch_answer_due = False  # only the asking client gets an answer
         self._output = []
 
     def watch(self, on_entered: Callable[[DeviceState], None]) -> None:
@@ -876,7 +876,7 @@ class Device:
     # ------------------------------------------------------------------ output
 
     def _send(self, message: m.Message) -> None:
-        if self._session:
+        if self._has_session:
             self._output.append(message)
 
     def _note_entered(self, state: DeviceState) -> None:

@@ -27,7 +27,7 @@ megapixels needs 17 million."""
 
 
 def _read_code(line: str) -> int:
-    """Return the status code of an answer; ValueError: it has none."""
+    """Return the status code of an answer; raise ValueError if it has none."""
     return int(line.partition("\r\n")[0])
 
 
@@ -38,7 +38,7 @@ def _read_value(line: str) -> int:
 
 
 def _read_status(line: str) -> m.StatusReport:
-    """Return the mode; LookupError: there is no such mode."""
+    """Return the status for a mode; raise LookupError for an unknown mode."""
     return m.StatusReport(status={"0": Status(0), "1": ONLINE}[line])
 
 
@@ -76,7 +76,7 @@ class _LoginState(enum.Enum):
 
 
 class TelnetClient(LineClient):
-    """One client: it logs in, then its commands are carried out one by one (decided).
+    """One client: it logs in, then its commands are carried out one by one.
 
     Attributes:
         number: number of the session, from 0.

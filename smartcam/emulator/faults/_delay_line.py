@@ -40,7 +40,7 @@ class Transmission:
     overtaken: bool = False  # whether later parts may pass this one while it waits
     # number of later parts to wait for, and the longest wait in seconds
     gather: tuple[int, float] | None = None
-    # without an order: whether the transmission is sent after those parts, not with them
+    # without an order: whether it is sent after the parts that it waits for, not with them
     after_gathered: bool = False
     end: Ending | None = None  # event of the connection after it
     faults: list[str] = field(
@@ -105,7 +105,7 @@ class DelayLine(Generic[T]):
     # transmissions of one time are carried together. False (UDP): each part is carried by itself
     ordered: bool
     wake: Callable[[], None]  # called when run() is due
-    # gets passing transmissions and the bytes of each, for one write; it may stop() the line
+    # gets due transmissions and the bytes of each, for one write; the function may stop() the line
     carry: Callable[[list[tuple[T, bytes]]], None]
     end: Callable[[Ending], None]  # ends the connection after a transmission
     on_dropped: Callable[[T], None]  # called with each transmission that was dropped by close()

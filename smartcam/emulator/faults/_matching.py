@@ -1,4 +1,4 @@
-"""Match faults with messages; keep the faults that wait, and those that have happened."""
+"""Match faults with messages; keep the faults that wait, and the last ones that happened."""
 
 from __future__ import annotations
 

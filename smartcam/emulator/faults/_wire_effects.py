@@ -69,7 +69,7 @@ class WireCodec(Protocol):
         ...
 
     def encode(self, message: m.Message) -> bytes:
-        """Return a message's bytes; UnsupportedError, LocalProtocolError: it cannot be sent."""
+        """Return a message's bytes; UnsupportedError or LocalProtocolError if it has none."""
         ...
 
     def encode_frame(self, frame: Frame) -> bytes:

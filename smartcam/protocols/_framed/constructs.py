@@ -83,7 +83,7 @@ def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
 def view_fields(dialect: FramedDialect, sender: Sender, data: bytes) -> list[FieldView]:
     """Return every field of one whole frame, in order, and surplus bytes as ``surplus``.
 
-    Raises MessageError: it is no complete frame of this dialect from this sender.
+    Raises MessageError: the bytes are no complete frame of this dialect from this sender.
     """
     try:
         parsed = frame_view(dialect, sender).parse(data)

@@ -107,7 +107,7 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
     client, camera = m.Sender.CLIENT, m.Sender.CAMERA
     idle, connecting, connected = State.IDLE, State.CONNECTING, State.CONNECTED
     table: dict[tuple[State, m.Sender, type[Message]], State] = {
-        # harmless without a session; it also ends a session of a client that has crashed
+        # harmless without a session; it ends the session of a client that has crashed
         (idle, client, m.Disconnect): idle,
         (idle, client, m.Connect): connecting,
         (connecting, client, m.Disconnect): State.DISCONNECTED,
@@ -644,8 +644,8 @@ class Machine:
     def _receive_known_delivery(self) -> bool:
         """Read a delivery that equals a stored one in all bytes except its result's data.
 
-        Its messages are those of the stored one, with other data in the result. Return False if
-        there is no such delivery.
+        Its messages are the stored delivery's, with other data in the result. Return False if no
+        such delivery is stored.
         """
         framer, events = self._framer, self._events
         buffer = framer.buffer

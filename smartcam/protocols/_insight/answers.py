@@ -133,7 +133,7 @@ class AnswerReader(LineReader):
         return data.decode(ENCODING)
 
     def _read_image(self) -> Generator[None, None, bytes]:
-        """Read a bitmap; its header has its bytes, the line before it perhaps its digits."""
+        """Read a bitmap. Its own header gives its size: the size line may count digits instead."""
         _parse_number((yield from self._read_line()), "an image's size")
         data = bytearray()
         size, crc, is_regular = 0, "", True
