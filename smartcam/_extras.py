@@ -1,4 +1,4 @@
-"""Import packages of the extras when they are first used."""
+"""Import the packages of smartcam's extras, which are optional, when they are first used."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Backoff"]
 
 MAX_FACTOR = sys.float_info.max
-"""Largest factor between two delays; it makes the second delay equal to ``maximum``."""
+"""Largest factor between two delays: with it, already the second delay is ``maximum``."""
 
 
 def is_transient(error: BaseException) -> bool:

@@ -199,7 +199,7 @@ class SentTrigger:
 
     Attributes:
         wanted: number of results expected.
-        number: sequence number set for it, None if its layout has none.
+        number: sequence number set for the trigger, None if its layout has none.
         evidence: evidence from the camera's messages.
         received: number of its received results.
         early_count: containers received before the camera showed that it had accepted the trigger.

@@ -1,4 +1,4 @@
-"""The counters of a client, over all its sessions."""
+"""Count a client's containers, events and times, over all its sessions."""
 
 from __future__ import annotations
 

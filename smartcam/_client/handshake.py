@@ -214,7 +214,7 @@ async def attempt(
 
     Args:
         address: address of the camera.
-        dialects: one dialect, or several that begin a session alike.
+        dialects: one dialect, or several whose sessions begin with the same messages.
         transport: TCP or UDP.
         progress: record of the attempt, in which each step is noted.
         name: name of the camera, for logs.
@@ -315,7 +315,7 @@ def dialect_remarks(address: Address) -> set[str]:
 
 
 def dialect_names(dialects: Sequence[Dialect]) -> str:
-    """Return the names of dialects that begin a session alike."""
+    """Return the names of the dialects of one attempt."""
     if len(dialects) == 1:
         return dialects[0].name
     return " or ".join(dict.fromkeys(dialect.name for dialect in dialects))

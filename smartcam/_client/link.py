@@ -1,4 +1,4 @@
-"""One TCP or UDP link to a camera, used once.
+"""Exchange messages with a camera over one TCP or UDP link, which is used once.
 
 The transport passes received bytes to the machine of ``protocols/``. Each call of the transport is
 a *delivery*; its events wait as a chunk in a bounded queue. The receive task takes one chunk in a
@@ -636,7 +636,7 @@ async def open_link(
 
     Args:
         protocol: protocol that makes the machine.
-        dialects: one dialect, or several that begin a session alike.
+        dialects: one dialect, or several whose sessions begin with the same messages.
         transport: TCP or UDP.
         host: the camera's name or address.
         port: port of the camera.

@@ -1,4 +1,4 @@
-"""A client's link to the camera, and the path of its messages while faults act on them.
+"""Pass messages between a client's link and the emulated camera, while faults act on them.
 
 The owner of a link makes the link's protocol machine, which has the camera's role. A link has a
 :class:`FaultyLink` only while wire faults wait or hold messages back. Then the camera's messages go

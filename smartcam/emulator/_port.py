@@ -1,4 +1,4 @@
-"""The camera's port, which can be closed and opened again with the same number."""
+"""Open, close and reopen the port of an emulated camera, always with the same number."""
 
 from __future__ import annotations
 

@@ -301,8 +301,8 @@ class Protocol:
         parameters: further parameters of a URL, with their meanings; in a URL, ``user`` and
             ``password`` are written before the host.
         detection: groups of dialects that a client tries if none is given, the most probable group
-            first, each on a new link. The dialects of a group begin a session alike. Default: a
-            group for each dialect.
+            first, each on a new link. The sessions of a group's dialects begin with the same
+            messages. Default: a group for each dialect.
         emulator: ``module:attribute`` of the class of its emulated cameras, such as a
             :class:`~smartcam.emulator.LineCamera`; "" if there is none.
         greeting: bytes that a camera sends to a new client before it receives anything; ``b""`` if

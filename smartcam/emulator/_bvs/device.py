@@ -465,7 +465,7 @@ class Device:
         Args:
             late: seconds by which the inspection takes longer.
             silent: True for an inspection that sends nothing.
-            extra: number of times that its container is repeated after the first one.
+            extra: number of times that the inspection's container is sent again.
         """
         late = check_seconds(late, "late", "device")
         silent = check_flag(silent, "silent", "device")

@@ -191,7 +191,9 @@ class DelayLine(Generic[T]):
         """Send due transmissions that have no order; queue due ones that others may overtake."""
         now = self._now
         due_entries = [entry for entry in self._unordered if entry.send_at <= now]
-        for entry in sorted(due_entries, key=lambda entry: (entry.send_at, entry.sent.after_gathered)):
+        for entry in sorted(
+            due_entries, key=lambda entry: (entry.send_at, entry.sent.after_gathered)
+        ):
             if entry not in self._unordered:  # closed meanwhile
                 return
             if self.ordered:

@@ -1,4 +1,4 @@
-"""Make the transmissions of one message as faults change them, without side effects."""
+"""Apply wire faults to one message: make the transmissions that replace it."""
 
 from __future__ import annotations
 

@@ -219,7 +219,7 @@ class Machine:
         policy: policy in place of the role's own; the emulator's quirks use it.
         trace: function that is called with the sender and each whole frame, in both directions, and
             with the error for bytes that make no frame.
-        kin: dialects that begin a session alike, of which the camera speaks one; ``dialect`` is the
+        kin: dialects whose sessions begin alike, of which the camera speaks one; ``dialect`` is the
             first. The answer to Connect removes the dialects that it does not fit; if several
             remain, :meth:`adopt` decides.
 
