@@ -15,8 +15,8 @@ deadlines.
 
 Connections are not accepted by ``asyncio.Server``. If it is closed before an accepted connection
 has a transport, the socket stays open until the garbage collector finds it, and the client waits
-forever. Without a free file descriptor it logs a traceback for each connection that its backlog
-may hold, every second.
+forever. If no file descriptor is free, ``asyncio.Server`` also logs, every second, a traceback for
+each connection that its backlog may hold.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def share_of(most: int) -> int:
 
 
 class Occupant(Protocol):
-    """A connection, with the part of it that the policy uses."""
+    """The part of a connection that the policy uses."""
 
     @property
     def keeps_place(self) -> bool:

@@ -1,9 +1,9 @@
-"""Checks of the values that users, and other people's programs, give.
+"""Check the values that users and other people's programs pass in.
 
 Each function returns the plain value, and only that value is used: an ``int`` or ``str`` of a
 subclass may compare, hash and print as it likes. A value that cannot work is a
 :exc:`~smartcam.ConfigurationError` that names the argument, the expected value, and the given
-value. Nothing is searched, sent or waited for.
+value. The checks search, send and wait for nothing.
 
 ``owner`` names the owner of the argument, such as a camera; "" if the argument's name suffices.
 """

@@ -1,4 +1,4 @@
-"""Import packages of the extras when they are first used."""
+"""Import the packages of smartcam's extras, which are optional, when they are first used."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BROKEN_OPENCV = "5.0.0"
 
 
 class Package(NamedTuple):
-    """A package of an extra: its name for users, the extra, and its usual purpose with a verb."""
+    """A package: its name for users, the extra that installs it, and its purpose with a verb."""
 
     called: str
     extra: str

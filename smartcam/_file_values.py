@@ -102,7 +102,7 @@ def matches_any(patterns: Sequence[str], camera: str) -> bool:
 def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits) -> bool:
     """Return True if items match a pattern whose part ``many`` matches any number of items.
 
-    ``indices`` are those of the parts in ``pattern`` that may match the next item.
+    ``indices``: indices of the parts of ``pattern`` that may match the next item.
     """
     indices = _skip_many({0}, pattern, many)
     for item in items:

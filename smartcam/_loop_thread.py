@@ -65,7 +65,7 @@ class _Mailbox:
         self._functions.append(function)
         if not self._closed:
             self._wake()
-        elif function in self._functions:  # else close() has called the function
+        elif function in self._functions:  # otherwise close() has called it
             self._functions.remove(function)
             raise ConfigurationError("the thread of the event loop has ended")
 
@@ -162,7 +162,7 @@ class _ThreadCall:
             try:
                 raise self._error
             finally:
-                self._error = None  # else this object and the traceback keep each other alive
+                self._error = None  # this object and the traceback would keep each other alive
         return self._result
 
     # ------------------------------------------------------------------ in the thread

@@ -1,4 +1,4 @@
-"""Start and stop servers: the common part of emulated cameras, sites and proxies."""
+"""The base class of servers: emulated cameras, web pages and proxies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Server(ABC):
-    """A server that is started and stopped; as an asynchronous context manager, both."""
+    """A server that can be started and stopped; ``async with`` does both."""
 
     @abstractmethod
     async def start(self) -> None:

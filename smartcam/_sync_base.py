@@ -177,7 +177,7 @@ class SyncCameraBase(Generic[ValueT]):
     def _subscribed(
         self, subscribe: Callable[P, Any], *args: P.args, **kwargs: P.kwargs
     ) -> SyncSubscription[Any]:
-        # in the loop's thread, which also closes it if Ctrl-C keeps the caller from getting it
+        # made in the loop's thread; if Ctrl-C keeps the caller from getting it, __del__ closes it
         return self._do(lambda: SyncSubscription(subscribe(*args, **kwargs), self._thread, self))
 
     @contextlib.contextmanager
@@ -243,8 +243,8 @@ def _start_closing(work: Coroutine[Any, Any, None]) -> None:
 class SyncSubscription(Generic[ItemT]):
     """A bounded stream of items: ``for item in subscription``, and ``with`` to close it.
 
-    As with :class:`smartcam.streams.Subscription`, it subscribes when it is made, and its account
-    always balances. If several threads iterate, each item goes to one of them.
+    Like :class:`smartcam.streams.Subscription`, it subscribes when it is made, and its counts
+    always agree. If several threads iterate, each item goes to one of them.
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class SyncSubscription(Generic[ItemT]):
         return self._subscription.ended
 
     def statistics(self) -> SubscriberStatistics:
-        """Return the account as it is now."""
+        """Return the numbers of offered, taken, dropped and queued items so far."""
         return self._thread.run(self._subscription.statistics)
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""The six services for a camera that the thesis defines: their requests, and what each does.
+"""The six camera services of the thesis with which smartcam began: their requests and actions.
 
-The thesis is the one with which smartcam began; its names of services and fields are kept. Programs
+The names of services and fields are those of the thesis, which existing programs use. Programs
 call the services in JSON on a fleet's bus, at a node of ROS 2, or at a node of ROS 1. Each of these
 converts its messages to requests and the answers to its messages, and gives the services the camera
 as a :class:`ThesisCamera`. A field that is 0 or an empty text counts as missing, since a field of a
@@ -174,8 +174,8 @@ class ThesisCall(NamedTuple):
 
     Attributes:
         camera: the camera.
-        request: the request, of the service's own class.
-        timeout: seconds.
+        request: the request, an object of the service's request class.
+        timeout: longest duration of the call, seconds.
     """
 
     camera: ThesisCamera

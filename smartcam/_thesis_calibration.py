@@ -1,4 +1,4 @@
-"""The five calibration services that the thesis defines: their requests, and what each does.
+"""The five calibration services of the thesis: their requests and actions.
 
 Programs call them as they call the six services of :mod:`smartcam._thesis`, which says what the
 thesis is: in JSON on a fleet's bus, in ROS 2 or in ROS 1. Each camera has one
@@ -143,8 +143,8 @@ class CalibrationCall(NamedTuple):
 
     Attributes:
         host: the owner of the camera.
-        request: the request, of the service's own class.
-        timeout: seconds.
+        request: the request, an object of the service's request class.
+        timeout: longest duration of the call, seconds.
     """
 
     host: CalibrationHost

@@ -1,4 +1,4 @@
-"""Handle the errors of code that a user passes in, so that our tasks go on.
+"""Handle the errors of code that a user passes in, so that smartcam's tasks go on.
 
 Each call of an interpreter, a calibration, an observer, a predicate or a generator is followed by
 ``except ENDS_PROGRAM: raise``, and then by ``except BaseException``, which reports the error.

@@ -1,7 +1,8 @@
 """Use a session of Zenoh in an event loop, although Zenoh calls back in threads of its own.
 
 The callbacks put received messages into one queue. A burst of messages wakes the event loop once.
-"Engine" means Zenoh's own code, "end" a program that has a session on the bus.
+"Engine" means Zenoh's own code, "end" a program that has a session on the bus. A "patient" callback
+runs only after all callbacks that are not patient.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ MAX_DECLARED_AT_ONCE = 32
 
 _RING = (1).to_bytes(8, sys.byteorder)
 
-_CALLBACK_FAILED = "%s ! what came from the bus was not taken"
+_CALLBACK_FAILED = "%s ! a message from the bus was not handled: its callback failed"
 
 
 @dataclass(frozen=True)
@@ -328,7 +329,7 @@ class ZenohSession:
                     try:
                         self._session = await self._open_engine_session(timeout)
                     except self._zenoh.ZError as exc:
-                        # an end that is silent is given up after a lease; then try others again
+                        # the engine gives up a silent end after a lease; then try the others again
                         if loop.time() - begun_at < 0.9 * min(timeout, LEASE_TIME):
                             raise self._connect_error(await self._failure_reason(exc)) from exc
         except TimeoutError as exc:
@@ -781,7 +782,7 @@ def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None)
 def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
     """Call the engine; log an error that only means that the session has ended meanwhile.
 
-    An object that another thread is using cannot be released now; it is when that thread drops it.
+    An object that another thread is using cannot be released now; that thread releases it later.
     """
     try:
         call(*arguments, **named)

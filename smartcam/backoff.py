@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator  # noqa: TC003 - old pydantic looks them up
+from collections.abc import Callable, Iterator  # noqa: TC003 - pydantic evaluates annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 __all__ = ["Backoff"]
 
 MAX_FACTOR = sys.float_info.max
-"""Largest factor between two delays: with it, the second delay is the longest already."""
+"""Largest factor between two delays: with it, already the second delay is ``maximum``."""
 
 
 def is_transient(error: BaseException) -> bool:
-    """Return True if another try may succeed.
+    """Return True if another try to reach the camera may succeed after this error.
 
     Faults of links are transient: nothing listens, no route to the host, a host name that does not
     resolve while the name server is away, silence, a peer that breaks the protocol. Errors in the
@@ -85,7 +85,7 @@ class Backoff:
         if self.attempts is not None:
             checked["attempts"] = check_integer(self.attempts, "attempts", 1, owner=owner)
         for name, value in checked.items():
-            object.__setattr__(self, name, value)  # plain value, since the class is frozen
+            object.__setattr__(self, name, value)  # the class is frozen
 
     def delays(
         self, *, short_lived: int = 0, chance: random.Random | None = None
@@ -93,9 +93,9 @@ class Backoff:
         """Yield the delay before each try, seconds; end after ``attempts``.
 
         Args:
-            short_lived: number of the last sessions in a row that were lost soon. The first delay
-                is as long as if so many tries had failed; otherwise a link that always breaks at
-                once would be opened again and again without a pause.
+            short_lived: number of sessions in a row, up to the last one, that were lost soon after
+                they began. The first delay is as long as after that many failed tries; otherwise a
+                link that always breaks at once would be opened again and again without a pause.
             chance: random source of the jitter; seed it to get the same delays again.
         """
         check_integer(short_lived, "short_lived", 0, owner="Backoff")

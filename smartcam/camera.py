@@ -163,11 +163,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @abc.abstractmethod
     def _deadline(self, timeout: float) -> float:
-        """Return the loop's time after ``timeout`` seconds; ConfigurationError if it cannot be."""
+        """Return the loop time in ``timeout`` seconds; ConfigurationError for a wrong timeout."""
 
     @abc.abstractmethod
     def _on_listener_added(self, subscribers: object) -> None:
-        """Note that ``subscribers`` got a subscriber, or a caller waits for its next item."""
+        """Note that there is a new subscriber, or a new caller that waits for the next item."""
 
     def _release_unreferenced(self) -> bool:
         """Release a camera to which nothing refers; return True if it was open.

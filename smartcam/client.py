@@ -1,4 +1,4 @@
-"""A camera at the wire.
+"""The client of one camera, which talks to the camera itself.
 
 ``open()`` starts the :class:`~smartcam._client.supervisor.Supervisor`, which makes sessions and
 passes every chunk of their links to the :class:`~smartcam._client.dispatch.Dispatch`. The commands
@@ -50,10 +50,10 @@ __all__ = ["SmartCamera"]
 
 
 class SmartCamera(Camera[ValueT]):
-    """A camera at the wire: this client has its only session.
+    """A camera at the wire: this client talks to the camera itself, and has the only session.
 
-    Once another client has taken the camera, this client has ended: everything raises
-    :exc:`~smartcam.ConnectionTakenError`. Make a new client then.
+    Once another client has taken the camera, this client has ended: every method that needs a
+    session raises :exc:`~smartcam.ConnectionTakenError`. Make a new client then.
     """
 
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
@@ -286,7 +286,7 @@ class SmartCamera(Camera[ValueT]):
         await self._send(m.Reboot())
         if link.machine.transport is Transport.TCP:
             await link.wait_closed(self.settings.close_timeout)
-        # over UDP nothing shows that the session is over, and over TCP perhaps nothing in time
+        # over UDP nothing shows that the session has ended; over TCP it may be shown too late
         link.abort(ConnectionResetError("the camera restarts"))
         self._dispatch.fail(link.lost_error())
 
@@ -299,7 +299,7 @@ class SmartCamera(Camera[ValueT]):
         if raw.answered if answered is None else answered:
             return dialect.body(await self._requests.exchange(raw.message, raw.answer, deadline))
         if raw.answered and raw.known:
-            # the camera still answers, and its answer must not pass for the next request's
+            # the camera still answers, and its answer must not be taken for the next request's
             await self._requests.post(raw.message, raw.answer, deadline)
         else:
             await self._requests.send_unanswered(raw.message, deadline, answered=False)

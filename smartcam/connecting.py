@@ -88,7 +88,7 @@ def connect(
 
     Args:
         url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
-            pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
+            sets the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
             ``fleet://HOST[:PORT]/CAMERA`` is a camera that an agent shares
             (:mod:`smartcam.fleet`). ``software:FILE#CAMERA`` is a plain camera whose pictures
             are inspected in this process, by a cell file (:mod:`smartcam.inspection`).
@@ -102,15 +102,15 @@ def connect(
             ``restore``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
 
     ``interpret_as`` gives the type of the camera's values: ``"localizations"``, ``"raw"``, a class,
-    a function. Without it the type is ``Any``, since a URL does not say it: bytes at the wire; for
-    a camera of a fleet the values that its agent makes.
+    a function. Without it the type is ``Any``, since a URL does not show it: a camera at
+    the wire gives bytes, a camera of a fleet the values that its agent makes.
 
     With ``calibration`` the value of every result is a list of localizations in the robot's frame,
     as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
     an observer. The calibration gets the values that ``interpret_as`` gives, turned to y up with
     ``y_down``. The frame in their headers is the camera's ``name``, which has to be the
-    ``camera_frame`` of a calibration that has one. No value passes without the calibration: a value
-    that is no list of localizations, or that the calibration refuses, is an
+    ``camera_frame`` of a calibration that has one. No value is returned uncalibrated: a value that
+    is no list of localizations, or that the calibration refuses, gives an
     :exc:`~smartcam.InterpretationError` with the cause chained. An interpreter that never gives
     localizations (raw, record, table, strings50) is a ConfigurationError at once; if a single
     trigger names one, its value stays as it is. A mapping gives each application id its own

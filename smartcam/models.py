@@ -1,4 +1,4 @@
-"""Public values: the camera's data, and the values made of them.
+"""The values that users get: a camera's results, statuses, events and counters.
 
 They are NamedTuples, dataclasses with slots and an ``IntFlag``: cheap to make, and immutable if
 many readers share them. :func:`jsonable` makes JSON of them, with their field names.
@@ -458,9 +458,9 @@ class NoticeReceived(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubscriberStatistics:
-    """Account of one subscriber: ``offered == taken + dropped + queued``.
+    """The item counts of one subscriber: ``offered == taken + dropped + queued``.
 
-    What a camera sent while it was subscribed is ``offered + missed``.
+    While it was subscribed, the camera sent ``offered + missed`` items.
 
     Attributes:
         name: kind of the subscribed items: ``results``, ``statuses`` or ``events``.
@@ -556,7 +556,7 @@ class Statistics:
         last_error: text of the last error of a link, or None.
         round_trip: seconds from a request to its answer, without switches, which take long.
         processing: seconds from a trigger to its result.
-        subscribers: accounts of the living subscribers.
+        subscribers: item counts of each subscriber that has not ended.
     """
 
     received: int = 0

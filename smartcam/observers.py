@@ -1,4 +1,4 @@
-"""The interface for monitoring tools: one class to derive from, without dependencies."""
+"""Observers: a class to derive from, whose methods a client calls, for monitoring tools."""
 
 from __future__ import annotations
 

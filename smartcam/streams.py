@@ -1,4 +1,4 @@
-"""Bounded streams, by which any number of independent subscribers get a camera's items."""
+"""Bounded streams: each of any number of subscribers gets a camera's items in its own queue."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ class Queue(Generic[T]):
         self._last_kept_at = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # number of errors among the items
-        # Only new items change the count of bytes, so that taking costs nothing: the bytes of taken
-        # items are subtracted then. A parcel stands for items that came together: the number of
-        # its last item, the number of items, their bytes.
+        # The bytes of taken items are subtracted when a new item comes, so that taking costs
+        # nothing. A parcel stands for items that came together: the number of its last item, the
+        # number of items, their bytes.
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
         self._bytes = 0  # bytes of all parcels, part of which may belong to items that are gone
         self._missed = 0
@@ -114,7 +114,7 @@ class Queue(Generic[T]):
             self._source = source
 
     def statistics(self) -> SubscriberStatistics:
-        """Return the account as it is now."""
+        """Return the numbers of offered, taken, dropped and queued items so far."""
         self._recount_bytes()
         return SubscriberStatistics(
             name=self._name,
@@ -146,7 +146,7 @@ class Queue(Generic[T]):
         while not self._items:
             if self._ended:
                 if self._end_error is not None:
-                    raise self._end_error.with_traceback(None)  # else its traceback grows each time
+                    raise self._end_error.with_traceback(None)  # each raise would lengthen it
                 raise StopAsyncIteration
             self._ready.clear()
             await self._ready.wait()
@@ -285,7 +285,7 @@ class Subscription(Queue[T]):
     """A bounded stream of items: ``async for item in subscription``.
 
     It subscribes when it is made and ends when it is closed, garbage collected, or the client
-    closes. Its account always balances: ``offered == taken + dropped + queued``.
+    closes. Its counts always agree: ``offered == taken + dropped + queued``.
 
     Cancellation: safe, nothing is lost; an item is taken as the last step.
     """

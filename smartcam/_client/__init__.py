@@ -1,1 +1,1 @@
-"""The client's inside: from a link's bytes to the waiting tasks. Nothing is public."""
+"""Internals of the client, by which a link's bytes reach the tasks that wait for them."""

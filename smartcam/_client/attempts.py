@@ -1,4 +1,4 @@
-"""Attempts at a session: the step that each reached, the probable cause, and a cure."""
+"""Record attempts at a session; find the probable cause of their failure, and a cure."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class Attempt:
     """One attempt, and the step that it reached.
 
     Attributes:
-        dialect: name of the dialect; until the camera's is known, the names of all dialects that
-            begin a session alike.
+        dialect: name of the dialect; until the camera's dialect is known, the names of all
+            dialects that the attempt tries.
         transport: ``tcp`` or ``udp``.
         step: name of the last step that was begun.
-        outcome: text on the end of the attempt.
+        outcome: text that says how the attempt ended.
         received: number of bytes received.
         hung_up: True if the other side ended the link without a byte.
         error: reason why there is no session, None if there is one.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from smartcam._client.listeners import Listeners
     from smartcam.protocols.messages import StatusReport
 
-# as plain integers: operations of an IntFlag cost more than the rest of handling a status
+# as plain integers: an IntFlag's operations cost more than all else that is done with a status
 _BUSY = int(Status.BUSY)
 _RUNNING_OR_BUSY = int(Status.RUNNING | Status.BUSY)
 
@@ -111,7 +111,7 @@ class CameraState:
         return same and self.active == application
 
     def note_usual_statuses(self, report: StatusReport) -> None:
-        """Handle the two statuses around a result; the second equals the present status."""
+        """Handle the two statuses around a result; the second one equals the last known status."""
         self.statuses_received += 2
         self.status = report.status
 
@@ -156,7 +156,7 @@ class CameraState:
             )
 
     def note_switch(self, application: int) -> None:
-        """Note that the camera has done a switch by this client."""
+        """Note that the camera has loaded an application as this client asked."""
         self.want_application(application)
         self._loaded_by_us = True
 

@@ -1,8 +1,9 @@
 """Run one command at a time, and go back after a temporary switch.
 
-Going back to the former application is a job, a task of the session's task group: it is finished
-even if the caller is cancelled, it has a time limit, and every later command waits for it. If a
-lost link prevented it, it is the first step of the next session. So is restoring the wanted state.
+A *job*, which is a task of the session's task group, goes back to the former application. A job is
+finished even if the caller is cancelled; it has a time limit, and every later command waits for it.
+If a lost link prevented the job, the next session begins with it. After a reconnect, another job
+restores the wanted application and run state.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ class CommandLock:
     # ------------------------------------------------------------------ for commands
 
     def hold(self, timeout: float) -> Hold:
-        """Hold the turn with ``async with``; it gives the deadline, which includes the wait.
+        """Return a context manager that holds the turn; it gives the deadline, waiting included.
 
         Raises:
             ResponseTimeoutError: other commands had the turn for ``timeout`` seconds.
@@ -197,8 +198,8 @@ class CommandLock:
     def go_back(self, before: PreviousState) -> asyncio.Task[None] | None:
         """Start a job that goes back when the turn is free, and return it.
 
-        Without a session return None; then the next session goes back. If several calls are made
-        before that, the last one counts, which is of the outermost block.
+        Without a session return None; then the next session goes back. Of several calls before the
+        next session, the last one counts: the outermost of nested blocks calls last.
         """
         if self._task_group is None or self._waits.end_reason is not None:
             self._restore_later(before)
@@ -324,7 +325,7 @@ class CommandLock:
             await asyncio.sleep(0)
 
     def _is_loss(self, error: SmartCamError) -> bool:
-        """Return True if the link is lost, which a missing answer causes, too."""
+        """Return True if a command failed because the link is lost, or was given up."""
         link = self._connection.link
         return isinstance(error, LinkError) or (link is not None and link.lost)
 

@@ -1,4 +1,4 @@
-"""The link of the present session, and the features of its protocol."""
+"""Keep the link of the present session, and the features of the session's protocol."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ Inspections that others trigger meanwhile count up from this number, away from t
 """
 
 FEWEST_NUMBERS = 64
-"""Least number of triggers until numbers repeat; for that, a narrow field has a smaller step."""
+"""Least number of triggers until numbers repeat; in a field of few bits the step is smaller."""
 
 RANGE_OF_FIRST_NUMBER = (1 << 31) - 1
 """Number of values from which a new client draws its first number at random."""
@@ -51,7 +51,7 @@ MAX_OWED = 1024
 
 
 class TriggerEvidence:
-    """Evidence that the camera accepted a trigger; this base class needs none.
+    """Evidence that the camera accepted a trigger; this base class takes it for granted.
 
     It is for UDP, where statuses and their order may be lost, and for cameras that handle commands
     one after the other, so that an answer needs no proof (In-Sight).
@@ -131,7 +131,7 @@ class EvidenceByStatus(TriggerEvidence):
 
     __slots__ = ("_answer_count",)
 
-    def __init__(self) -> None:  # without its base's, to be fast: each trigger makes one
+    def __init__(self) -> None:  # does not call the base's, to be fast: each trigger makes one
         self.begin_count = 0
         self.reached = self.proven = self.doubtful = False
         self._answer_count = 0  # answers to the Queries before the trigger and after it
@@ -154,7 +154,7 @@ class EvidenceByStatus(TriggerEvidence):
         return self.reached
 
     def note_usual_round(self) -> bool:
-        """Note both answers and one inspection between them, if nothing was noted yet."""
+        """Note both Queries' answers and one inspection between them, if none was noted yet."""
         if self._answer_count or self.begin_count:
             return False
         self._answer_count, self.begin_count, self.reached, self.proven = 2, 1, True, True
@@ -199,7 +199,7 @@ class SentTrigger:
 
     Attributes:
         wanted: number of results expected.
-        number: sequence number set for it, None if its layout has none.
+        number: sequence number set for the trigger, None if its layout has none.
         evidence: evidence from the camera's messages.
         received: number of its received results.
         early_count: containers received before the camera showed that it had accepted the trigger.
@@ -389,8 +389,8 @@ class Correlation:
     def note_usual_round(self, pending: SentTrigger) -> bool:
         """Note two answers and one inspection between them; return False if this is not possible.
 
-        It is not if the trigger already has a result, an earlier result is owed, or the evidence is
-        of another kind. After True, the container of the inspection is this trigger's.
+        It is not possible if the trigger already has a result, if an earlier result is owed, or if
+        the evidence is of another kind. After True, the inspection's container is this trigger's.
         """
         evidence = pending.evidence
         if not self._gets_every_status or self.owed or self._last is not evidence:

@@ -1,4 +1,4 @@
-"""The counters of a client, over all its sessions."""
+"""Count a client's containers, events and times, over all its sessions."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ class ClientCounters:
         extra_results: containers for a trigger that had its results already.
         inspections_by_others: inspections that something else has triggered.
         overtriggers: times the Overtriggered bit rose.
-        notices: remarks of the camera's own.
+        notices: notices that the camera sent.
         sessions: sessions made.
         last_error: text of the last error of a link.
-        round_trip: request to answer, seconds.
-        processing: trigger to result, seconds.
+        round_trip: times from a request to its answer, seconds.
+        processing: times from a trigger to its last result, seconds.
     """
 
     def __init__(self) -> None:
@@ -86,7 +86,7 @@ class ClientCounters:
         self._open_wire: Counters | None = None
 
     def count(self, fate: str, containers: int = 1) -> None:
-        """Count containers with their fate, in one step: the sum always holds."""
+        """Count containers under their fate and in ``received``."""
         self.fates[fate] += containers
         self.received += containers
 
@@ -107,7 +107,7 @@ class ClientCounters:
         self.overtriggers += 1
 
     def note_notice(self) -> None:
-        """Count a remark of the camera's own."""
+        """Count a notice that the camera sent."""
         self.notices += 1
 
     def note_loss(self, error: Exception) -> None:

@@ -1,8 +1,8 @@
 """A timer for deadlines that are set often and hardly ever reached.
 
-To make a timer of the event loop costs more than all other steps of a wait, and most timers are
-cancelled at once. This timer is kept when a later deadline is set; when it fires before that, it is
-set again.
+A new timer of the event loop costs more than all other steps of a wait, and most timers are
+cancelled soon. This timer is kept when a later deadline is set; if it fires before that deadline,
+it is started again.
 """
 
 from __future__ import annotations

@@ -161,9 +161,9 @@ class Dispatch:
     def _handle_usual_round(self, events: list[Event], now: float, at: datetime) -> bool:
         """Handle the answers to the running trigger in one step, if they are the usual ones.
 
-        Otherwise do nothing and return False. Nobody but the trigger's caller and the streams of
-        results may use the answers. ``python -m tests.client.proofs.straight`` shows that the
-        effect is the same as of one event after the other.
+        Otherwise, or if anybody but the trigger's caller and streams of results needs the events,
+        do nothing and return False. ``python -m tests.client.proofs.straight`` shows that the
+        effect is the same as if the events were handled one by one.
         """
         first_answer, begin_status, container, end_status, last_answer = events
         usual = self._usual
@@ -191,7 +191,7 @@ class Dispatch:
         if owner is None:
             return False
         self._waits.expect_fences(0)
-        if listeners.wants_statuses:  # an agent
+        if listeners.wants_statuses:  # true in a fleet's agent
             state.note_status(usual.begin_status, ())
             listeners.offer_status(usual.begin_status.status, now)
             self._results.deliver(container, owner, "triggered", None, now, at)
@@ -225,7 +225,7 @@ class Dispatch:
         self._waits.finish(error)
         self._results.finish()
         self._requests.finish()
-        self._handlers = {}  # else its methods would keep this object until a garbage collection
+        self._handlers = {}  # its methods would keep this object until a garbage collection
         self._listeners.end(None if isinstance(error, ConnectionClosedError) else error)
 
     # ------------------------------------------------------------------ kinds of events
@@ -306,7 +306,7 @@ def _usual_round(events: list[Event]) -> _UsualRound | None:
 
 
 def gather_containers(events: list[Event], endian: int) -> list[Event]:
-    """Return the containers among events as one burst, and after it the statuses.
+    """Return all containers among events as one burst, followed by the statuses.
 
     A camera that runs free sends statuses around each container, so that containers that were
     received together could not be interpreted together. The events are returned unchanged if there

@@ -69,7 +69,7 @@ class Doorbell:
         """Make the task continue as by :meth:`ring`, then the callers whose outcomes it has set.
 
         Exceptions that end the program are raised in the loop, since a transport would handle them
-        as errors of its own.
+        as errors of the transport.
         """
         wake, context, loop = self._wake, self._context, self._loop
         if wake is None or context is None or asyncio.current_task(loop) is not None:
@@ -304,7 +304,7 @@ class PlainDoorbell:
         return self._loop.create_future()
 
     def set_outcome(self, outcome: Outcome, value: object) -> None:
-        """Set the result of an outcome; its task continues through the loop."""
+        """Set the result of an outcome; the waiting task continues in the loop's next turn."""
         outcome.set_result(value)
 
     def __await__(self) -> Generator[Any, None, None]:

@@ -1,12 +1,13 @@
-"""Make a session: fresh links, one after the other, until a camera answers.
+"""Make a session: try new links, one after the other, until the camera answers.
 
 Each attempt sends Disconnect (harmless without a session; old sessions confuse the camera, thesis
 3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
 Query. Anything unexpected, silence included, ends the attempt, and the next one uses a new link.
 If a camera closes the connection without sending a byte, the next attempt is made without the
 Disconnect.
-If no dialect is pinned, the protocol's dialects are tried in turn. Dialects that begin a session
-alike share an attempt; the answer to Connect and the messages after it show which one it is.
+If the address names no dialect, the protocol's dialects are tried in turn. Dialects that begin a
+session alike, with the same messages, share an attempt; the answer to Connect and the messages
+after it show which one the camera speaks.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ answers in milliseconds, or not at all if it speaks another dialect. Later round
 time, for slow links."""
 
 MIN_STATUS_ANSWERS = 3
-"""Number of requests for the status that a camera must answer until its dialect has that request: a
-status may also come by itself."""
+"""Number of requests for the status that a camera must answer to show that its dialect has this
+request. One answer is not enough, since a status may also come by itself."""
 
 BUSY_PAUSE = 0.05
 """Seconds until a camera that was too busy to name its application is asked again."""
@@ -75,7 +76,7 @@ class Session(NamedTuple):
 
     Attributes:
         link: the link.
-        address: address of the attempt, with the dialect pinned.
+        address: address of the attempt, in which the dialect is named.
         dialect: dialect of the session.
         version: protocol version from the Connect answer.
         early: chunks received while the session was made, in order: the first status, and any
@@ -158,7 +159,7 @@ class _Collector:
             await self.receive_chunk()
 
     async def find_dialect(self) -> None:
-        """Find out which of the machine's dialects the camera speaks: does it answer Get status?
+        """Find out which of the machine's dialects the camera speaks, by asking for its status.
 
         A status may also come by itself, so it must come after each of several requests.
         """
@@ -213,7 +214,7 @@ async def attempt(
 
     Args:
         address: address of the camera.
-        dialects: one dialect, or several that begin a session alike.
+        dialects: one dialect, or several whose sessions begin with the same messages.
         transport: TCP or UDP.
         progress: record of the attempt, in which each step is noted.
         name: name of the camera, for logs.
@@ -314,7 +315,7 @@ def dialect_remarks(address: Address) -> set[str]:
 
 
 def dialect_names(dialects: Sequence[Dialect]) -> str:
-    """Return the names of dialects that begin a session alike."""
+    """Return the names of the dialects of one attempt."""
     if len(dialects) == 1:
         return dialects[0].name
     return " or ".join(dict.fromkeys(dialect.name for dialect in dialects))
@@ -334,7 +335,8 @@ async def establish(
 
     Raises:
         ConfigurationError: the camera cannot give results of this layout.
-        ConnectFailedError: the reason, and the cure; ``attempts`` has the outcome of each.
+        ConnectFailedError: no attempt made a session; the text has a cause and a cure, and
+            ``attempts`` the outcome of each attempt.
 
     Cancellation: the link that was being made is dropped.
     """
@@ -379,7 +381,7 @@ async def establish(
                 progress.end(exc, loop.time() - begun_at)
                 cause = exc
             if progress.hung_up:
-                # perhaps because of the Disconnect, so attempts alternate
+                # perhaps because of the Disconnect, so only every other attempt sends it
                 disconnect_first = not disconnect_first
             logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
             if progress.step == OPENING or isinstance(cause, CommandRejectedError):

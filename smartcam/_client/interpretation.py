@@ -1,8 +1,8 @@
 """Make a :class:`~smartcam.Result` from a result container: choose the interpreter, and run it.
 
 ``interpret_as`` is one specification for all containers, or a mapping from application ids to
-specifications. ``calibration``, one for all applications or one for each, is applied after the
-interpreter. Then each returned value is poses in the robot's frame.
+specifications. A ``calibration``, one for all applications or one for each, is applied to the
+interpreter's value, which then consists of poses in the robot's frame.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class Interpretation:
         return {key: text for key, text in texts.items() if text is not None} or None
 
     def number(self, container: ResultContainer, endian: int) -> int | None:
-        """Return a container's sequence number, None if it has none or does not fit."""
+        """Return a container's sequence number; None if the layout has none or does not fit."""
         reader = self._reader_for(container.application)
         if reader is None or reader.interpreter.layout is None:
             return None
@@ -326,7 +326,7 @@ class _Calibrations:
             )
 
     def apply(self, value: object, application: int) -> Any:
-        """Return localizations in the robot's frame; the value itself if the calibration is None.
+        """Return localizations in the robot's frame; without a calibration, the value unchanged.
 
         Raises:
             InterpretationError: the value is no list of localizations, or the calibration failed,

@@ -1,4 +1,4 @@
-"""One TCP or UDP link to a camera, used once.
+"""Exchange messages with a camera over one TCP or UDP link, which is used once.
 
 The transport passes received bytes to the machine of ``protocols/``. Each call of the transport is
 a *delivery*; its events wait as a chunk in a bounded queue. The receive task takes one chunk in a
@@ -88,7 +88,7 @@ class LinksOfLoop:
 
     @staticmethod
     def of(loop: asyncio.AbstractEventLoop) -> LinksOfLoop:
-        """Return the links of a loop: always the same object."""
+        """Return the object that counts a loop's links; there is one object for each loop."""
         known = _links_of_loops.get(loop)
         if known is None:
             known = _links_of_loops[loop] = LinksOfLoop()
@@ -162,7 +162,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             "_closed",
             "_close_waiters",
         ),
-        *("_closing", "_datagrams", "_doorbell", "_frames", "_buffer_full", "_liveness_timeout"),
+        *("_closing", "_is_udp", "_doorbell", "_frames", "_buffer_full", "_liveness_timeout"),
         *(
             "_loss_reason",
             "_max_frames",
@@ -194,12 +194,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._loop_links = LinksOfLoop.of(self.loop)  # this link, and others on its loop
         self.last_byte_at: float = self.loop.time()
         self._transport: Any = None
-        self._datagrams = machine.transport is Transport.UDP
+        self._is_udp = machine.transport is Transport.UDP
         # socket for reading waiting datagrams directly
         self._direct_socket: socket.socket | None = None
         self._machine_replies = machine.replies
         self._get_buffer = machine.room
-        # if the machine can send several at once
+        # a method of the machine, if it can send several messages at once
         send_singly: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
         self._send_all = getattr(machine, "send_all", send_singly)
         self.trace: FrameTrace | None = None
@@ -245,7 +245,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """Write several messages: one write on TCP, a datagram each on UDP.
 
         Raises:
-            LocalProtocolError: the state forbids a message; those before it were written.
+            LocalProtocolError: the state forbids a message; the messages before it were written.
             ConnectionLostError: the link is gone.
         """
         if self._loss_reason is not None:
@@ -306,7 +306,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             if self._transport is None or self._closed:
                 return
             self._send_disconnect()
-            if self._datagrams:
+            if self._is_udp:
                 self._transport.close()
             elif not self._transport.is_closing():
                 self._resume()
@@ -368,11 +368,11 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """asyncio: the link is open."""
         self._transport = transport
         self._loop_links.open += 1
-        if self._datagrams:
+        if self._is_udp:
             read_no_more_than_needed(transport)
             self._direct_socket = second_socket(transport)
         sock = transport.get_extra_info("socket")
-        if sock is not None and not self._datagrams:
+        if sock is not None and not self._is_udp:
             # the camera sets it, too, and its manual recommends it (SC manual p. 40: published)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._liveness_timeout is not None:
@@ -450,7 +450,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self.trace.pass_on()
         if not frames:
             return
-        if self._datagrams:
+        if self._is_udp:
             for frame in frames:
                 self._transport.sendto(frame)
         else:
@@ -515,7 +515,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._max_frames = max(MIN_FRAMES_PER_CHUNK, min(MAX_CHUNK_FRAMES, frames))
 
     def _pause(self) -> None:
-        if not (self._paused or self._datagrams):
+        if not (self._paused or self._is_udp):
             self._paused = True
             self._transport.pause_reading()
 
@@ -636,13 +636,13 @@ async def open_link(
 
     Args:
         protocol: protocol that makes the machine.
-        dialects: one dialect, or several that begin a session alike.
+        dialects: one dialect, or several whose sessions begin with the same messages.
         transport: TCP or UDP.
         host: the camera's name or address.
         port: port of the camera.
         name: name of the camera in logs.
         max_length: bytes of the largest payload that is accepted.
-        trace: function that is called with the frames of each delivery, and with those sent.
+        trace: function that is called with the frames of each delivery, and with sent frames.
         liveness_timeout: see :class:`Link`.
 
     Raises:

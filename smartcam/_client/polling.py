@@ -1,4 +1,4 @@
-"""Poll the status while it is needed, in dialects that do not send it by themselves (``bid``).
+"""Request the status repeatedly while it is needed, if the camera does not send it (``bid``).
 
 One timer runs while a trigger or a wait for a status is pending, or while statuses or events are
 subscribed to. It sends a request only if no request for the status is open; an
@@ -47,7 +47,7 @@ class Polling:
 
     def __post_init__(self) -> None:
         self._running = False
-        self._triggered = False  # whether a trigger is pending
+        self._trigger_is_pending = False
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0  # time at which the timer fires; a timer of uvloop does not have it
         self._open_since = 0.0
@@ -81,14 +81,14 @@ class Polling:
         Args:
             request_count: number of requests for the status that were sent with the trigger.
         """
-        self._triggered = True
+        self._trigger_is_pending = True
         if request_count:
             self._state.note_status_request(self._connection.loop.time(), request_count)
         self.poll_soon()
 
     def end_trigger(self) -> None:
         """Note that no trigger is pending any more."""
-        self._triggered = False
+        self._trigger_is_pending = False
 
     def _stop(self) -> None:
         if self._timer is not None:
@@ -98,7 +98,7 @@ class Polling:
     def _tick(self) -> None:
         self._timer = None
         link, status_count = self._connection.link, self._state.statuses_received
-        soon = self._triggered or self._waits.status_waiters
+        soon = self._trigger_is_pending or self._waits.status_waiters
         if not (soon or self._listeners.needs_polling) or link is None or link.lost:
             return
         loop = self._connection.loop

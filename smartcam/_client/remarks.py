@@ -16,9 +16,9 @@ PERIOD = 60.0
 
 @dataclass(slots=True, eq=False)
 class _Logged:
-    """Count of the lines of one kind in the period that began at ``begun``."""
+    """Count of the lines of one kind in the period that began at ``begun_at``."""
 
-    begun: float
+    begun_at: float
     count: int = 0
 
 
@@ -36,7 +36,7 @@ class Remarks:
         self._kinds: dict[str, _Logged] = {}
 
     def log(self, kind: str, level: int, text: str, *values: object, now: float) -> None:
-        """Log a line unless there were enough of its kind; later log the number left out.
+        """Log a line, unless many of its kind were logged; log later how many were left out.
 
         Args:
             kind: name of the kind, for people.
@@ -46,15 +46,15 @@ class Remarks:
             now: seconds of any clock that does not jump.
         """
         logged = self._kinds.setdefault(kind, _Logged(now))
-        if now - logged.begun >= PERIOD:
+        if now - logged.begun_at >= PERIOD:
             self._log_left_out(kind, level, logged)
-            logged.begun, logged.count = now, 0
+            logged.begun_at, logged.count = now, 0
         logged.count += 1
         if logged.count <= MAX_REMARKS:
             logger.log(level, "%s %s", self._name, text % values)
         elif logged.count == MAX_REMARKS + 1:
-            more = "%s ! more of the kind %r in %g s than are logged: %d; the others are counted"
-            logger.log(level, more, self._name, kind, PERIOD, MAX_REMARKS)
+            more = "%s ! more than %d lines of the kind %r in %g s: the others are only counted"
+            logger.log(level, more, self._name, MAX_REMARKS, kind, PERIOD)
 
     def end(self) -> None:
         """Log the number of left-out lines at the session's end."""

@@ -3,8 +3,8 @@
 No message names its request. So an answer is matched by its type, and at most one request of a
 type is open. A cancelled request leaves a pending answer, which the next request of that type
 awaits first. If an answer never comes, the link is given up, since later answers would be matched
-wrongly; but not before ``request_timeout`` is over (``switch_timeout`` for a switch), since a
-caller may have little time, and others use the link, too.
+wrongly. This happens only after ``request_timeout`` (``switch_timeout`` for a switch), even if the
+caller's deadline is earlier, since other callers use the link, too.
 
 Every ``deadline`` is loop time. The command lock decides whose command runs, one at a time.
 """

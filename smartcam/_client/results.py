@@ -103,7 +103,7 @@ class Results:
         self.correlation: Correlation = Correlation(random.random())  # noqa: S311
         self.input_in_doubt: bool = False
         self._pending: PendingTrigger | None = None
-        # interpretation for the numbers in results, after the first trigger with a number
+        # interpretation that reads the numbers in results; None until a trigger had a number
         self._numbering: Interpretation | None = None
         self._warned_extra = self._warned_others = False
         self._lossy = False  # whether a message may arrive twice or be lost (UDP)
@@ -207,7 +207,7 @@ class Results:
                 pending,
                 OvertriggeredError(
                     f"{self._name}: it cannot be told whose the result is: something else has "
-                    "triggered the camera at the same time, or an answer of it is missing"
+                    "triggered the camera at the same time, or an answer of the camera is missing"
                 ),
             )
         else:
@@ -243,7 +243,7 @@ class Results:
         elif risen & Status.OVERTRIGGERED:
             error = OvertriggeredError(
                 f"{self._name}: the camera dropped a trigger while ours was under way; "
-                "it cannot be told whose"
+                "it cannot be told whose trigger"
             )
         elif risen & Status.INPUT_CONTAINER and pending.has_input:
             error = InputContainerError(
@@ -463,7 +463,7 @@ class Results:
             logger.warning("%s ! something else triggers the camera, too", self._name)
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
-        """End the running trigger if it has all results, and messages prove that they are its."""
+        """End a trigger that has all its results, if messages prove that they belong to it."""
         if owner.received < owner.wanted or not owner.evidence.proven or owner.outcome.done():
             return
         if owner.has_input:

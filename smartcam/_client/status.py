@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam._client.waits import Waits
 
 BUSY_PAUSE = 0.02
-"""Seconds until a request is repeated that the camera was too busy for."""
+"""Seconds until a request that the camera was too busy to handle is repeated."""
 
 
 def is_ready(status: Status) -> bool:

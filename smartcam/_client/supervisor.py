@@ -1,4 +1,4 @@
-"""The life of a client: sessions, one after the other, and the steps between them.
+"""Make a client's sessions, one after the other, and do the steps between them.
 
 Each client has one task for this, the only task outside of a task group. It makes a session, lets
 the receive task read the link to its end, ends all waits, and makes the next session after the
@@ -113,7 +113,7 @@ class Supervisor:
 
     @property
     def address(self) -> Address:
-        """The camera's address, with the dialect pinned once it was found out."""
+        """The camera's address, which names the dialect once it was found out."""
         return self._settings.address if self.session is None else self.session.address
 
     @property

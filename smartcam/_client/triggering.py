@@ -1,4 +1,4 @@
-"""Triggers: from the camera's readiness to the results, or to the reason why there are none.
+"""Trigger the camera: wait until it is ready, send the trigger, and return results or an error.
 
 First the results that earlier triggers still owe are awaited or made impossible, and a Query is
 sent before each trigger, so that no older result counts as the trigger's
@@ -74,8 +74,8 @@ OVERTRIGGERED_GRACE = 1.0
 """Seconds for which a trigger waits until the Overtriggered of an earlier one falls. While the bit
 is set, it cannot show that a new trigger was dropped, so no trigger is sent."""
 
-MAX_SHARE_WITHOUT_WAIT = 0.5
-"""A trigger with less than this share of its timeout left counts as delayed."""
+DELAYED_BELOW_SHARE = 0.5
+"""A trigger that is sent with less than this share of its timeout left counts as delayed."""
 
 MIN_TIMEOUT_SHARE = 0.01
 """Least share of its timeout that a delayed trigger must have left."""
@@ -226,7 +226,7 @@ class Triggers:
         numbering = interpretation.numbering(state.active) if features.numbered else None
         link = connection.require_link()
         now = link.loop.time()
-        if deadline - now < MAX_SHARE_WITHOUT_WAIT * timeout:
+        if deadline - now < DELAYED_BELOW_SHARE * timeout:
             self._check_time_left(deadline - now, timeout)
         number = None if numbering is None else correlation.take_number(numbering.highest)
         pending = PendingTrigger(
@@ -255,7 +255,7 @@ class Triggers:
                         await link.drain()
             results = await pending.outcome  # TimeoutError: the timer of Results, at the deadline
         except TimeoutError as exc:
-            raise self._timed_out(pending, link, deadline) from exc
+            raise self._give_up_at_deadline(pending, link, deadline) from exc
         except asyncio.CancelledError:
             if not pending.outcome.done() or pending.outcome.cancelled():
                 correlation.give_up(pending)
@@ -330,7 +330,7 @@ class Triggers:
             correlation.note_query_answered()
         if correlation.owed or self._commands.is_halted():
             await self._settle_owed(deadline, wait=request.wait, numbers_suffice=numbers_suffice)
-        waited = False  # waits in line with Queries, so that neither kind delays the other
+        waited = False  # at most once in line with Queries, so that these do not delay it for long
         while True:
             status = state.bits
             if status & _WAITS_BITS != _WAITING:
@@ -379,7 +379,7 @@ class Triggers:
         if features.polled:
             self._polling.begin_trigger(messages.count(_GET_STATUS))
 
-    def _timed_out(
+    def _give_up_at_deadline(
         self, pending: PendingTrigger, link: Link, deadline: float
     ) -> TriggerTimeoutError:
         """Give up a trigger at its deadline; return the error."""
@@ -563,7 +563,7 @@ def _is_not_overtriggered(status: Status) -> bool:
 
 
 def _evidence(features: Features) -> TriggerEvidence:
-    """Return the evidence that a trigger needs before results count as its own."""
+    """Return a new object for the evidence that a trigger's results need in this protocol."""
     if not features.fences:
         # over UDP an answer may be lost or late
         acknowledged = features.acknowledged and features.ordered

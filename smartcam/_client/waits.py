@@ -198,7 +198,7 @@ class Waits:
     # ------------------------------------------------------------------ statuses
 
     async def wait_status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
-        """Return the next status that ``predicate`` accepts; it is called with each one in order.
+        """Return the next status that ``predicate`` accepts; every status is passed to it in order.
 
         An error of the predicate is raised here.
 
@@ -214,7 +214,7 @@ class Waits:
         finally:
             self.status_waiters.pop(waiter, None)
         if isinstance(outcome, SmartCamError):
-            raise outcome.with_traceback(None)  # else it would grow with each waiter's raise
+            raise outcome.with_traceback(None)  # shared: each raise would make the traceback longer
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome

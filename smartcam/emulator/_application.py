@@ -1,4 +1,4 @@
-"""Applications: the programs that are stored on the emulated camera."""
+"""Define applications, the programs that are stored on the emulated camera."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Application(EmulatorData):
 
     @property
     def period(self) -> int | None:
-        """Number of runs after which its containers repeat; None if each run makes its own."""
+        """Number of runs after which the containers repeat; None if each run makes a new one."""
         layout = self.result_layout
         if layout is None or layout.sequence_field is not None or self.generator is not None:
             return None
@@ -118,7 +118,7 @@ class Application(EmulatorData):
         values: Mapping[str, Any] | None = None,
         byte_order: ByteOrder = "little",
     ) -> bytes | None:
-        """Return the result container's bytes of one run, None without a "send results" tool.
+        """Return the bytes of one run's result container, None without a "send results" tool.
 
         Args:
             number: the run's sequence number.
@@ -141,7 +141,7 @@ class Application(EmulatorData):
     def container_of(
         self, values: Values, *, number: int, byte_order: ByteOrder = "little"
     ) -> bytes | None:
-        """Return the result container's bytes of values, None without a "send results" tool.
+        """Return the bytes of a container of values, None without a "send results" tool.
 
         Args:
             values: values of the layout's fields.

@@ -1,4 +1,4 @@
-"""The emulated camera on a port: sockets, a clock and the device between them.
+"""Run an emulated BVS camera on a port: connect sockets and a clock with the device.
 
 Received bytes go ``socket -> ClientLink -> Machine -> EmulatedCamera.received ->
 Device.handle``; the device's messages go ``Device.take_output -> Machine -> one write``.
@@ -258,7 +258,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def url(self) -> str:
-        """The camera's address with the dialect pinned."""
+        """The camera's address, in which the dialect is named."""
         kind = Transport(self.transport)
         scheme = next(s for s, t in BVS.schemes.items() if t is kind)
         hidden = self.device.quirks.hidden_triggers
@@ -299,7 +299,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def last_report(self) -> LastReport | None:
-        """The last run's report, even if no client received it; its time is the log's."""
+        """The last run's result, even if no client received it; its time is as in the log."""
         last = self.device.last_report
         if last is None:
             return None

@@ -1,4 +1,4 @@
-"""A client's link to the camera, and the path of its messages while faults act on them.
+"""Pass messages between a client's link and the emulated camera, while faults act on them.
 
 The owner of a link makes the link's protocol machine, which has the camera's role. A link has a
 :class:`FaultyLink` only while wire faults wait or hold messages back. Then the camera's messages go
@@ -67,7 +67,7 @@ class CameraMachine(Protocol):
         ...
 
     def send(self, message: Any) -> None:
-        """Send a message; LocalProtocolError: not now."""
+        """Send a message; raise LocalProtocolError if the state forbids it."""
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""
@@ -122,7 +122,7 @@ class LinkOwner(Protocol):
         ...
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
-        """Note a message that passed or is lost, as faults have changed it."""
+        """Note a message that passed or was lost, in the form that faults gave it."""
         ...
 
 

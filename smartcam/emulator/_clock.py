@@ -1,4 +1,4 @@
-"""The time of an emulated camera: the real time, or a time that a test moves by hand."""
+"""Clocks for emulated cameras: the real time, or a time that a test moves by hand."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class TimerHandle(Protocol):
 
 
 class Clock(ABC):
-    """A source of time that calls back at an instant. Seconds, from any origin."""
+    """A source of time, in seconds from any origin, that calls functions at given times."""
 
     @property
     @abstractmethod
@@ -64,7 +64,7 @@ class OneTimer:
     """One timer of a clock, which is set again for each next event."""
 
     _clock: Clock
-    _callback: Callable[[], None]  # called at the instant; the timer is not set then
+    _callback: Callable[[], None]  # called when the timer fires, which is then no longer set
 
     def __post_init__(self) -> None:
         self._handle: TimerHandle | None = None

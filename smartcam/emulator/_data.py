@@ -1,4 +1,4 @@
-"""The base of the data from which emulated cameras are made."""
+"""The base class of the pydantic models that describe emulated cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Emulated cameras that evaluate one part after the other: the common base of several makes."""
+"""The base class of several makes' emulated cameras, which evaluate one part after another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Functions, by their names, that make an application's values if they are not constants.
+"""Generators: functions, known by name, that make the values of an application's results.
 
 A generator gets a :class:`Run` and returns a value for ``Layout.build``: a mapping for a record, a
 list of mappings for ``( ... )*``. :func:`register_generator` adds a generator that scenario files
@@ -28,7 +28,7 @@ class Run(NamedTuple):
 
     Attributes:
         number: the run's sequence number.
-        turn: number of runs of this application before it, since it was loaded.
+        turn: number of runs of this application before this run, since it was loaded.
         time: seconds since the device was made.
         layout: layout of the result.
         scene: the table that the camera sees.

@@ -72,7 +72,7 @@ class InspectedApplication(Application):
 
     @property
     def period(self) -> int | None:
-        """No common container: each run makes its own."""
+        """None, since each run makes a new container."""
         return None
 
     @model_validator(mode="after")

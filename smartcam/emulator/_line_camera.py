@@ -44,10 +44,10 @@ MAX_SCHEDULED_CALLS = 10_000
 """Largest number of calls that may be scheduled for later at one time."""
 
 
-_FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", "cameras"})
+_COMMON_FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", "cameras"})
 """The fields of a scenario that apply to every camera that uses lines."""
 
-_STATE = frozenset({"active", "running"})
+_PROGRAM_FIELDS = frozenset({"active", "running"})
 """Fields of a scenario that apply only to cameras with programs."""
 
 
@@ -66,7 +66,7 @@ class LineClient:
         self._camera = camera
         self._link = link
         self._server = server
-        self._row = 0  # state of the current line
+        self._row = 0  # number of the row of the current line
         self._answers_later = False
 
     def answer_later(self) -> Self:
@@ -91,7 +91,7 @@ class LineClient:
         self.say_bytes(self._camera.lines.data(text), row=0)
 
     def answer(self, text: str | None) -> None:
-        """Answer the current line, with None by nothing, and read the next line."""
+        """Answer the current line (None: send nothing), and read the next line."""
         if text is not None:
             self.say_bytes(self.pack(text))
         if not self._answers_later:
@@ -188,7 +188,7 @@ class LineCamera(WireCamera):
         faults: Iterable[BaseFault | Mapping[str, Any]] = (),
         timeline: Iterable[Cue | Mapping[str, Any]] = (),
     ) -> None:
-        self._clients: dict[ClientLink, LineClient] = {}  # the oldest stands first
+        self._clients: dict[ClientLink, LineClient] = {}  # the oldest is first
         self._scheduled_calls: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
         self._links_to_flush: dict[ClientLink, None] = {}  # links with lines to write
@@ -254,7 +254,9 @@ class LineCamera(WireCamera):
     @classmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
         """Return the place of something unsupported in a scenario, and the reason; or None."""
-        fields = _FIELDS | (_STATE if cls.state_options(None, running=True) else frozenset())
+        fields = _COMMON_FIELDS | (
+            _PROGRAM_FIELDS if cls.state_options(None, running=True) else frozenset()
+        )
         for name in sorted(plan.changed() - fields):
             if name != "dialect" or plan.dialect not in cls.protocol.dialects:
                 takes = ", ".join(sorted(fields))

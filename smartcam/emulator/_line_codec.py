@@ -1,4 +1,4 @@
-"""Lines of text as frames, for the links, faults and the log of an emulated camera.
+"""Treat lines of text as frames, for the links, faults and the log of an emulated camera.
 
 A frame's payload is a line with its end. Its id is the number of the row that the line belongs to,
 from 1, as a request or as an answer; 0 for a line without a row.
@@ -148,7 +148,7 @@ class LineCodec:
         return kind or m.UnknownMessage
 
     def encode(self, message: m.Message) -> bytes:
-        """Return the bytes of a line; UnsupportedError: it is another message."""
+        """Return the bytes of a line; raise UnsupportedError for any other message."""
         if isinstance(message, (HeardLine, SaidLine)):
             return message.data
         raise UnsupportedError(f"dialect {self.label} is lines: insert data")
@@ -264,7 +264,7 @@ class LineFramer:
         self._buffer += data
 
     def next_frame(self) -> Frame | None:
-        """Return the next line, None if it is incomplete; FrameError: it is too long."""
+        """Return the next line, None if it is incomplete; raise FrameError if it is too long."""
         codec = self._codec
         match = codec.ends.search(self._buffer, self._search_start)
         size = len(self._buffer) if match is None else match.start()
@@ -289,10 +289,10 @@ class LineFramer:
 
 
 class LineServer:
-    """One connection's lines, in the camera's role: a line waits until the one before is done.
+    """The camera's side of one connection: a line waits until the line before it is answered.
 
     Attributes:
-        busy: True while a line is carried out.
+        busy: True while a line is carried out and not answered yet.
         is_reading: True while :meth:`events` is running.
         hides_next_line: True if the log must not show the next line.
     """

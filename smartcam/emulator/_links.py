@@ -1,4 +1,4 @@
-"""Sockets of the emulated camera: they move bytes and do not interpret them.
+"""Listen for clients of an emulated camera, and move bytes without interpreting them.
 
 A client's link is a TCP connection, or all datagrams of one address.
 """

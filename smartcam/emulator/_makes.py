@@ -21,7 +21,7 @@ def emulated_class(protocol: str) -> type[WireCamera]:
 
     Raises:
         PluginError: the protocol is unknown or broken, or its class is.
-        UnsupportedError: the protocol brings none.
+        UnsupportedError: the protocol has no emulated camera.
     """
     target = load_protocol(protocol).emulator
     if not target:

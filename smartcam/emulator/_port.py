@@ -1,4 +1,4 @@
-"""The camera's port, which can be closed and opened again with the same number."""
+"""Open, close and reopen the port of an emulated camera, always with the same number."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Port:
         self._close_socket()
 
     async def wait_closed(self) -> None:
-        """Wait until all is closed; :meth:`close_with_links` must be called before."""
+        """Wait until the port and all links are closed; call :meth:`close_with_links` before."""
         opening, self._opening = self._opening, None
         if opening is not None:
             await asyncio.wait({opening})
@@ -109,7 +109,7 @@ class Port:
                 self._socket = self._socket or self._bind()
                 await self._hand_over(self._socket)
             except OSError as exc:
-                _log.warning("! %s: port %d is not to be had: %s", self._name, self.number, exc)
+                _log.warning("! %s: port %d cannot be opened yet: %s", self._name, self.number, exc)
                 await asyncio.sleep(RETRY_PAUSE)
             else:
                 return

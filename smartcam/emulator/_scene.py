@@ -1,4 +1,4 @@
-"""A table with seven tangram pieces, and a camera that sees it.
+"""Simulate a table with seven tangram pieces, and a camera that sees it.
 
 The pieces have ground-truth poses in metres. The camera turns them into pixels by a similarity
 transformation (scale, rotation, offset) and adds noise; its own calibration is the exact inverse of

@@ -1,4 +1,4 @@
-"""Emulated cameras whose frames have a ticket: the common base of several makes."""
+"""The base class of several makes' emulated cameras, whose frames have a ticket."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TicketedClient(LineClient):
 
     @property
     def session(self) -> Self:
-        """The client itself; for a copy from :meth:`keep`, the original client."""
+        """The client itself; for a copy from :meth:`answer_later`, the original client."""
         return cast("Self", self._session)
 
     def speak(self, name: str) -> None:
@@ -119,14 +119,14 @@ class TicketedCodec(LineCodec):
 
 
 class TicketedFramer(LineFramer):
-    """Cuts a client's frames of either form."""
+    """Cuts a client's bytes into frames, with a header or ended by ``CR LF``."""
 
     def __init__(self, codec: TicketedCodec) -> None:
         super().__init__(codec)
         self._ticketed_codec = codec
 
     def next_frame(self) -> Frame | None:
-        """Return the next frame, None if it is incomplete; FrameError: it is too long."""
+        """Return the next frame, None if it is incomplete; raise FrameError if it is too long."""
         codec = self._ticketed_codec
         match = codec.header.match(self._buffer)
         if match is None:

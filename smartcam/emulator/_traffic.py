@@ -1,4 +1,4 @@
-"""The emulator's log of frames on the wire, and waits for entries."""
+"""Log the frames on an emulated camera's wire, and wait for frames."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 MAX_ENTRIES = 10_000
-"""Largest number of entries kept; the oldest are dropped first. The log is not meant for a day of a
-fast line."""
+"""Largest number of entries kept; the oldest are dropped first. This is too few for a day of a fast
+production line."""
 
 MAX_BYTES = 1 << 25
 """Largest number of bytes of all entries, read or not; the oldest are dropped first. It keeps
@@ -127,7 +127,7 @@ class Log(Sequence[LogEntry]):
         self.pushed_out: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
-        # entries after those, whose messages are not decoded yet
+        # the later entries, whose messages are not decoded yet
         self._raw_entries: deque[LogEntry | _EntryParts] = deque()
         self._sizes: deque[int] = deque()  # sizes of all entries in order, bytes
         self._size = 0  # sum of the sizes, bytes

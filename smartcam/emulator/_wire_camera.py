@@ -1,4 +1,4 @@
-"""The base of emulated cameras of every make: port, links, faults, timeline, log.
+"""The base class of emulated cameras of every make: port, links, faults, timeline, log.
 
 Every action is a *step*: advance the device's time, act, deliver the device's messages, and set one
 timer for the device's next event.
@@ -258,7 +258,7 @@ class WireCamera(Server):
 
     @property
     def last_report(self) -> LastReport | None:
-        """The last run's report, even if no client received it; None without one."""
+        """The last run's result, even if no client received it; None without one."""
         return None
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
@@ -277,7 +277,7 @@ class WireCamera(Server):
             "endian": 0,
             "next_number": None,
             "queued_inputs": None,
-            "run_ends": "ResultContainer",  # message that reports it to a client
+            "run_ends": "ResultContainer",  # message by which a client learns of a run's end
             "applications": [],
             "cells": {},
             "quirks": {},
@@ -587,7 +587,7 @@ class WireCamera(Server):
 
     @abstractmethod
     def _advance_device(self, now: float) -> None:
-        """Advance the device's time; ``now``: the clock's."""
+        """Advance the device's time; ``now``: the clock's time, seconds."""
 
     @abstractmethod
     def _collect(self) -> None:

@@ -1,4 +1,4 @@
-"""Interpreters of the bytes of result containers. Pure; no clock, no socket.
+"""Turn the bytes of result containers into values; no clock and no socket is used.
 
 ``localizations``, ``strings50``, ``record``, ``table`` and ``raw`` come with smartcam, others as
 entry points of the group ``smartcam.interpreters``.

@@ -1,4 +1,4 @@
-"""The base of interpreters: a result container's bytes in, a value out.
+"""Define interpreters, which turn a result container's bytes into a value.
 
 An interpreter keeps nothing between results and guesses nothing. The shortest one is a function
 over a :class:`Reader`; an interpreter with a layout is a subclass of :class:`Interpreter`.
@@ -253,15 +253,15 @@ class Interpreter(ABC):
 
 
 class PlainInterpreter(Interpreter):
-    """An interpreter that reads bytes without a :class:`Reader` and keeps no context.
+    """An interpreter that reads bytes without a :class:`Reader`.
 
-    The client uses one context for all containers.
+    It must not keep the context, since the client reuses one object for all containers.
     """
 
     def __init_subclass__(cls) -> None:
         """Use the default :meth:`read_all` if only :meth:`read` is overridden."""
         read, read_all = (
-            next(place for place, base in enumerate(cls.__mro__) if name in vars(base))
+            next(index for index, base in enumerate(cls.__mro__) if name in vars(base))
             for name in ("read", "read_all")
         )
         if read < read_all:

@@ -1,4 +1,4 @@
-"""The interpreters raw, record, table and strings50."""
+"""Interpret results as raw bytes, texts of 50 bytes, a record or a table."""
 
 from __future__ import annotations
 
@@ -20,25 +20,28 @@ _TEXT = struct.Struct(f"{TEXT_BYTES}s")
 
 
 class RawInterpreter(PlainInterpreter):
-    """The container's bytes as they are, hex in JSON; takes no layout."""
+    """Returns the container's bytes unchanged (as hexadecimal digits in JSON); takes no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
     def read(self, data: bytes, context: Context) -> bytes:
-        """Return the bytes after the application id."""
+        """Return the container's bytes, which follow the application id on the wire."""
         return data
 
 
 class Strings50Interpreter(PlainInterpreter):
-    """Texts of 50 bytes each (the thesis' ``50ByteStrings``); takes no layout."""
+    """Reads texts of 50 bytes each; takes no layout.
+
+    A thesis about the BVS camera names this format ``50ByteStrings``.
+    """
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
     def read(self, data: bytes, context: Context) -> list[str]:
-        """Return the texts in order; empty texts keep their places.
+        """Return the texts in order; an empty text is returned as "".
 
         Raises:
-            InterpretationError: bytes are left after the last whole text, or one is not UTF-8.
+            InterpretationError: bytes are left after the last whole text, or a text is not UTF-8.
         """
         try:
             return [raw.partition(b"\0")[0].decode() for (raw,) in _TEXT.iter_unpack(data)]
@@ -49,7 +52,7 @@ class Strings50Interpreter(PlainInterpreter):
 
 
 class RecordInterpreter(PlainInterpreter):
-    """One record of named fields; needs a layout.
+    """Reads one record of named fields, or a list of records; needs a layout.
 
     See :meth:`smartcam.Layout.parse`.
     """
@@ -71,7 +74,7 @@ class RecordInterpreter(PlainInterpreter):
 
 
 class TableInterpreter(PlainInterpreter):
-    """Records as a numpy array; needs a layout.
+    """Reads records into a numpy array; needs a layout.
 
     See :meth:`smartcam.Layout.parse_table`.
     """

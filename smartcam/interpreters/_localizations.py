@@ -1,4 +1,4 @@
-"""``localizations``: the parts that the camera found, with their poses."""
+"""Interpret results as localizations: parts that the camera found, with their poses."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ _QUANTITIES = {
 _POSE = ("x", "y", "z", "theta")
 
 _SIGMAS = ("sigma_x", "sigma_y", "sigma_theta")
-"""Fields that are needed for the errors of a pose."""
+"""Fields with the standard deviations of a pose; ``pose.sigma`` needs all three."""
 
 _CORRELATIONS = ("correlation_xy", "correlation_xt", "correlation_yt")
-"""Optional correlations of the errors; without them the errors are independent."""
+"""Optional fields with correlations between a pose's errors; a missing one counts as 0."""
 
 MAX_QUALITY = 1.0 + 1e-6
 """Largest quality: 1, with room for the rounding of a 32-bit float."""
@@ -66,7 +66,7 @@ _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[report
 
 
 class LocalizationsInterpreter(PlainInterpreter):
-    """Found parts, a :class:`~smartcam.Localization` each: feature, quality, pose.
+    """Reads one :class:`~smartcam.Localization` for each found part: feature, quality, pose.
 
     Args:
         layout: ``x`` and ``y`` must be in its records. Without ``feature_id`` it is ``""``,
@@ -101,12 +101,12 @@ class LocalizationsInterpreter(PlainInterpreter):
         self._reorder = field_use.reorder
         self._z_index = field_use.z_index
         self._scales = field_use.scales
-        self._checks = field_use.checks_unused
+        self._checks_unused = field_use.checks_unused
         self._sigmas = field_use.sigmas
         self._is_unusual = (
             field_use.z_index is not None or field_use.checks_unused or field_use.sigmas is not None
         )
-        self._empty = bytes(self.layout.size)
+        self._empty_record = bytes(self.layout.size)
         self._names: dict[bytes, str] = {}  # names of features, by their bytes on the wire
 
     def read(self, data: bytes, context: Context) -> list[Localization]:
@@ -156,7 +156,7 @@ class LocalizationsInterpreter(PlainInterpreter):
             raise
         if not math.isfinite(total):  # but large, valid numbers may sum up to infinity
             self._check_numbers(data, context)
-        elif self._checks:
+        elif self._checks_unused:
             self.layout.parse_records(data, context.byte_order)
         if skipped:
             context.empty_slots += skipped
@@ -231,7 +231,7 @@ class LocalizationsInterpreter(PlainInterpreter):
     def _add_sigmas(
         self, localizations: list[Localization], data: bytes, context: Context
     ) -> list[Localization]:
-        """Return localizations to whose poses the errors are added, if the errors are valid."""
+        """Return the localizations, with standard deviations in the poses where they are valid."""
         use = cast("_SigmaUse", self._sigmas)
         rows = self.layout.wire_records(data, context.byte_order)
         used_rows = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
@@ -256,7 +256,7 @@ class LocalizationsInterpreter(PlainInterpreter):
 
     def _is_empty(self, data: bytes, number: int) -> bool:
         begin = self.layout.head_size + number * self.layout.size
-        return data[begin : begin + self.layout.size] == self._empty
+        return data[begin : begin + self.layout.size] == self._empty_record
 
     def _check_numbers(self, data: bytes, context: Context) -> None:
         """Raise InterpretationError for the first invalid number, text or bool.
@@ -291,7 +291,7 @@ class _FieldUse(NamedTuple):
         z_index: index of ``z``; None: the record has no ``z``, as is usual.
         scales: factors that convert the values to SI; None if they are in SI.
         checks_unused: whether unused texts and bools have to be checked, too.
-        sigmas: indices of the errors of poses; None: the record has none.
+        sigmas: fields with the standard deviations of the pose; None: the record has none.
     """
 
     defaults: tuple[Any, ...]
@@ -303,7 +303,7 @@ class _FieldUse(NamedTuple):
 
 
 class _SigmaUse(NamedTuple):
-    """The fields of a record with the errors of its pose."""
+    """The fields of a record with its pose's standard deviations and their correlations."""
 
     sigmas: tuple[tuple[int, float], ...]  # indices of the fields in _SIGMAS, and factors for SI
     # indices of the fields in _CORRELATIONS; None: the field is missing

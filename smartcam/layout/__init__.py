@@ -271,8 +271,8 @@ class Layout:
     def wire_records(self, payload: Payload, byte_order: ByteOrder = "little") -> Rows:
         """Return the unconverted values of each record of :meth:`parse_records`.
 
-        Units are those of the wire, texts are bytes as the camera sent them, bools are unchecked
-        numbers from 0 to 255.
+        Numbers have their unit on the wire, texts are bytes as the camera sent them, bools are
+        unchecked numbers from 0 to 255.
 
         Raises:
             InterpretationError: the payload's size does not fit.
@@ -360,8 +360,8 @@ class Layout:
                 rounded to the wire's unit.
             byte_order: byte order of numbers.
             slots: number of records up to which records of zeros are appended, as the camera does.
-            sequence: value of the ``@sequence`` field, which overrides the one in ``value``. A list
-                layout with such a field in its head uses 0 if none is given.
+            sequence: value of the ``@sequence`` field, which overrides the one in ``value``. If
+                ``value`` is a list and the head has such a field, the default is 0.
 
         Raises:
             ConfigurationError: a value does not fit its field, or is missing or unknown.

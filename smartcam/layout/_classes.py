@@ -55,7 +55,7 @@ class ClassLayout(NamedTuple):
 
 class _Member(NamedTuple):
     name: str
-    hint: Any  # the class without its layout text
+    hint: Any  # the annotation without its layout text
     text: str | None
 
 
@@ -150,7 +150,7 @@ def _read_field(described: type, member: _Member) -> Field:
         )
     field = spec.fields[0]
     allowed = _allowed_types(field)
-    # a model converts values by itself
+    # pydantic converts a model's values to the annotated types
     if not _is_model(described) and member.hint not in (*allowed, Any, object):
         expected = " or ".join(type_.__name__ for type_ in allowed)
         actual = getattr(member.hint, "__name__", member.hint)

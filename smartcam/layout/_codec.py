@@ -2,8 +2,8 @@
 
 There are two ways to read. The fast way unpacks all records with one ``struct.Struct``, turns the
 rows into columns, converts the columns that need a conversion, and turns the columns back into
-rows. It does not know the place of an error. If it fails, the slow way goes through the bytes in
-order and finds this place.
+rows. The fast way cannot tell where an error is. If it fails, the slow way goes through the bytes
+in order and finds the place.
 """
 
 from __future__ import annotations
@@ -281,9 +281,9 @@ def split_rows(items: list[T], counts: list[int]) -> list[list[T]]:
 
 
 def values_by_name(value: object, names: Sequence[str], label: str) -> dict[str, Any]:
-    """Return a mapping's, a record's or a sequence's values by name.
+    """Return the values of a mapping, a record, an object of a class or a sequence, by name.
 
-    Raises ConfigurationError if it is none of these, or a sequence of another length.
+    Raises ConfigurationError if ``value`` is none of these, or a sequence of another length.
     """
     values: Any = value
     if isinstance(value, Mapping):
@@ -329,8 +329,8 @@ def _offsets(fields: tuple[Field, ...]) -> list[int]:
 def _converters(field: Field, *, lenient: bool) -> tuple[Convert, ConvertAll] | None:
     """Return the converter of a single wire value, and the converter of a column of values.
 
-    A converter is None if values stay as they are. For columns, a comprehension takes a third of
-    the time of a function call per value.
+    Return None if values stay as they are. A comprehension over a column takes a third of the time
+    of a function call for each value.
     """
     if field.type == "string":
         return _decode_text, _decode_texts

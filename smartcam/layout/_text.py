@@ -28,8 +28,8 @@ MAX_TEXT_CHARACTERS = 20_000
 each configured by hand on the camera, still fit."""
 
 MAX_COUNT = 65_535
-"""Largest number of bytes of a string, and of records: more than a container of about 64 kB
-holds."""
+"""Largest length of a string in bytes, and largest number of records: more than a container of
+about 64 kB holds."""
 
 SEQUENCE = "sequence"
 
@@ -113,7 +113,7 @@ UNITS: dict[str, Unit] = {
 SI_SYMBOLS: dict[str, str] = {"length": "m", "angle": "rad", "time": "s", "pixels": "px"}
 """The symbols of the SI units that values have, by their quantity; a ratio has none."""
 
-# words that people write for a type, and that are not spelled like it
+# names of the types in programming languages, for hints in errors
 _OTHER_NAMES = {
     "float": "real32",
     "float32": "real32",

@@ -32,7 +32,7 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
     Args:
         layout: the fields; ``( ... )*`` and a counted group take as many records as the cells
             fill.
-        cells: the name of each cell and its text; None for a cell without one.
+        cells: name and text of each cell; the text is None for a cell without one.
 
     Raises:
         InterpretationError: a text is no value of its field, or there are too few or too many

@@ -165,7 +165,7 @@ def _mistakes_text(
     file_label: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]
 ) -> str:
     texts = [
-        # the text of a layout has a marker below it; its first line gives the position
+        # only the first line of a layout's error, which gives the position: a marker follows it
         ": ".join([f"line {_find_line(root, place)}", *_place_text(place), text.partition("\n")[0]])
         for place, text in itertools.islice(findings, _MAX_MISTAKES)
     ]

@@ -1,4 +1,4 @@
-"""Read YAML of other people within bounds, since a few lines may stand for millions of values."""
+"""Read YAML within limits, since a few lines with aliases may stand for millions of values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sans-I/O wire protocols: bytes to events and back, for both roles.
+"""Sans-I/O wire protocols: turn bytes into events and messages into bytes, for both roles.
 
 For authors of dialects and protocols; :mod:`smartcam.protocols.messages` has the messages.
 """

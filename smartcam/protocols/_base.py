@@ -1,6 +1,6 @@
-"""The parts of a protocol: dialects, roles with their policies, the entry point.
+"""Define what a protocol consists of: dialects, roles with their policies, the entry point.
 
-A :class:`Dialect` is one wire variant as the client uses it, in any form of frames;
+A :class:`Dialect` is one variant of a protocol on the wire, whatever form its frames have;
 ``_framed/dialect.py`` has the dialect of binary frames. A :class:`Policy`, chosen by role and
 transport, decides how broken input is handled.
 """
@@ -122,13 +122,14 @@ class Spelled(NamedTuple):
 
 
 class RawRequest(NamedTuple):
-    """A request by its id.
+    """A request that a user sends by its id or command, and what is known of its answer.
 
     Attributes:
         message: the message to send.
         answer: the answer's message type, or its id.
-        answered: whether the camera answers it, by the documents; True for an unknown id.
-        known: whether the dialect knows the id.
+        answered: True if the documents say that the camera answers the request, or if the id is
+            unknown.
+        known: True if the dialect knows the id.
     """
 
     message: Message
@@ -146,7 +147,8 @@ class Dialect(ABC):
         about: one line for people.
         source: document that describes the dialect, with its grade.
         quirks: names of this dialect's deviations, as in ``?quirks=``.
-        shows_triggers: the status shows each accepted trigger: Waiting for Trigger drops.
+        shows_triggers: True if the status shows each accepted trigger: the bit Waiting for
+            Trigger is cleared.
     """
 
     name: str
@@ -157,12 +159,12 @@ class Dialect(ABC):
 
     in_order: ClassVar[bool] = False
     """True if the camera handles one request after the other, so that an answer shows that all
-    earlier requests are finished, with their results. Also True if its results name their
-    trigger, so that no order is needed."""
+    earlier requests are finished and their results were sent. Also True if each result names its
+    trigger, so that the order does not matter."""
     exclusive: ClassVar[bool] = True
-    """True if the camera serves one client, and a new client takes the camera from it."""
+    """True if the camera serves one client at a time, and a new client displaces the old one."""
     has_login: ClassVar[bool] = False
-    """True if a refused session is final: a wrong password stays wrong."""
+    """True if the camera checks a password, so that a refused session is not tried again."""
 
     @property
     def label(self) -> str:
@@ -213,7 +215,7 @@ class Dialect(ABC):
         return tuple(name for name, _ in wire_fields(message_type))
 
     def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status as this dialect reads it; ``reader`` is the dialect that has read it."""
+        """Return a status, read by the dialect ``reader``, as this dialect reads the same bits."""
         return report
 
     def data_begins(self, sender: Sender, message_id: int) -> int | None:
@@ -230,11 +232,11 @@ class Dialect(ABC):
 
     @abstractmethod
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return a request by its id, for users who know messages that the dialect has not.
+        """Return a request by its id, for users who know a message that the dialect lacks.
 
         Raises:
             LocalProtocolError: only the client itself may send it, such as Connect and Disconnect.
-            UnsupportedError: the protocol's ids are of another kind.
+            UnsupportedError: the id must be a number in this dialect, or must be a text.
         """
 
     @abstractmethod
@@ -294,17 +296,17 @@ class Protocol:
         default_port: port if a URL names none.
         models: camera models that speak it.
         dialects: the protocol's dialects by name.
-        machine: function that makes the client's machine of a link. It gets dialects that begin a
-            session alike, and finds out which of them the camera speaks.
-        parameters: other parameters of a URL, and their meanings; ``user`` and ``password`` stand
-            before the host there.
+        machine: function that makes the client's machine of a link. The machine gets dialects
+            whose sessions begin with the same messages, and finds out which one the camera speaks.
+        parameters: further parameters of a URL, with their meanings; in a URL, ``user`` and
+            ``password`` are written before the host.
         detection: groups of dialects that a client tries if none is given, the most probable group
-            first, each on a new link. The dialects of a group begin a session alike. Default: a
-            group for each dialect.
+            first, each on a new link. The sessions of a group's dialects begin with the same
+            messages. Default: a group for each dialect.
         emulator: ``module:attribute`` of the class of its emulated cameras, such as a
-            :class:`~smartcam.emulator.LineCamera`; "" if it brings none.
-        greeting: bytes that a camera sends to a new client before it received anything; ``b""`` if
-            it waits for the client, None if that is not known.
+            :class:`~smartcam.emulator.LineCamera`; "" if there is none.
+        greeting: bytes that a camera sends to a new client before it receives anything; ``b""`` if
+            the camera sends nothing then, None if that is not known.
     """
 
     name: str
@@ -327,12 +329,15 @@ class Protocol:
         quirks: Iterable[str] = (),
         parameters: Mapping[str, str] | None = None,
     ) -> list[tuple[Dialect, ...]]:
-        """Return the dialects to try: groups that begin a session alike, each on a fresh link.
+        """Return the groups of dialects to try, each on a new link.
+
+        The sessions of a group's dialects begin with the same messages.
+
 
         Args:
             transport: transport of the link.
-            dialect: name of the pinned dialect; without it, quirks are found out, too.
-            quirks: names of the quirks that are pinned.
+            dialect: name of the dialect that the URL sets; None to find out dialect and quirks.
+            quirks: names of the quirks that the URL sets.
             parameters: other parameters of the URL.
 
         Raises:
@@ -353,9 +358,9 @@ def load_protocol(name: str) -> Protocol:
 
     Raises:
         PluginError: the name is unknown, or the protocol failed to load.
-        ConfigurationError: the entry point gives something else.
+        ConfigurationError: the entry point gives no :class:`Protocol`.
     """
-    from smartcam.registry import PROTOCOLS  # imported late: it logs
+    from smartcam.registry import PROTOCOLS  # imported late, since it imports logging
 
     protocol = PROTOCOLS.load(name)
     if not isinstance(protocol, Protocol):

@@ -1,4 +1,4 @@
-"""The BVS protocol of Balluff smart cameras.
+"""Define the BVS protocol of Balluff smart cameras: its dialects, messages and result codes.
 
 Facts with their sources stand in ``docs/protocol.md``. Grades: *published* in a manual of this
 product or a sibling, *derived* from published facts, *inferred*.
@@ -358,7 +358,7 @@ class _Bvs(Protocol):
     dialects: Mapping[str, FramedDialect]
 
 
-# while the camera may speak either of the last two, frames are shown as those of bid (published)
+# while both of the last two are possible, traces show frames as bid's, which is published
 _16_BIT_KIN = (B16, BID, B16.with_quirks(["code"]))
 
 BVS: _Bvs = _Bvs(
@@ -370,18 +370,19 @@ BVS: _Bvs = _Bvs(
     machine=Machine,
     parameters={
         SHOWS_TRIGGERS: (
-            "`no`: the camera's status does not tell of each trigger that it takes. Then a result "
-            "needs no proof that it is of this trigger, and a late or a stranger's one may be taken"
+            "`no`: the camera's status does not show each trigger that it accepts. Then the client "
+            "takes a result without proof that it belongs to this trigger: it may be a late result "
+            "or another client's"
         ),
     },
     detection={
         # The manuals show the dialects with a magic number over UDP only, and for TCP nothing but
-        # 16 bits. Of the two framings with a magic number three documents and a published vector
-        # stand against one description.
+        # 16 bits. Three documents and a published test vector support the framing of the dialect
+        # handbook, one description that of the dialect thesis.
         Transport.TCP: (_16_BIT_KIN, (HANDBOOK,), (THESIS,)),
         Transport.UDP: ((HANDBOOK,), _16_BIT_KIN, (THESIS,)),
     },
     emulator="smartcam.emulator._camera:EmulatedCamera",
-    greeting=b"",  # before Connect neither results nor status (SC manual p. 28: published)
+    greeting=b"",  # the camera sends nothing before Connect (SC manual p. 28: published)
 )
 """The protocol that the entry point ``bvs`` gives."""

@@ -1,4 +1,4 @@
-"""Lines, prompts and counted text, cut from a stream of bytes."""
+"""Cut lines, prompts and texts of a given length from a stream of bytes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class LineReader:
-    """Cuts lines, prompts and counted text from a stream of bytes.
+    """Cuts lines, prompts and texts of a given length from a stream of bytes.
 
     Args:
         line_end: pattern of the end of a line, one or two bytes.
@@ -36,7 +36,7 @@ class LineReader:
         return bytes(self._buffer)
 
     def feed(self, data: bytes) -> None:
-        """Add bytes. The caller bounds the kept bytes, by :func:`len`."""
+        """Add bytes. The caller limits the number of kept bytes, which :func:`len` returns."""
         self._buffer += data
 
     def next_line(self) -> str | None:
@@ -60,7 +60,7 @@ class LineReader:
         return line
 
     def take(self, size: int) -> bytes | None:
-        """Remove and return the next ``size`` bytes, None if they are not all there yet."""
+        """Remove and return the next ``size`` bytes; return None if fewer have come."""
         if len(self._buffer) < size:
             return None
         data = bytes(self._buffer[:size])
@@ -69,7 +69,7 @@ class LineReader:
         return data
 
     def take_prompt(self, prompt: bytes) -> bool:
-        """Remove a prompt, which has no line end, if it comes next; return whether it did."""
+        """Remove a prompt if the kept bytes begin with it; return False if they do not."""
         if not self._buffer.startswith(prompt):
             return False
         self.take(len(prompt))

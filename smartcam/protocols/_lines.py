@@ -1,8 +1,8 @@
-"""Cameras that speak in lines of text: each request is a line, and so is its answer.
+"""Speak with cameras whose requests and answers are lines of text.
 
-A table of :class:`LineRow` holds the camera's requests and answers, from which dialect and machine
-are made. Answers have several forms: one line, in the order of the requests; several lines; an echo
-and then a result; or lines in any order, each with a word or a ticket of its request.
+A table of :class:`LineRow` lists a camera's requests and answers; dialect and machine use
+it. Answers have several forms: one line, in the order of the requests; several lines; an echo and
+then a result; or lines in any order, each with a word or a ticket of its request.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ class LineRow(NamedTuple):
             lines of a script are always recognized by the first word of the line. A dialect with
             tickets needs ``word`` only for unasked lines.
         echo: line that comes before the answer.
-        until: first words that end an answer of several lines, which ``read`` gets joined by line
-            feeds.
-        also: message types other than ``answer`` that the answer may become.
+        until: possible first words of the last line of an answer of several lines. ``read`` gets
+            these lines joined by line feeds.
+        also: further message types that ``read`` may return.
         script: function for a request of several lines; it gets the dialect and the message, yields
             lines and receives the answer to each. ``line`` is then the line for error texts.
     """
@@ -111,7 +111,7 @@ class LineReply(m.Acknowledgement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineCommand(m.Request):
-    """A line of the user; a dialect allows it if a row gives the form of its answer."""
+    """A line that the user writes; a dialect allows such lines if it has a row for this class."""
 
     answer: ClassVar[type[m.Message] | None] = LineReply
 
@@ -119,7 +119,7 @@ class LineCommand(m.Request):
 
 
 def refuse_line(line: str) -> m.Message:
-    """Refuse every line: the ``read`` of a row without an answer, or with a script.
+    """Refuse every line; for ``read`` of a row that has no answer, or that has a script.
 
     Raises:
         ValueError: always.
@@ -129,7 +129,7 @@ def refuse_line(line: str) -> m.Message:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LineDialect(Dialect):
-    """A dialect of lines.
+    """A dialect whose requests and answers are lines of text.
 
     Args:
         name, about, source, quirks: as for :class:`~smartcam.protocols.Dialect`.
@@ -137,17 +137,17 @@ class LineDialect(Dialect):
         ids: the ids that applications may have.
         line_end: end of each line, one or two bytes.
         max_line: bytes of a line, without its end; a longer line breaks the protocol.
-        encoding: encoding of its characters.
-        split: splits an answer into its word, "" for none, and the text that is read; None if
-            answers come in order and do not name their request.
-        tickets: numbers that requests carry, each the next one; ``{ticket}`` in a row's line, or
-            added by :meth:`pack`. Empty without tickets.
+        encoding: encoding of the lines.
+        split: function that splits an answer into its word ("" for none) and the text for
+            ``read``; None if answers come in order and do not name their request.
+        tickets: numbers of which each request carries the next one, in place of ``{ticket}`` in a
+            row's line or added by :meth:`pack`; empty for a dialect without tickets.
         at_once: requests are sent without waiting for earlier answers; needs ``split``.
         codes: the meaning of each result code of the answers; without codes, every answer is a
             success.
         names_application: results name their application, or there is only one. Otherwise the
             camera is asked before each trigger and after each result, by the row of Query.
-        make: name of the maker or make, for errors.
+        make: name of the maker or the product line, for error texts.
     """
 
     rows: tuple[LineRow, ...]
@@ -199,7 +199,7 @@ class LineDialect(Dialect):
         return any(message_type in {row.request, row.answer, *row.also} for row in self.rows)
 
     def message_id(self, message: m.Message | type[m.Message]) -> int:
-        """Return 0: lines have no numbers; UnsupportedError: it has no such message."""
+        """Return 0, since lines have no ids; raise UnsupportedError without such a message."""
         kind = message if isinstance(message, type) else type(message)
         if not self.has(kind):
             raise self.unsupported(kind)
@@ -265,7 +265,7 @@ class LineDialect(Dialect):
         return Spelled(None, "line", {"text": text}, frame.payload + self.line_end)
 
     def command(self, line: str) -> str:
-        """Return a line of the user after a check; a subclass may refuse some lines.
+        """Check a line that the user writes, and return it; a subclass may refuse some lines.
 
         Raises:
             ConfigurationError: the text is no line that can be sent.
@@ -273,10 +273,10 @@ class LineDialect(Dialect):
         return line
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return the request for a line of the user; the payload is added to the line.
+        """Return the request for a line that the user writes; the payload is added to the line.
 
         Raises:
-            UnsupportedError: the dialect allows no lines of the user.
+            UnsupportedError: the dialect allows no such lines.
             ConfigurationError: the text is no line that can be sent.
             LocalProtocolError: the line triggers, and its answer would not name the trigger.
         """
@@ -305,7 +305,11 @@ class LineDialect(Dialect):
         return next((row for row in own_rows if _command_word(row.line) == word), None)
 
     def row_of(self, message: m.Message) -> LineRow | None:
-        """Return the row of a message; a user's line is answered like the same client's command."""
+        """Return the row of a message.
+
+        For a user's line that sends the same command as a client's request, the row describes
+        that request's answer.
+        """
         row = self.row(type(message))
         equivalent = self._equivalent_row(message) if isinstance(message, LineCommand) else None
         if row is None or equivalent is None:
@@ -338,7 +342,7 @@ def _first_word(line: str) -> str:
 
 
 def _command_word(line: str) -> str:
-    """Return the word of a command; "PROGRAM?" is another word than "PROGRAM"."""
+    """Return a command's first word, with a question mark that follows it directly."""
     match = _COMMAND_WORD.match(line)
     return line if match is None else match[0]
 
@@ -382,8 +386,8 @@ class LineMachine:
     """One connection's lines, in the client's role, as a link needs it.
 
     See :class:`~smartcam.protocols.LinkMachine`. If answers do not name their request, a
-    request is sent when the request before it is answered, so that a lost answer is not taken from
-    a later request. A line is the answer to the open request, unless a row says that the
+    request is sent when the request before it is answered, so that the answer to a later request is
+    never taken for a lost one. A line is the answer to the open request, unless a row says that the
     camera sends such a line unasked. If answers name their request, they may come in any order.
 
     Containers that answer a Trigger have ``asked=True``, containers that come unasked
@@ -424,9 +428,7 @@ class LineMachine:
         self._max_length = max_length
         self._reader = dialect.reader(max_length)
         self._store = memoryview(bytearray(MAX_READ_BYTES))
-        self._open_requests: list[
-            _OpenRequest
-        ] = []  # open requests in order; at most one of a kind
+        self._open_requests: list[_OpenRequest] = []  # in order; at most one of each kind
         self._tickets = itertools.cycle(map(str, dialect.tickets))
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         trigger = dialect.row(m.Trigger)

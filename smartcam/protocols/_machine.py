@@ -1,4 +1,4 @@
-"""The interface between a link and the machine of its protocol.
+"""Define the interface between a link and its protocol's state machine.
 
 A machine turns received bytes into events, and messages into bytes to send, in either role; it
 imports no socket, loop or clock. ``_framed`` has the machine for frames, ``_lines`` and
@@ -25,8 +25,7 @@ class State(enum.Enum):
     """The state of a link."""
 
     if not TYPE_CHECKING:
-        __hash__ = object.__hash__  # each is one object; enum's own is a function in Python
-
+        __hash__ = object.__hash__  # faster than Enum.__hash__, which is written in Python
     IDLE = "idle"
     """Open, without a session."""
     CONNECTING = "connecting"
@@ -106,7 +105,7 @@ class LinkMachine(Protocol):
     transport: Transport
     """The transport of the link."""
     replies: bool
-    """True if the machine may have bytes to send after it received some."""
+    """True if receiving bytes may give the machine bytes to send, such as a queued request."""
     counters: Counters
     """The counters of bytes and messages."""
 
@@ -138,9 +137,10 @@ class LinkMachine(Protocol):
         ...
 
     def filled(self, count: int, now: float) -> bool:
-        """Accept ``count`` bytes that were written into :meth:`room`; return False without events.
+        """Accept ``count`` bytes that were written into :meth:`room`.
 
-        ``now``: seconds of any clock, which bound the time that a frame may take.
+        ``now``: time of arrival, seconds of any clock; a machine that limits the time for a frame
+        compares such times. Returns False if these bytes cannot have completed a message.
         """
         ...
 
@@ -157,6 +157,9 @@ class LinkMachine(Protocol):
     def send(self, message: Message, *, answered: bool | None = None, again: bool = False) -> None:
         """Queue a message; write :meth:`data_to_send` next.
 
+        ``answered``: whether an answer is expected; None: as the dialect says. ``again``: allow a
+        second pending request of this kind.
+
         Raises:
             LocalProtocolError: the message is not possible now; nothing has changed.
             UnsupportedError: the dialect has no such message.
@@ -170,11 +173,11 @@ class LinkMachine(Protocol):
 def send_each(machine: LinkMachine, messages: Iterable[m.Message]) -> None:
     """Send messages that the link will write together.
 
-    A second Query is allowed, since there is a trigger between the two. A status also comes by
-    itself, so a request for it leaves no answer pending.
+    A second Query is allowed: the client asks before a trigger and again after it. GetStatus does
+    not wait for an answer, since the camera also sends statuses by itself.
 
     Raises:
-        LocalProtocolError: the protocol's state forbids a message; those before it are sent.
+        LocalProtocolError: the link's state forbids a message; the messages before it are sent.
     """
     has_query = False
     for message in messages:
@@ -188,7 +191,14 @@ def send_each(machine: LinkMachine, messages: Iterable[m.Message]) -> None:
 
 @dataclass(slots=True)
 class Counters:
-    """Counters of bytes and messages that went through a machine."""
+    """Counters of bytes and messages that went through a machine.
+
+    Attributes:
+        ignored_frames: broken frames that were dropped.
+        unknown_ids: messages with an id that the dialect does not know.
+        unexpected_messages: answers that no request was waiting for.
+        long_bodies: messages with a longer body than documented, which were accepted.
+    """
 
     frames_received: int = 0
     frames_sent: int = 0

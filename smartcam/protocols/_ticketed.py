@@ -1,8 +1,8 @@
-"""Cameras that speak in frames with a header of text: a ticket, the length, and the content.
+"""Speak with cameras whose frames have a header of text: a ticket, the length, and the content.
 
 Each request carries a ticket that its answer repeats, so answers may come in any order, with other
-frames between them. Such a dialect is a dialect of lines that end by their length. Contents are
-bytes; as texts they are Latin-1, in which each character is one byte.
+frames between them. Such a frame is handled as a line whose length is given in advance. Contents
+are bytes; as texts they are Latin-1, in which each character is one byte.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 _DIGIT = re.compile(rb"[0-9]")
 
 ENCODING = "latin-1"
-"""One byte for each character, whatever the content."""
+"""An encoding in which each byte is one character, so that any content can be a text."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TicketedDialect(LineDialect):
-    """A dialect of frames: ``TTTT`` ``L`` and a length, ``CR LF``, the ticket again and content.
+    """A dialect whose frames are a ticket, ``L``, a length, ``CR LF``, the ticket again, content.
 
     Args:
         digits: number of digits of the length, 0 for frames without a header, which end with their
             first ``CR LF``. The length counts the ticket, the content and the ``CR LF`` after it.
-        asks_with_length: True if requests have the header, too.
+        asks_with_length: True if requests have the header, too; otherwise only answers have it.
     """
 
     digits: int = 9
@@ -106,7 +106,7 @@ class HeaderReader(LineReader):
     Args:
         width: digits of a ticket, 0 for frames without tickets.
         digits: digits of the length.
-        max_length: largest number of bytes of a content.
+        max_length: largest number of bytes of a frame's content.
     """
 
     def __init__(self, width: int, digits: int, max_length: int) -> None:
@@ -140,7 +140,10 @@ class HeaderReader(LineReader):
         self.take(self._header_bytes)
         body = self.take(length) or b""
         if not body.endswith(b"\r\n") or not body.startswith(form[1]):
-            raise FrameError(f"frame {form[1].decode()} does not hold what it says", data=body[:64])
+            raise FrameError(
+                f"frame {form[1].decode()} does not repeat its ticket, or does not end with CR LF",
+                data=body[:64],
+            )
         return body[:-2].decode(ENCODING)
 
     def _may_begin(self, header: bytes) -> bool:

@@ -1,11 +1,11 @@
-"""The messages that client and camera exchange, whatever the wire looks like.
+"""Define the messages that client and camera exchange, independent of their form on the wire.
 
 Each message is a frozen dataclass that declares its body once: a field's annotation is its form
 on the wire (:data:`Word`, :data:`UInt32`, :data:`Data`). A dialect's table
 (``protocols/_bvs.py``) gives each message its id, and lists the fields that the dialect leaves
 out; codecs, construct views and the documentation are made from both. ``TRANSITIONS`` in
-``protocols/_framed/machine.py`` lists when messages may come; new requests and reports join those
-of a session there.
+``protocols/_framed/machine.py`` lists the states in which each message may come; a new request or
+report must be added to the lists from which it is made.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Sender(enum.Enum):
     """The side that sends a message."""
 
     if not TYPE_CHECKING:
-        __hash__ = object.__hash__  # each is one object; enum's own is a function in Python
+        __hash__ = object.__hash__  # faster than Enum.__hash__, which is written in Python
 
     CLIENT = "client"
     CAMERA = "camera"
@@ -101,8 +101,8 @@ class Request(Message):
     """A message from client to camera.
 
     Attributes:
-        answer: the message type the camera answers with in a dialect that has it, None if it never
-            does.
+        answer: message type of the camera's answer, if the dialect has this type; None if the
+            camera never answers.
     """
 
     __slots__ = ()
@@ -355,9 +355,9 @@ class SetClock(Request):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetInput(Request):
-    """Input data for the next inspection, laid out as its "Receive data" tool says.
+    """Send input data for the next inspection, in the form that its "Receive data" tool expects.
 
-    On BVS ID it is the reference value, filled with zeros to its configured length.
+    On BVS ID the data is the reference value, filled with zeros to its configured length.
     """
 
     answer: ClassVar[type[Message] | None] = SetInputAnswer
@@ -440,4 +440,6 @@ def wire_fields(message_type: type[Message]) -> tuple[tuple[str, Wire], ...]:
     return fields
 
 
-_WIRE_FIELDS: dict[type[Message], tuple[tuple[str, Wire], ...]] = {}  # hints are slow to read
+_WIRE_FIELDS: dict[
+    type[Message], tuple[tuple[str, Wire], ...]
+] = {}  # cached, since get_type_hints is slow

@@ -60,7 +60,7 @@ def test_interpreters_lists_the_built_in_ones() -> None:
     assert all(line["about"] for line in lines if line["name"] in names)
     out = run("interpreters").done().out
     assert {line.split()[0] for line in out.splitlines()} >= names
-    assert "Found parts, a Localization each" in out
+    assert "one Localization for each found part" in out
 
 
 def test_help_lists_every_command_by_topic() -> None:

@@ -35,7 +35,7 @@ async def test_lines_of_a_kind_have_a_bound_in_each_minute(
         lines = said(caplog)
         assert lines[0].endswith("! the camera says: error 0: short circuit")
         assert len(lines) == MAX_LINES + 2
-        assert "more of the kind 'notice error' in 60 s than are logged: 20" in lines[-2]
+        assert "more than 20 lines of the kind 'notice error' in 60 s" in lines[-2]
         assert lines[-1].endswith("notification 500002: {}")
         caplog.clear()
         await asyncio.sleep(60)

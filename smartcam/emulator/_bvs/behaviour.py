@@ -1,4 +1,4 @@
-"""The behaviour of cameras that speak different dialects, as data."""
+"""Describe by data how cameras behave, which depends on the dialect that they speak."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ class Behaviour:
     acknowledges: bool = False  # each request is answered with a result code
     answers_bad_messages: bool = False  # unknown and malformed requests are answered, too
     answers_disconnect: bool = False  # Disconnect is answered, too
-    runs_always: bool = False  # there is no run mode to enter or leave; not Ready is BUSY
+    runs_always: bool = (
+        False  # there is no run mode to enter or leave; not being Ready counts as BUSY
+    )
     status_with_session: bool = True  # a status comes after Connect
     reports_changes: bool = True  # every change of the status is reported
     sticky_errors: bool = False  # error bits stay until they are reset
@@ -39,8 +41,8 @@ SMART_CAMERA = Behaviour()
 def behaviour_of(dialect: FramedDialect, quirks: Quirks) -> Behaviour:
     """Return the behaviour of a camera that speaks ``dialect``.
 
-    Source: BVS ID guide p. 52, 58, 206, 210, 227 (published for ``bid``); the quirks have the
-        sources of the rest.
+    Source: BVS ID guide p. 52, 58, 206, 210, 227 (published for ``bid``); the quirks name the
+        sources of the other facts.
     """
     if not dialect.has(m.TriggerAnswer):
         return Behaviour(coded="code" in dialect.quirks)

@@ -1,4 +1,4 @@
-"""The device's calendar clock and its input queue."""
+"""Model the device's calendar clock and its queue of input data."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ class CalendarClock:
 
 
 class InputQueue:
-    """Input containers, one for each inspection.
+    """A queue of input containers, of which each inspection takes one.
 
     Source: SC manual p. 30 and p. 33 (published): with more containers than inspections one is
-    dropped, with fewer one is reused. Which one, and the depth: unknown.
+    dropped, with fewer one is reused. Which one is dropped, and how many are kept, is unknown.
     """
 
     def __init__(self, depth: int) -> None:
-        self._depth = depth  # containers kept
+        self._depth = depth  # largest number of containers kept
         self._queue: deque[Mapping[str, Any]] = deque()
         self._last: Mapping[str, Any] | None = None
 
@@ -105,5 +105,5 @@ class RunChange:
     """The changes that faults make to one inspection."""
 
     delay: int = 0  # additional duration of the inspection, nanoseconds
-    sends_nothing: bool = False  # whether the evaluation sends nothing
-    extra_copies: int = 0  # number of repetitions of its container
+    sends_nothing: bool = False  # whether the inspection sends no container
+    extra_copies: int = 0  # number of times that the container is sent again

@@ -1,4 +1,4 @@
-"""The device of an emulated camera: a model whose time is advanced by its caller.
+"""Model the device of an emulated camera; the caller advances the device's time.
 
 It knows no socket, loop or clock. Messages of the active session go in by :meth:`Device.handle`,
 time by :meth:`Device.tick`; the camera's messages are taken with :meth:`Device.take_output`.
@@ -104,7 +104,7 @@ class _Inspection(NamedTuple):
 
 
 class LastReport(NamedTuple):
-    """The report of a run, even if no client received it."""
+    """The result of the last run that had one, even if no client received it."""
 
     time: float  # seconds
     byte_order: ByteOrder
@@ -161,7 +161,7 @@ class Device:
         self._now = 0
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
-        self._session = False
+        self._has_session = False
         self.sessions: int = 0
         self._switch_answer_due = False  # an answer to a switch is due in this session
         self.last_report: LastReport | None = None
@@ -175,7 +175,7 @@ class Device:
         self._held_busy = False
         self._triggers_to_drop = 0  # number of triggers still to be dropped
         self._run_change = RunChange()  # changes to the running inspection, or else to the next one
-        # a reference value stays until the next one; it does not queue
+        # a reference value (BVS ID) is kept until the next one, and is not queued
         depth = 1 if behaviour.acknowledges else self.quirks.input_queue_depth
         self._inputs = InputQueue(depth)
         self._clock = CalendarClock(clock_time, self._now)
@@ -217,7 +217,7 @@ class Device:
     @property
     def connected(self) -> bool:
         """True while a client has a session."""
-        return self._session
+        return self._has_session
 
     @property
     def endian(self) -> int:
@@ -281,10 +281,10 @@ class Device:
         if isinstance(message, m.Connect):
             self.connect()
         elif isinstance(message, m.Disconnect):
-            is_answered = self._session and self.behaviour.answers_disconnect
+            is_answered = self._has_session and self.behaviour.answers_disconnect
             self.disconnect()
             self._output = [m.DisconnectAnswer()] if is_answered else []
-        elif self._session:
+        elif self._has_session:
             self._handle_request(message)
         self._advance(self._now)
 
@@ -293,7 +293,7 @@ class Device:
 
         Source: SC manual p. 28, 29 (published); that ``bid`` sends no status is inferred.
         """
-        self._session, self._switch_answer_due = True, False
+        self._has_session, self._switch_answer_due = True, False
         self.sessions += 1
         self._note_entered(DeviceState.CONNECTED)
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
@@ -308,16 +308,16 @@ class Device:
 
         Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
         """
-        if self._session:
+        if self._has_session:
             self._note_entered(DeviceState.DISCONNECTED)
-        self._session = self._switch_answer_due = False  # only the asking client gets an answer
+        self._has_session = self._switch_answer_due = False  # only the asking client gets an answer
         self._output = []
 
     def watch(self, on_entered: Callable[[DeviceState], None]) -> None:
         """Call a function for every state that the device enters from now on.
 
-        It is called right after the event that led to the state; for a message or an operator's
-        action, by the next :meth:`report_entered`.
+        The function is called right after the event that led to the state; after a message or an
+        operator's action, the next :meth:`report_entered` calls it.
         """
         self._on_entered = on_entered
         self._last_word = self._status_word()
@@ -363,7 +363,7 @@ class Device:
             self._leave_run_mode()
 
     def trigger(self) -> bool:
-        """Trigger by the digital input; True if an inspection began."""
+        """Trigger by the digital input; return True if an inspection began."""
         with self.around():
             taken = self._trigger()
             self._advance(self._now)
@@ -465,7 +465,7 @@ class Device:
         Args:
             late: seconds by which the inspection takes longer.
             silent: True for an inspection that sends nothing.
-            extra: number of times that its container is repeated after the first one.
+            extra: number of times that the inspection's container is sent again.
         """
         late = check_seconds(late, "late", "device")
         silent = check_flag(silent, "silent", "device")
@@ -581,8 +581,8 @@ class Device:
     def _trigger(self) -> bool:
         """Begin an inspection, or drop the trigger and report that.
 
-        A stopped or switching application ignores it, and so does one without triggers
-        (mvBlueGEMINI manual p. 31 and the newest SC manual p. 48, published).
+        A camera that is stopped or switching ignores the trigger, and so does an application that
+        runs free (mvBlueGEMINI manual p. 31 and the newest SC manual p. 48, published).
         """
         if self._mode is not Mode.RUNNING or not self._active.triggered or not self._can_run:
             return False
@@ -604,7 +604,7 @@ class Device:
             self._send(m.SwitchAnswer(code=ResultCode.BUSY, application=self._active.id))
             return
         if self._mode is Mode.SWITCHING:
-            return  # not answered: inferred
+            return  # that it is not answered is inferred
         target = self._applications.get(application)  # no application has id 0
         stopped = runs_always or self._mode is not Mode.RUNNING
         policy = "allow" if stopped else self.quirks.switch_while_running
@@ -713,7 +713,7 @@ class Device:
         return "big" if self._endian == 1 else "little"
 
     def _plan_free_run(self, origin: int, count: int) -> None:
-        """Schedule free run ``count``, timed from the first one, so that runs do not drift."""
+        """Schedule free run number ``count``; timed from the first run, runs do not drift."""
         when = origin + nanoseconds(count / (self._active.rate or 1.0))
         self._events[_Event.FREE_RUN] = (
             when,
@@ -876,7 +876,7 @@ class Device:
     # ------------------------------------------------------------------ output
 
     def _send(self, message: m.Message) -> None:
-        if self._session:
+        if self._has_session:
             self._output.append(message)
 
     def _note_entered(self, state: DeviceState) -> None:

@@ -1,1 +1,1 @@
-"""The emulated In-Sight camera."""
+"""The emulated Cognex In-Sight camera."""

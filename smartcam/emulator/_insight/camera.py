@@ -260,14 +260,17 @@ class EmulatedInSight(LineCamera):
         self.device.load(check_application_or_name(job, "job", "emulator"))
 
     def answer_next(self, code: int, *, command: str | None = None) -> None:
-        """Answer a command with a status code instead of carrying it out; oldest call first.
+        """Answer a command with a status code instead of carrying it out.
+
+        The codes of several calls are used in the order of the calls.
+
 
         Args:
             code: the code.
             command: the two letters of the command; default the next command of any kind.
 
         Raises:
-            ConfigurationError: 1000 answers are ordered already.
+            ConfigurationError: 1000 answers wait to be used already.
         """
         code = check_integer(code, "code", -(1 << 31), (1 << 31) - 1, "emulator")
         if command is not None:

@@ -1,4 +1,4 @@
-"""Answer a line exactly as the emulated In-Sight camera does."""
+"""Carry out command lines on the emulated In-Sight device, and make the answers."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Respond(Protocol):
 
 
 class InSightCommands:
-    """A camera's commands; the arguments are the emulator's.
+    """Carries out a camera's commands; the arguments are as for ``EmulatedInSight``.
 
     Raises:
         ConfigurationError: an argument is wrong.
@@ -88,8 +88,8 @@ class InSightCommands:
             "GF": lambda _: _value_answer(None if device.job is None else device.job.file),
             "GJ": lambda _: _value_answer(None if device.job is None else device.job.id),
             "GV": self._get_value,
-            "SI": lambda argument: self._set_value(argument, "int", _integer),
-            "SF": lambda argument: self._set_value(argument, "float", _number),
+            "SI": lambda argument: self._set_value(argument, "int", _parse_integer),
+            "SF": lambda argument: self._set_value(argument, "float", _parse_number),
             "SS": lambda argument: self._set_value(argument, "string", str),
             "GI": self._get_info,
             "EV": self._evaluate,
@@ -134,7 +134,7 @@ class InSightCommands:
     def _request_event(
         self, argument: str, report_code: Callable[[StatusCode], None], *, at_image: bool
     ) -> None:
-        event = _integer(argument)
+        event = _parse_integer(argument)
         if event is None or not 0 <= event <= words.TRIGGER_EVENT:
             report_code(StatusCode.INVALID_ARGUMENT)
         else:
@@ -143,7 +143,7 @@ class InSightCommands:
     # ------------------------------------------------------------------ jobs
 
     def _set_job(self, argument: str, respond: Respond) -> None:
-        number = _integer(argument)
+        number = _parse_integer(argument)
         self._load(None if number is None or number < 0 else number, respond)
 
     def _load(self, job: str | int | None, respond: Respond) -> None:
@@ -171,7 +171,7 @@ class InSightCommands:
         return _code_answer(self._device.request_value(key, kind, value))
 
     def _cell_to_set(self, argument: str) -> tuple[str | None, str]:
-        """Return the key of the cell to set, None if there is no such cell, and the rest."""
+        """Return the key of the cell to set (None: no such cell), and the text after the cell."""
         cell = words.parse_wire_cell(argument)
         if cell is not None:
             return cell[0].wire, cell[1]
@@ -181,7 +181,8 @@ class InSightCommands:
     def _key_of_name(self, name: str) -> str | None:
         """Return the key of a cell with a name, None if there is no such cell.
 
-        Cells are kept in upper case, so one without its three digits is not found.
+        Only names have keys in lower case, so a position such as ``A1``, which needs three digits,
+        is not found.
         """
         key, job = name.lower(), self._device.job
         return key if job is not None and key in job.sources else None
@@ -296,9 +297,9 @@ def _check_sendable(where: str, text: str) -> None:
         raise ConfigurationError(f"{where}: only Latin-1 can be sent, got {text!r:.80}") from exc
 
 
-def _integer(text: str) -> int | None:
+def _parse_integer(text: str) -> int | None:
     return int(text) if _INTEGER.fullmatch(text) else None
 
 
-def _number(text: str) -> float | None:
+def _parse_number(text: str) -> float | None:
     return float(text) if _NUMBER.fullmatch(text) else None

@@ -26,41 +26,43 @@ WRITE_LIMIT = 1 << 25
 megapixels needs 17 million."""
 
 
-def _code(line: str) -> int:
-    """Return the status code of an answer; ValueError: it has none."""
+def _read_code(line: str) -> int:
+    """Return the status code of an answer; raise ValueError if it has none."""
     return int(line.partition("\r\n")[0])
 
 
-def _value(line: str) -> int:
+def _read_value(line: str) -> int:
     """Return the number after the status code, or the number that means no job."""
     code, _, value = line.partition("\r\n")
     return int(value) if int(code) == words.StatusCode.DONE else m.UNNAMED_APPLICATION
 
 
-def _status(line: str) -> m.StatusReport:
-    """Return the mode; LookupError: there is no such mode."""
+def _read_status(line: str) -> m.StatusReport:
+    """Return the status for a mode; raise LookupError for an unknown mode."""
     return m.StatusReport(status={"0": Status(0), "1": ONLINE}[line])
 
 
 ROWS = (
-    LineRow(m.GetStatus, "GO", m.StatusReport, _status),
-    LineRow(m.Query, "GJ", m.QueryAnswer, lambda line: m.QueryAnswer(application=_value(line))),
+    LineRow(m.GetStatus, "GO", m.StatusReport, _read_status),
+    LineRow(
+        m.Query, "GJ", m.QueryAnswer, lambda line: m.QueryAnswer(application=_read_value(line))
+    ),
     LineRow(
         m.SwitchApplication,
         "SJ{application}",
         m.SwitchAnswer,
-        lambda line: m.SwitchAnswer(code=_code(line), application=m.UNNAMED_APPLICATION),
+        lambda line: m.SwitchAnswer(code=_read_code(line), application=m.UNNAMED_APPLICATION),
     ),
     LineRow(
         m.LoadFile,
         "LF{name}",
         m.SwitchAnswer,
-        lambda line: m.SwitchAnswer(code=_code(line), application=m.UNNAMED_APPLICATION),
+        lambda line: m.SwitchAnswer(code=_read_code(line), application=m.UNNAMED_APPLICATION),
     ),
-    LineRow(m.Start, "SO1", m.StartAnswer, lambda line: m.StartAnswer(code=_code(line))),
-    LineRow(m.Stop, "SO0", m.StopAnswer, lambda line: m.StopAnswer(code=_code(line))),
-    LineRow(m.Trigger, "SW8", m.TriggerAnswer, lambda line: m.TriggerAnswer(code=_code(line))),
-    LineRow(m.ReadImage, "RI", m.Image, lambda line: m.Image(code=_code(line), data=b"")),
+    LineRow(m.Start, "SO1", m.StartAnswer, lambda line: m.StartAnswer(code=_read_code(line))),
+    LineRow(m.Stop, "SO0", m.StopAnswer, lambda line: m.StopAnswer(code=_read_code(line))),
+    LineRow(m.Trigger, "SW8", m.TriggerAnswer, lambda line: m.TriggerAnswer(code=_read_code(line))),
+    LineRow(m.ReadImage, "RI", m.Image, lambda line: m.Image(code=_read_code(line), data=b"")),
 )
 """The commands that are requests of the library; faults name them by these requests."""
 
@@ -74,7 +76,7 @@ class _LoginState(enum.Enum):
 
 
 class TelnetClient(LineClient):
-    """One client: it logs in, then its commands are carried out one by one (decided).
+    """One client: it logs in, then its commands are carried out one by one.
 
     Attributes:
         number: number of the session, from 0.

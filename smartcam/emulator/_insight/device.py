@@ -63,7 +63,7 @@ class _PendingEvent:
 
 
 class InSightDevice:
-    """A camera with jobs and an image.
+    """Models a camera with jobs and an image.
 
     Methods for clients' commands return the status code of the answer, or pass it to a callback.
 
@@ -102,7 +102,7 @@ class InSightDevice:
         self._running_event: _PendingEvent | None = None
         self._runs_since_load = 0  # number of acquisitions since the job was loaded
         self._cells: dict[str, str] = {}
-        # counts loads and changes of the mode; a free run from before one stops
+        # counts loads and changes of the mode, each of which ends the free runs before it
         self._generation = 0
         if active is not None:
             self.job = self.find(active)
@@ -200,7 +200,7 @@ class InSightDevice:
         self.set_online(False)
 
     def trigger(self) -> bool:
-        """Trigger by the input; False if the camera does not take it, as for ``SE8``."""
+        """Trigger by the input; return False if the camera does not accept that, as for ``SE8``."""
         with self.around():
             return self._begin_run(TRIGGER_EVENT, None, at_image=False)
 
@@ -229,7 +229,10 @@ class InSightDevice:
                 self._abort_run()
 
     def switch_application(self, application: int, *, running: bool = False) -> bool:
-        """Load the job with an id by hand, then go online or offline; False during another load.
+        """Load the job with an id by hand, then go online or offline.
+
+        Return False, and do nothing, while another job is loaded.
+
 
         Raises:
             ConfigurationError: there is no such job.

@@ -1,4 +1,4 @@
-"""Images of the emulated In-Sight camera: 8 bit grey, sent as a bitmap file."""
+"""Check images of the emulated In-Sight camera, 8 bit grey, and make bitmap files of them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""An emulated camera as data, with the events that happen to it."""
+"""Scenarios: data that describes emulated cameras, and events that happen to them."""

@@ -1,4 +1,4 @@
-"""Merge a scenario and the options that were given with it into an emulated camera."""
+"""Merge a scenario with the options of an emulated camera, which override it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def make_plan(
     timeline: Iterable[Cue | Mapping[str, Any]],
     **given: Any,
 ) -> Scenario:
-    """Return the scenario with the given options; None stands for an option that was not given.
+    """Return the scenario with the given options; an option that is None was not given.
 
     Raises:
         ConfigurationError: an option is wrong, or not supported by the camera.

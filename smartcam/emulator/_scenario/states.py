@@ -44,5 +44,5 @@ _BITS: Mapping[int, DeviceState] = {
 
 
 def risen_states(bits: int) -> list[DeviceState]:
-    """Return the states of those bits of a status word that have risen."""
+    """Return the states of the bits of a status word that have just been set."""
     return [state for bit, state in _BITS.items() if bits & bit]

@@ -1,4 +1,4 @@
-"""The base of all faults: the message that a fault waits for."""
+"""The base classes of faults, which define the message that a fault waits for."""
 
 from __future__ import annotations
 

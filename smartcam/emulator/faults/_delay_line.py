@@ -40,7 +40,7 @@ class Transmission:
     overtaken: bool = False  # whether later parts may pass this one while it waits
     # number of later parts to wait for, and the longest wait in seconds
     gather: tuple[int, float] | None = None
-    # without an order: whether the transmission is sent after those parts, not with them
+    # without an order: whether it is sent after the parts that it waits for, not with them
     after_gathered: bool = False
     end: Ending | None = None  # event of the connection after it
     faults: list[str] = field(
@@ -94,7 +94,7 @@ class _WaitingTransmission(Generic[T]):
 
 @dataclass(eq=False)
 class DelayLine(Generic[T]):
-    """One direction of one link.
+    """Delays transmissions in one direction of one link.
 
     :meth:`put` transmissions, then call :meth:`run`. ``carry`` is called with the bytes to send.
     """
@@ -105,7 +105,7 @@ class DelayLine(Generic[T]):
     # transmissions of one time are carried together. False (UDP): each part is carried by itself
     ordered: bool
     wake: Callable[[], None]  # called when run() is due
-    # gets passing transmissions and the bytes of each, for one write; it may stop() the line
+    # gets due transmissions and the bytes of each, for one write; the function may stop() the line
     carry: Callable[[list[tuple[T, bytes]]], None]
     end: Callable[[Ending], None]  # ends the connection after a transmission
     on_dropped: Callable[[T], None]  # called with each transmission that was dropped by close()
@@ -125,7 +125,7 @@ class DelayLine(Generic[T]):
     def put(self, sent: Iterable[T], amount: int = 1) -> None:
         """Add the transmissions of a message; call :meth:`run` next.
 
-        They count as ``amount`` for transmissions that wait for later ones.
+        For transmissions that wait for a number of later ones, they count as ``amount``.
         """
         now = self._now
         gatherer = self._count_new(amount, now)
@@ -176,7 +176,7 @@ class DelayLine(Generic[T]):
         return nanoseconds(self.clock.now)
 
     def _count_new(self, amount: int, now: int) -> _WaitingTransmission[T] | None:
-        """Count new transmissions for waiting ones; return the transmission to join."""
+        """Count new transmissions for waiting ones; return the one that the new ones join."""
         waiting = [entry for entry in (*self._queue, *self._unordered) if entry.missing_count > 0]
         for entry in waiting:
             entry.missing_count -= amount
@@ -188,10 +188,12 @@ class DelayLine(Generic[T]):
         return gatherers[0] if gatherers else None
 
     def _send_unordered(self) -> None:
-        """Send transmissions that may be overtaken, and all without an order."""
+        """Send due transmissions that have no order; queue due ones that others may overtake."""
         now = self._now
-        due_at = [entry for entry in self._unordered if entry.send_at <= now]
-        for entry in sorted(due_at, key=lambda entry: (entry.send_at, entry.sent.after_gathered)):
+        due_entries = [entry for entry in self._unordered if entry.send_at <= now]
+        for entry in sorted(
+            due_entries, key=lambda entry: (entry.send_at, entry.sent.after_gathered)
+        ):
             if entry not in self._unordered:  # closed meanwhile
                 return
             if self.ordered:

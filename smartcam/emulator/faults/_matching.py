@@ -1,4 +1,4 @@
-"""Match faults with messages; keep the faults that wait, and those that have happened."""
+"""Match faults with messages; keep the faults that wait, and the last ones that happened."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ _log = logging.getLogger("smartcam.emulator")
 
 @dataclass(slots=True, eq=False)
 class Row:
-    """A fault that waits."""
+    """A fault that waits for messages, and how many it has seen."""
 
     fault: Fault
     times_left: int | None  # number of times that it will still apply; None: always
     fitting_count: int = 0  # messages that fitted so far
 
     def count_message(self) -> bool:
-        """Count a message that fits; True if the fault applies to it."""
+        """Count a message that fits; return True if the fault applies to this message."""
         self.fitting_count += 1
         if self.fitting_count < self.fault.nth:
             return False
@@ -79,7 +79,7 @@ class FaultQueue:
 
     @property
     def waiting(self) -> list[Fault]:
-        """The faults."""
+        """The faults that wait, in the order in which they were given."""
         return [row.fault for row in self._all]
 
     def add(self, given: Iterable[BaseFault | Mapping[str, Any]]) -> None:
@@ -112,12 +112,12 @@ class FaultQueue:
     def by_message(self, rows: list[Row], message: m.Message) -> list[Fault]:
         """Return the faults among ``rows`` that a message triggers, as :meth:`by_frame`."""
         number = self._dialect.message_id(message)
-        unnamed = isinstance(message, m.UnknownMessage)  # a refusal of only a code
+        unnamed = isinstance(message, m.UnknownMessage)  # a refusal that is only a code
         kind = type(message) if unnamed else self._dialect.message_type(message.sender, number)
         return self._fire_matching(rows, kind.__name__, number, message)
 
     def at_once(self) -> list[Fault]:
-        """Return the faults that wait for no message, in order."""
+        """Remove and return the faults that wait for no message, in order."""
         rows = list(self._at_once)
         self._forget(rows)
         return self._record([row.fault for row in rows], None)

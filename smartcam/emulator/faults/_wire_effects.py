@@ -1,4 +1,4 @@
-"""Make the transmissions of one message as faults change them, without side effects."""
+"""Apply wire faults to one message: make the transmissions that replace it."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class WireCodec(Protocol):
         ...
 
     def encode(self, message: m.Message) -> bytes:
-        """Return a message's bytes; UnsupportedError, LocalProtocolError: it cannot be sent."""
+        """Return a message's bytes; UnsupportedError or LocalProtocolError if it has none."""
         ...
 
     def encode_frame(self, frame: Frame) -> bytes:
@@ -109,7 +109,7 @@ class WireMessage(Transmission):
         return None if self.passed_bytes == self.original else bytes(self.passed_bytes)
 
     def find_byte(self, offset: int) -> tuple[int, int]:
-        """Return the index of the part with the byte at ``offset``, and the place in that part."""
+        """Return the index of the part with the byte at ``offset``, and the byte's offset in it."""
         ends = list(accumulate(map(len, self.parts)))
         part_index = next(index for index, end in enumerate(ends) if offset < end)
         return part_index, offset - (ends[part_index] - len(self.parts[part_index]))
@@ -214,8 +214,8 @@ def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
         for index in indices:
             sent[index].drop()
             sent[index].faults.append(fault.kind)
-    find_byte = indices[0] if fault.where == "before" else indices[-1] + 1
-    return [*sent[:find_byte], insertion, *sent[find_byte:]]
+    insert_at = indices[0] if fault.where == "before" else indices[-1] + 1
+    return [*sent[:insert_at], insertion, *sent[insert_at:]]
 
 
 def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: WireCodec) -> _Sent:
@@ -247,10 +247,10 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireC
         if rebuild is not None:
             sent = rebuild(fault, sent, dialect)
             continue
-        for part in sent:
-            if part.changeable:
-                part.faults.append(fault.kind)
-                _CHANGES[type(fault)](fault, part)
+        for sent_message in sent:
+            if sent_message.changeable:
+                sent_message.faults.append(fault.kind)
+                _CHANGES[type(fault)](fault, sent_message)
     return sent
 
 

@@ -1,8 +1,8 @@
-"""Views of a dialect's frames for the package construct, generated from its message table.
+"""Describe a dialect's frames field by field, with the package construct.
 
-They describe whole frames field by field, with offsets, for people (``smartcam decode``, the
-documentation) and as a second implementation of the table in tests. The hot path does not use them.
-The package has no types, so it is imported only here.
+The descriptions are generated from the dialect's message table. People read them (``smartcam
+decode``, the documentation), and tests compare them with the codecs, which are faster and which
+clients use. The package construct has no type hints, so only this module imports it.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
 def view_fields(dialect: FramedDialect, sender: Sender, data: bytes) -> list[FieldView]:
     """Return every field of one whole frame, in order, and surplus bytes as ``surplus``.
 
-    Raises MessageError: it is no complete frame of this dialect from this sender.
+    Raises MessageError: the bytes are no complete frame of this dialect from this sender.
     """
     try:
         parsed = frame_view(dialect, sender).parse(data)

@@ -1,4 +1,4 @@
-"""Dialects of binary frames, as data.
+"""Define a dialect of binary frames by data: header layout, message table, result codes.
 
 A :class:`FramedDialect` joins a header layout and a message table and compiles them to codecs.
 """
@@ -57,8 +57,8 @@ class MessageRow(NamedTuple):
     Attributes:
         message_id: id on the wire.
         type: the message.
-        title: the manual's name.
-        source: document that has the fact, with its grade.
+        title: the message's name in the manual.
+        source: document that describes the message, with the grade of this knowledge.
         omits: fields of the message that are not on this dialect's wire; they have defaults.
         byte_order: ``struct`` code of the body's byte order.
     """
@@ -122,8 +122,8 @@ class StatusBits:
 
 
 MAX_KNOWN = 256
-"""Largest number of different messages of a type that are kept. A camera sends few, but a peer
-could send any number."""
+"""Largest number of different messages of a type that a codec keeps to return them again. A camera
+sends few, but a peer could send any number."""
 
 
 MAX_SURPLUS_BYTES = 1 << 12
@@ -132,7 +132,7 @@ firmware may append a few words; more bytes mean a wrong length."""
 
 
 class Codec:
-    """One message of one dialect, compiled.
+    """Encodes and decodes one message type of one dialect.
 
     Attributes:
         type: class of the message.
@@ -170,7 +170,7 @@ class Codec:
         self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
         self._meaning = dialect.code
         self._messages: dict[bytes, Message] = {}  # received bodies; messages are immutable
-        # they set the slots of a frozen message, in half the time of its constructor
+        # setting the slots of a frozen message takes half the time of its constructor
         self._setters = [_slot_setter(row.type, name) for name in self.names]
         self._defaults = [
             (_slot_setter(row.type, slot.name), slot.default)
@@ -194,7 +194,7 @@ class Codec:
         return size >= self.size if self.has_data else size == self.size
 
     def _refuses(self, payload: bytes) -> bool:
-        """Return True if a body that is too short is a result code of a refusal."""
+        """Return True if a body that is too short for the message is just a refusal's code."""
         code = self._code
         if code is None or len(payload) != code.size:
             return False
@@ -242,14 +242,14 @@ class Codec:
     def spell(self, body: bytes) -> dict[str, Any]:
         """Return the fields of a body with data as JSON values; the body must be long enough.
 
-        No message is made, since there are many results.
+        To be fast, no message object is made.
         """
         fields: dict[str, Any] = dict(zip(self.names, self._body.unpack_from(body), strict=False))
         fields[self.names[-1]] = body[self.size :].hex()
         return fields
 
     def make_copier(self, message: Message) -> Callable[[bytes], Message]:
-        """Return a function that makes copies of a message with other data."""
+        """Return a function that gets data and returns a copy of a message with this data."""
         new, kind, data_name = object.__new__, self.type, self._data or ""
         names = [slot.name for slot in dataclasses.fields(kind) if slot.name != data_name]
         shared = [(_slot_setter(kind, name), getattr(message, name)) for name in names]
@@ -298,7 +298,7 @@ class WireQuirk(NamedTuple):
 
     Attributes:
         about: one line for people.
-        source: document that describes the dialect, with its grade.
+        source: document that describes the deviation, with its grade.
         rows: rows of the messages that differ.
         codes: meanings of the result codes, if they differ.
     """
@@ -403,7 +403,7 @@ class FramedDialect(Dialect):
         return {}
 
     def with_quirks(self, names: Iterable[str]) -> FramedDialect:
-        """Return the dialect with these deviations; the same object for the same names.
+        """Return the dialect with these deviations; the same names always give the same object.
 
         Raises:
             ConfigurationError: the dialect knows no such deviation.
@@ -432,7 +432,7 @@ class FramedDialect(Dialect):
         return variant
 
     def with_parameters(self, parameters: Mapping[str, str]) -> FramedDialect:
-        """Return the dialect with the URL's ``shows_triggers``; always the same object.
+        """Return the dialect with the URL's ``shows_triggers``; equal calls give the same object.
 
         Raises:
             ConfigurationError: the value is neither ``yes`` nor ``no``.
@@ -497,7 +497,7 @@ class FramedDialect(Dialect):
         return self.encoder(message if isinstance(message, type) else type(message)).message_id
 
     def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status as this dialect reads it; ``reader`` is the dialect that has read it."""
+        """Return a status, read by the dialect ``reader``, as this dialect reads the same bits."""
         if not isinstance(reader, FramedDialect):
             return report
         word = reader.status_bits.write(report.status)
@@ -514,7 +514,7 @@ class FramedDialect(Dialect):
         if codec is not None and codec.has_data and len(frame.payload) >= codec.size:
             fields = codec.spell(frame.payload)
         else:
-            with contextlib.suppress(RemoteProtocolError):  # the frame's error follows in the trace
+            with contextlib.suppress(RemoteProtocolError):  # the trace shows the error next
                 message = self.decode(sender, frame)
                 names = self.fields(type(message))
                 fields = {name: jsonable(getattr(message, name)) for name in names}
@@ -522,7 +522,7 @@ class FramedDialect(Dialect):
         return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return a request by its id, for users who know messages that the dialect has not.
+        """Return a request by its id, for users who know a message that the dialect lacks.
 
         Raises:
             LocalProtocolError: Connect and Disconnect.
@@ -542,7 +542,7 @@ class FramedDialect(Dialect):
         )
 
     def _named_message(self, frame: Frame) -> Message:
-        """Return a frame's message, unnamed if a named one would have other bytes."""
+        """Return a frame's message; UnknownMessage if a known one would be sent as other bytes."""
         with contextlib.suppress(RemoteProtocolError):
             message = self.decode(Sender.CLIENT, frame)
             if self.to_frame(message) == frame:
@@ -627,7 +627,7 @@ class FramedDialect(Dialect):
         return self.encode_frame(self.to_frame(message)) if constant is None else constant[0]
 
     def surplus(self, sender: Sender, frame: Frame) -> int:
-        """Return the number of bytes that a known message's body is longer than documented."""
+        """Return by how many bytes a known message's body is longer than documented."""
         codec = self.decoders(sender).get(frame.message_id)
         if codec is None or codec.has_data:
             return 0

@@ -1,8 +1,8 @@
-"""Bound the time that a frame may take to be received.
+"""Limit the time from a frame's first byte to its last.
 
-A frame with a wrong length includes the bytes of the next messages, so that none is received. If a
-peer stops sending, the liveness check detects it, so it is enough to check the age when bytes
-arrive.
+A frame with a wrong length swallows the bytes of the next messages, so that no message is received
+any more. The age is checked only when bytes arrive: a peer that stops sending is detected by the
+liveness check.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ wrong. Before, a frame may contain any bytes."""
 class UnfinishedFrame:
     """The age of the frame that is being received.
 
-    The longest pause is not counted, since it may be this side that did not read.
+    The longest pause between two arrivals is not counted: perhaps this side did not read.
 
     Attributes:
         searched: number of the frame's bytes that were searched for another header.

@@ -1,12 +1,12 @@
 """Cut received bytes into frames, by the length field only.
 
 A frame is a header (a magic number in some dialects, a length, a message id) and a payload. The
-form of the header is data: :class:`HeaderLayout`. A length above the limit, or above the limit of
-its message, is refused as soon as the header is received, so no more than one header and one
-payload of the permitted size is ever kept.
+form of the header is data: :class:`HeaderLayout`. A length above the general limit, or above
+the limit of its message, is refused as soon as the header is received, so no more than one header
+and one payload of the permitted size is ever kept.
 
-A chunk is not copied: frames are found in it by offset. A large unfinished frame has its own
-buffer, into which the transport may write.
+A received chunk is not copied: frames are found in the chunk by offset. A large unfinished frame
+has its own buffer, into which the transport may write.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ script manual, p. 35); 1 MiB leaves room for its successors and refuses a length
 
 
 MIN_OWN_BUFFER_BYTES = 1 << 12
-"""Least number of bytes of an unfinished frame that gets its own buffer. A smaller one is copied
-before the next chunk, which costs less."""
+"""Least number of bytes of a frame that gets its own buffer while it is unfinished. The bytes of a
+smaller frame are copied in front of the next chunk, which costs less."""
 
 Buffer: TypeAlias = bytes | memoryview
 Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
@@ -38,12 +38,12 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 
 
 FIRST_READ_BYTES = 1 << 12
-"""Largest number of bytes of the first reads. It doubles after each read that filled the buffer."""
+"""Bytes of the first buffer for reads. The buffer doubles after each read that filled it."""
 
 MAX_READ_BYTES = 1 << 15
 """Largest number of bytes of a read, except while a large frame is received. This many bytes of
-results fit into a subscriber's queue if each has 16 bytes or more, so a subscriber that keeps up
-loses nothing."""
+results fit into a subscriber's queue if each result has at least 16 bytes, so a subscriber that
+keeps up loses nothing."""
 
 
 MIN_READ_BYTES = 1 << 10
@@ -150,7 +150,7 @@ class Framer:
         # a received chunk, or one large frame; cut() returns offsets in it
         self.buffer: Buffer = b""
         self.start: int = 0  # offset of the next frame
-        self._large: memoryview | None = None  # whole size of an unfinished large frame
+        self._large: memoryview | None = None  # buffer for the whole of an unfinished large frame
         self._filled = 0
         # buffer into which a transport writes; a large frame stays there
         self._store = memoryview(b"")
@@ -230,7 +230,7 @@ class Framer:
         return True
 
     def halve_reads(self) -> None:
-        """Halve the size of reads, since the last one had too many frames for one turn.
+        """Halve the size of reads: the last read had too many frames for one turn of the loop.
 
         The size grows again when a read does not fill the buffer.
         """
@@ -238,7 +238,7 @@ class Framer:
         self._read_buffer = self._store[: self._max_read]
 
     def cut(self) -> tuple[int, int, int] | None:
-        """Return the next whole frame's id and its payload's begin and end; None without one.
+        """Return id, and offsets of the payload's begin and end, of the next whole frame, or None.
 
         :meth:`take` returns the bytes between these offsets, before the next :meth:`feed`. Raises
         FrameError: wrong magic, or a length that is impossible or above the limit; no bytes are
@@ -277,11 +277,11 @@ class Framer:
         return bytes(self.buffer[begin:end])
 
     def following(self, read: Read, model_start: int, size: int) -> list[bytes]:
-        """Return the ends of the payloads of the next whole frames, as long as they are alike.
+        """Cut the next whole frames that are like the frame that begins at ``model_start``.
 
-        They must have the same id and the same first ``size`` bytes of payload as the frame that
-        begins at ``model_start``; the bytes after these are returned. The first frame that differs,
-        or is wrong, ends the list. ``read``: reader of a header and ``size`` more bytes.
+        They must have the same id and the same first ``size`` bytes of payload; the remaining bytes
+        of each payload are returned. The first frame that differs, or is wrong, ends the list.
+        ``read``: function that reads a header and ``size`` more bytes.
         """
         header, buffer, start = self._header, self.buffer, self.start
         payloads: list[bytes] = []
@@ -371,7 +371,7 @@ class Framer:
         magic = self._header.magic
         if self._large is not None:
             self.buffer, self.start, self._large = self.pending, 0, None
-        self._copy_view(self.start)  # else each search would copy the view
+        self._copy_view(self.start)  # otherwise each search would copy the view
         begin = self.start
         begin_of_next = bytes(self.buffer).find(magic, begin + 1) if magic else -1
         if begin_of_next < 0:

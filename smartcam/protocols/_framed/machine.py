@@ -1,4 +1,4 @@
-"""The state machine of one link, in either role.
+"""The state machine of one link with binary frames, in either role.
 
 It turns bytes into events; it imports no socket, loop or clock. Two rules hold: a transition
 outside :data:`TRANSITIONS` is illegal, and ``receive_*`` never raises for bad input. The role's
@@ -99,7 +99,7 @@ _SESSION_REPORTS = (
 )
 
 
-# Messages that the camera may send unasked; whether it answers a Disconnect does not matter.
+# Messages that are accepted without a pending request; some cameras do not answer Disconnect.
 _BY_ITSELF = frozenset((m.StatusReport, m.ResultContainer, m.DisconnectAnswer))
 
 
@@ -107,7 +107,7 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
     client, camera = m.Sender.CLIENT, m.Sender.CAMERA
     idle, connecting, connected = State.IDLE, State.CONNECTING, State.CONNECTED
     table: dict[tuple[State, m.Sender, type[Message]], State] = {
-        # harmless without a session; it also ends a session of a client that has crashed
+        # harmless without a session; it ends the session of a client that has crashed
         (idle, client, m.Disconnect): idle,
         (idle, client, m.Connect): connecting,
         (connecting, client, m.Disconnect): State.DISCONNECTED,
@@ -186,7 +186,7 @@ class _Delivery(NamedTuple):
 
 
 class _SentTogether(NamedTuple):
-    """Messages that were sent together.
+    """Messages that the client sent together, to be sent again faster.
 
     Attributes:
         messages: the messages; they are recognized by this tuple object.
@@ -219,7 +219,7 @@ class Machine:
         policy: policy in place of the role's own; the emulator's quirks use it.
         trace: function that is called with the sender and each whole frame, in both directions, and
             with the error for bytes that make no frame.
-        kin: dialects that begin a session alike, of which the camera speaks one; ``dialect`` is the
+        kin: dialects whose sessions begin alike, of which the camera speaks one; ``dialect`` is the
             first. The answer to Connect removes the dialects that it does not fit; if several
             remain, :meth:`adopt` decides.
 
@@ -393,10 +393,10 @@ class Machine:
             self._receive_frames()
 
     def _receive_chunk(self, data: bytes) -> None:
-        """Read a short chunk while no frame is unfinished; store it if it can be recognized.
+        """Read a short chunk while no frame is unfinished; store a chunk that can be recognized.
 
-        It can if it has only whole frames that leave the state unchanged, and if its messages,
-        encoded again, are exactly its bytes.
+        A chunk can be recognized if it has only whole frames that leave the state unchanged, and
+        if its messages, encoded again, give exactly its bytes.
         """
         state, before = self._state, len(self._events)
         self._receive(data)
@@ -505,10 +505,11 @@ class Machine:
     def send_all(self, messages: Sequence[Message]) -> None:
         """Send messages together, as :func:`~smartcam.protocols._machine.send_each` does.
 
-        The same tuple, sent again with the same pending answers, gives the same frames.
+        If the same tuple is sent again while the same answers are pending, the stored frames are
+        sent.
 
         Raises:
-            LocalProtocolError: the state forbids a message; those before it are sent.
+            LocalProtocolError: the state forbids a message; the messages before it are sent.
         """
         sent_before = self._sent_together
         if sent_before is not None:
@@ -538,7 +539,7 @@ class Machine:
     # ------------------------------------------------------------------ inside
 
     def _make_frame(self, message: Message) -> _MadeFrame:
-        """Return the frame of a message with a body; a camera's machine keeps it for that object.
+        """Return a message's frame; a camera's machine keeps it for the next use of that object.
 
         Of messages with data, such as results, only the last frame is kept.
         """
@@ -643,8 +644,8 @@ class Machine:
     def _receive_known_delivery(self) -> bool:
         """Read a delivery that equals a stored one in all bytes except its result's data.
 
-        Its messages are those of the stored one, with other data in the result. Return False if
-        there is no such delivery.
+        Its messages are the stored delivery's, with other data in the result. Return False if no
+        such delivery is stored.
         """
         framer, events = self._framer, self._events
         buffer = framer.buffer
@@ -669,8 +670,8 @@ class Machine:
     def _find_result(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
         """Return the next message and its end if it is a result like an earlier one.
 
-        It must have the same application and size, and be before a known status or at the end of
-        the bytes: before another message it may begin a burst.
+        It must have the same application and size, and a known status or the end of the bytes must
+        follow it: if another message follows, the result may begin a burst.
         """
         data = start + self._result_head
         known = self._known_results.get(buffer[start:data])
@@ -712,7 +713,7 @@ class Machine:
         return None
 
     def _reject_overdue(self, now: float) -> bool:
-        """Reject the unfinished frame if it will never be complete; return whether it was."""
+        """Reject the unfinished frame if it will never be complete; return True if rejected."""
         framer, unfinished = self._framer, self._unfinished_age
         age = unfinished.age(self._unfinished_number, self._unfinished_since, now)
         if age < frame_age.HINT_TIME:

@@ -1,1 +1,1 @@
-"""In-Sight's native mode: commands and answers are lines of text."""
+"""Native mode of Cognex In-Sight cameras: commands and answers are lines of text."""

@@ -1,4 +1,4 @@
-"""Answers of In-Sight native mode: a status code, and data in a form that the command sets."""
+"""Read answers of In-Sight native mode: a status code, and data whose form the command sets."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
 
 MAX_IMAGE_BYTES = 1 << 26
-"""Largest number of bytes of an image that is accepted: 20 million pixels of three bytes, and some
-more."""
+"""Largest number of bytes of an image that is accepted: a little more than 20 million pixels of
+three bytes."""
 
 _BMP_MAGIC = b"BM"
 _BMP_SIZE_AT = slice(2, 6)  # place of the file's size, UINT32 little endian
@@ -48,10 +48,10 @@ class CommandAnswer(NamedTuple):
 class AnswerReader(LineReader):
     """Cuts answers from a stream; the form of each depends on its command.
 
-    The machine that feeds it reads until nothing is left, so at most one line is kept.
+    The machine that feeds the reader reads until nothing is left, so at most one line is kept.
 
     Args:
-        max_length: longest text of an answer that gives its length, bytes.
+        max_length: longest text accepted in an answer that states the text's length, bytes.
         on_pieces: function that is called with received pieces, and whether a line end followed
             each.
     """
@@ -84,14 +84,14 @@ class AnswerReader(LineReader):
         return None
 
     def next_line(self) -> str | None:
-        """Return the next line as :meth:`LineReader.next_line`, and report it."""
+        """Return the next line as :meth:`LineReader.next_line`, and pass it to ``on_pieces``."""
         line = super().next_line()
         if line is not None:
             self._on_pieces((line.encode(ENCODING),), True)
         return line
 
     def take_prompt(self, prompt: bytes) -> bool:
-        """Remove a prompt as :meth:`LineReader.take_prompt`, and report it."""
+        """Remove a prompt as :meth:`LineReader.take_prompt`, and pass it to ``on_pieces``."""
         taken = super().take_prompt(prompt)
         if taken:
             self._on_pieces((prompt,), False)
@@ -103,7 +103,7 @@ class AnswerReader(LineReader):
         first_line = yield from self._read_line()
         if form is AnswerForm.BARE:
             return CommandAnswer(StatusCode.DONE, first_line)
-        code = _number(first_line, "a status code")
+        code = _parse_number(first_line, "a status code")
         if code != StatusCode.DONE or form is AnswerForm.CODE:
             return CommandAnswer(code)
         if form is AnswerForm.HEX:
@@ -122,7 +122,7 @@ class AnswerReader(LineReader):
         return line
 
     def _read_sized(self) -> Generator[None, None, str]:
-        size = _number((yield from self._read_line()), "a length")
+        size = _parse_number((yield from self._read_line()), "a length")
         if not 0 <= size <= self._max_length:
             raise FrameError(f"a text of {size} bytes comes; 0 to {self._max_length} are accepted")
         while (data := self.take(size)) is None:
@@ -133,8 +133,8 @@ class AnswerReader(LineReader):
         return data.decode(ENCODING)
 
     def _read_image(self) -> Generator[None, None, bytes]:
-        """Read a bitmap. Its header has its size; the number before it may count digits instead."""
-        _number((yield from self._read_line()), "an image's size")
+        """Read a bitmap. Its own header gives its size: the size line may count digits instead."""
+        _parse_number((yield from self._read_line()), "an image's size")
         data = bytearray()
         size, crc, is_regular = 0, "", True
         while not size or len(data) < size:
@@ -167,7 +167,7 @@ class AnswerReader(LineReader):
         """Remove all whole lines of an image, up to ``max_digits`` digits, and return their bytes.
 
         An image has thousands of lines, so they are read together. If a line is broken, remove
-        nothing and return None: then the caller reads the lines one by one, and finds it.
+        nothing and return None: then the caller reads line by line, and finds the broken line.
         """
         end = self._buffer.rfind(LINE_END)
         if end < 0:
@@ -202,7 +202,7 @@ def _bitmap_size(data: bytearray) -> int:
     return size
 
 
-def _number(line: str, expected: str) -> int:
+def _parse_number(line: str, expected: str) -> int:
     text = line.strip()
     if not text.removeprefix("-").isdecimal() or not text.isascii() or len(text) > 12:
         raise unexpected_line_error(line, expected)

@@ -1,8 +1,8 @@
-"""The native mode of Cognex In-Sight cameras: text over telnet.
+"""Define the dialect for the native mode of Cognex In-Sight cameras: text over telnet.
 
-The library's messages (:mod:`smartcam.protocols.messages`) become command lines, each answered
-before the next is sent; the answers become the library's messages. So the client knows nothing of
-commands. The facts about the camera, with their sources, stand in ``docs/insight.md``.
+The library's messages (:mod:`smartcam.protocols.messages`) become command lines, of which each is
+answered before the next is sent; the answers become the library's messages. So the client knows
+nothing of commands. The facts about the camera, with their sources, stand in ``docs/insight.md``.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _VERDICTS: Mapping[int, Verdict] = {
     StatusCode.DONE: Verdict.DONE,
     StatusCode.UNRECOGNIZED: Verdict.UNKNOWN,
 }
-"""Verdicts by status code; all other codes refuse."""
+"""Verdicts by status code; any other code is a refusal."""
 
 _LOGIN = CodeMeaning("the user or the password is wrong", Verdict.REFUSED)
 
@@ -164,7 +164,7 @@ class InSightDialect(Dialect):
         return message_type in _REQUESTS or message_type in _REPORTS
 
     def message_id(self, message: m.Message | type[m.Message]) -> int:
-        """Return 0: commands have no numbers; UnsupportedError: it has no such message."""
+        """Return 0, since commands have no ids; raise UnsupportedError without such a message."""
         kind = message if isinstance(message, type) else type(message)
         if not self.has(kind):
             raise self.unsupported(kind)
@@ -187,7 +187,7 @@ class InSightDialect(Dialect):
         return Spelled(None, kind, {"text": text}, frame.payload + LINE_END)
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return a command of the user, such as ``GVA001``; the payload follows it.
+        """Return a command that the user writes, such as ``GVA001``; the payload is added to it.
 
         Raises:
             UnsupportedError: the form of its answer is not known.

@@ -1,8 +1,8 @@
-"""One connection to an In-Sight camera, as a link sees it: the client's side of native mode.
+"""The state machine of one connection to an In-Sight camera: the client's side of native mode.
 
-Answers do not name their command, so a command is sent when the command before it is answered. A
-request of the library is a script, a generator of :class:`InSightMachine`: it sends its commands
-one after the other, and makes messages of their answers.
+Answers do not name their command, so a command is sent when the command before it is answered. Each
+request of the library has a script, a generator method of :class:`InSightMachine`. The script
+yields its commands one after the other, and makes messages of the answers.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class InSightMachine:
         self._login: Iterator[None] = iter(())
         self._queued_requests: collections.deque[_PendingRequest] = (
             collections.deque()
-        )  # at most one of a kind
+        )  # at most one of each kind
         self._running_request: _PendingRequest | None = None
         self._scripts: dict[type[m.Message], Callable[[Any], Script]] = {
             m.GetStatus: self._get_status,
@@ -309,7 +309,7 @@ class InSightMachine:
             raise LocalProtocolError(f"Connect cannot be sent in state {self.state.value}")
         self.state = State.CONNECTING
         self._login = self._log_in()
-        self._read()  # the greeting may be there
+        self._read()  # the greeting may have come already
 
     def _log_in(self) -> Iterator[None]:
         """Answer each prompt once, and read whether the camera accepts the login.
@@ -359,7 +359,7 @@ class InSightMachine:
         self._write(line)
 
     def _report(self, message: m.Message) -> None:
-        self._events.append(message)  # after a yield, the list may be another object
+        self._events.append(message)  # the attribute: after a yield, it may be another list
 
     def _get_status(self, _message: m.Message | None = None) -> Script:
         answer_text = (yield "GO").text.strip()
@@ -370,7 +370,7 @@ class InSightMachine:
     def _read_job_id(self) -> Generator[str, CommandAnswer, int]:
         """Return the active job's id.
 
-        A job without a number in its name has no id, nor does a job without a name.
+        For a job without a name, or without a number in its name, return UNNAMED_APPLICATION.
         """
         code, text, _ = yield "GJ"
         if code != StatusCode.DONE:
@@ -402,9 +402,10 @@ class InSightMachine:
         self._report(m.StopAnswer(code=(yield "SO0").code))
 
     def _trigger(self, _message: m.Message) -> Script:
-        """Trigger, and read the cells when they are up to date.
+        """Trigger, wait until the cells are up to date, and read them.
 
-        If the camera accepted no trigger, its status is reported first, which may have the reason.
+        If the camera did not accept the trigger, its status, which may show the reason, is
+        reported before the answer.
         """
         code = (yield f"SW{TRIGGER_EVENT}").code
         if code == StatusCode.FAILED:

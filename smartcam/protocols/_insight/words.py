@@ -69,7 +69,7 @@ ERROR_VALUE = "#ERR"
 """The text of a cell whose function failed (manual, published)."""
 
 HEX_WIDTH = 80
-"""Hexadecimal digits a line of image data (manual, published)."""
+"""Number of hexadecimal digits in a line of image data (manual, published)."""
 
 
 class StatusCode(enum.IntEnum):
@@ -89,7 +89,7 @@ class StatusCode(enum.IntEnum):
 
 
 class AnswerForm(enum.Enum):
-    """The parts of an answer. A code other than 1 always stands alone."""
+    """The parts of an answer. Nothing follows a code other than 1."""
 
     CODE = "code"
     """The code, nothing else."""
@@ -136,7 +136,7 @@ class CommandRow(NamedTuple):
 
 
 INFO_LINES = 5
-"""Lines of ``GI`` (clients, derived)."""
+"""Number of lines in the answer to ``GI`` (clients, derived)."""
 
 _NO_ACCESS = {-6: "the user has no full access"}
 _EVENT = {
@@ -284,7 +284,7 @@ _GENERAL_TEXTS = {
     -5: "accepted, but an operator or an input holds the camera offline",
     **_NO_ACCESS,
 }
-"""Meanings of the codes without a command."""
+"""Meanings of the codes in the answer to a command that this library does not know."""
 
 
 def code_text(command: str, code: int) -> str:
@@ -397,7 +397,8 @@ def job_id(file: str) -> int | None:
 def checksum(digits: bytes, before: str = "") -> str:
     """Return the checksum of hexadecimal data: CRC-16 with polynomial 0x1021, first value 0.
 
-    The characters of the digits count, in upper case, without line ends (manual, published).
+    It is calculated over the digits as upper-case characters, without line ends (manual,
+    published).
     ``before``: checksum of the preceding digits.
     """
     return f"{binascii.crc_hqx(digits, int(before or '0', 16)):04X}"
