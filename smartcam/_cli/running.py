@@ -58,7 +58,7 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 
 0: done. 1: a fault of smartcam. 2: wrong usage. 3: no session or a broken session, or a source of
 frames that is missing, in use or lost. 4: a time-out in a session, or while waiting for a frame.
-5: the camera refused, is not running, or has no such pixels or feature. 6: a result cannot be
+5: the camera refused, is not running, or lacks the pixel format or feature. 6: a result cannot be
 interpreted. 7: ``calibrate --check`` found a stale calibration, or ``calibrate compare`` found
 different ones. 130 and 143: ended by Ctrl-C or SIGTERM.
 """
@@ -87,7 +87,7 @@ def run(
 ) -> NoReturn:
     """Run a command's coroutine until it ends, then exit the process.
 
-    Ctrl-C and SIGTERM cancel the coroutine, so every ``async with`` in it is left in order (a
+    Ctrl-C and SIGTERM cancel the coroutine, so every ``async with`` in it still cleans up (a
     camera gets its Disconnect).
 
     Args:
@@ -152,13 +152,13 @@ def _one_line(error: Exception) -> str:
         return f"unexpected {error!r}; --debug shows where"
     lines = str(error).splitlines()
     if isinstance(error, LayoutError):
-        del lines[1:]  # the layout with a mark; the first line has the position
+        del lines[1:]  # these show the layout with a mark; the first line names the position
     text = " ".join(line.strip() for line in lines)
     cause = error.__cause__
     is_hang_up = (
         isinstance(error, ConnectionLostError)
         and isinstance(cause, ConnectionError)
-        and not isinstance(cause, LinkError)  # such as a lost agent
+        and not isinstance(cause, LinkError)  # such as the loss of a fleet's agent
     )
     return f"{text}. {TAKEN_ADVICE}" if is_hang_up else text
 

@@ -23,9 +23,9 @@ LENGTH_DECIMALS = 9
 
 @click.group(cls=ListedGroup)
 def sheet() -> None:
-    """Make a sheet to print: a target to scale, rays A and B from its origin, rulers.
+    """Make a sheet to print: a target in true size, rays A and B from its origin, rulers.
 
-    Lengths are in millimetres. Print at 100 %, then measure both rulers: printers scale.
+    Lengths are in millimetres. Print at 100 %, then measure both rulers: printers change sizes.
     """
 
 
@@ -45,7 +45,7 @@ def _count_option(name: str, about: str, least: int = 3) -> Callable[[F], F]:
 def _sheet_command(
     function: Callable[..., Coroutine[Any, Any, None]],
 ) -> Callable[..., None]:
-    """Make a coroutine function the function of a command, with the options of all sheets."""
+    """Decorate a coroutine function: it becomes a command with the options of all sheets."""
     command = async_command(*OUTPUT_OPTIONS)(function)
     for option in (
         click.option(
@@ -114,11 +114,11 @@ async def checkerboard(**arguments: Any) -> None:
     help="OpenCV's name of the markers' dictionary.",
 )
 @click.option(
-    "--legacy-pattern", is_flag=True, help="As in OpenCV before 4.6: differs with even rows."
+    "--legacy-pattern", is_flag=True, help="As in OpenCV before 4.6: differs if --rows is even."
 )
 @_sheet_command
 async def charuco(square: float, marker: float | None, **arguments: Any) -> None:
-    """A checkerboard with a marker in each white square: some of it may be hidden."""
+    """A checkerboard with a marker in each white square: a part may be hidden from the camera."""
     side = round(0.75 * square, LENGTH_DECIMALS) if marker is None else marker
     await _write_sheet("charuco", square=square, marker=side, **arguments)
 
@@ -143,7 +143,7 @@ async def charuco(square: float, marker: float | None, **arguments: Any) -> None
 )
 @_sheet_command
 async def marker_grid(dictionary: str, kalibr: bool, **arguments: Any) -> None:
-    """Markers in rows and columns: some of them may be hidden."""
+    """Markers in rows and columns: some of them may be hidden from the camera."""
     if kalibr:
         arguments |= {"dictionary": "DICT_APRILTAG_36h11", "border": 2, "kalibr": True}
     else:

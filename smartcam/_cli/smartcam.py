@@ -157,7 +157,7 @@ TOPICS: Mapping[str, Mapping[str, ListedCommand]] = {
         ),
         "sheet": ListedCommand(
             "sheet",
-            "Make a sheet to print: a target to scale, rays A and B from its origin, rulers.",
+            "Make a sheet to print: a target in true size, rays A and B from its origin, rulers.",
             extra="calibration",
         ),
     },

@@ -52,7 +52,7 @@ _MAX_NESTING = 32
 
 
 class RawBytes:
-    """Bytes that become base64 when they are sent, so that a dropped picture costs nothing."""
+    """Bytes that become base64 only when they are sent: a dropped picture is never encoded."""
 
     __slots__ = ("data",)
 
@@ -118,7 +118,7 @@ def _to_json_value(message_type: MessageType, field: MessageField, value: Any) -
 
 
 def _signed(value: int) -> int:
-    """Return a byte for ROS 1, whose ``byte`` is an int8."""
+    """Return a byte as ROS 1 writes it: its type ``byte`` is an int8."""
     return value - 256 if value > 127 else int(value)
 
 

@@ -15,13 +15,13 @@ INTEGERS: Final = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
     "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "byte": "B",
 }  # fmt: skip
-"""The codes of ``struct`` and numpy by the type."""
+"""Codes that ``struct`` and numpy have for a type, by the name of the type."""
 
 NUMBERS: Final = {**INTEGERS, "float32": "f", "float64": "d", "bool": "?"}
 BASIC_TYPES: Final = frozenset({*NUMBERS, "string"})
 TYPE_ALIASES: Final = {"char": "uint8", "octet": "byte"}
 
-_PART = r"[a-z][a-z0-9]*(?:_[a-z0-9]+)*"  # one way to match only: no name takes long
+_PART = r"[a-z][a-z0-9]*(?:_[a-z0-9]+)*"  # matches in one way only, so no text is slow to match
 TYPE_NAME: Final = re.compile(rf"({_PART})/(msg|srv)/([A-Z][A-Za-z0-9]*)")
 _FIELD: Final = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=(?P<limit>\d+))?"
@@ -38,7 +38,7 @@ class MessageField(NamedTuple):
         type: a basic type, or a message's full name.
         limit: largest number of bytes of a string; 0 for any.
         size: number of elements of an array, largest number for a sequence; 0 for any.
-        default: value of the field in a new message; None is zero.
+        default: value of the field in a new message; with None it is zero, false or empty.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Definition:
     """A message's fields and constants.
 
     Attributes:
-        kinds: types of the constants by name.
+        constant_types: type of each constant, by the constant's name.
     """
 
     name: str
@@ -115,10 +115,10 @@ def _default_text(value: Any) -> str:
 
 
 def split_name(name: str, category: str = "") -> tuple[str, str, str]:
-    """Return package, kind and name of a type.
+    """Return package, category (msg or srv) and short name of a type.
 
     Raises:
-        ConfigurationError: the text is no name of a type, or not of this kind.
+        ConfigurationError: the text is no name of a type, or the type has another category.
     """
     matched = TYPE_NAME.fullmatch(name) if isinstance(name, str) else None
     if matched is None or category not in ("", matched[2]):
@@ -130,7 +130,7 @@ def split_name(name: str, category: str = "") -> tuple[str, str, str]:
 
 
 def dds_name(name: str) -> str:
-    """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
+    """Return a type's name as zenoh keys contain it, such as ``std_msgs::msg::dds_::String_``."""
     package, category, short_name = name.split("/")
     return f"{package}::{category}::dds_::{short_name}_"
 
@@ -188,18 +188,18 @@ def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
     type_name = _full_name(package, matched["type"])
     limit = int(matched["limit"] or 0)
     if limit and type_name != "string":
-        raise ValueError("only a string is bounded by <=")
-    size, bound = matched["size"], matched["bound"]
-    if bound and not size:
+        raise ValueError("only the type string may be followed by <=")
+    size, is_bounded = matched["size"], matched["bound"] is not None
+    if is_bounded and not size:
         raise ValueError("expected a number after <=")
-    shape = "" if size is None else "array" if size and not bound else "sequence"
+    shape = "" if size is None else "array" if size and not is_bounded else "sequence"
     field = MessageField(matched["name"], type_name, shape, int(size or 0), limit)
     if shape == "array" and not field.size:
         raise ValueError("an array of 0 elements")
     value = matched["constant"] if matched["constant"] is not None else matched["default"]
     is_constant = matched["constant"] is not None
     if is_constant and (shape or type_name not in BASIC_TYPES):
-        raise ValueError("a constant is of one basic value")
+        raise ValueError("a constant has one value of a basic type")
     return field._replace(default=_parse_value(field, value, is_constant=is_constant)), is_constant
 
 

@@ -1,4 +1,4 @@
-"""The common part of the link proxy's TCP and UDP halves: a port and its clients."""
+"""Base of the link proxy for TCP and UDP: a port and its clients."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Proxied(ABC):
 
     @abstractmethod
     def cut(self) -> None:
-        """End the traffic in order, on TCP with FIN."""
+        """End the traffic after the bytes that have passed, on TCP with FIN."""
 
     @abstractmethod
     def reset(self) -> None:

@@ -100,7 +100,7 @@ class Rule:
         return self.direction == direction and self.connection in {None, connection}
 
     def ahead(self, by: int) -> Self:
-        """Return the rule, acting ``by`` bytes, or datagrams, later."""
+        """Return a copy of the rule that acts ``by`` bytes, or datagrams, later."""
         return self
 
 
@@ -133,7 +133,7 @@ class PlacedRule(StreamRule):
     at: int = 0
 
     def ahead(self, by: int) -> Self:
-        """Return the rule, acting ``by`` bytes later."""
+        """Return a copy of the rule that acts ``by`` bytes later."""
         return replace(self, at=self.at + by)
 
 
@@ -153,7 +153,7 @@ class RangeRule(PlacedRule):
         return None if self.count is None else self.at + self.count
 
     def change(self, data: bytes) -> bytes:
-        """Return the bytes of the range as they pass."""
+        """Return what the proxy sends in place of these bytes of the range."""
         return data
 
 
@@ -212,7 +212,7 @@ class CoalesceBytes(PointRule, name="coalesce"):
 
 @dataclass(frozen=True, kw_only=True)
 class InsertBytes(PointRule, name="insert"):
-    """Insert bytes of the proxy's own."""
+    """Insert bytes that neither side sent."""
 
     data: bytes
 
@@ -233,7 +233,7 @@ class Flip(RangeRule):
 
 
 class DropBytes(RangeRule, name="drop"):
-    """Leave a range out."""
+    """Drop the bytes of a range."""
 
     def change(self, data: bytes) -> bytes:
         """Return nothing."""

@@ -47,7 +47,7 @@ HARD_END = struct.pack("ii", 1, 0)
 
 
 class ProxiedConnection(Proxied):
-    """A client's socket, a socket to the target, and a pipe each way."""
+    """A client's socket, a socket to the target, and a pipe in each direction."""
 
     def __init__(self, relay: StreamRelay, number: int, client: socket.socket) -> None:
         super().__init__(relay, number)
@@ -200,7 +200,7 @@ class _RawAcceptor(Acceptor[ProxiedConnection]):
         self._relay = relay
 
     def adopt(self, connection: socket.socket) -> None:
-        """Pair the connection with a socket to the target."""
+        """Open a socket to the target for an accepted connection."""
         self._relay.add_client(connection)
 
 
@@ -230,7 +230,7 @@ class StreamRelay(Relay[ProxiedConnection]):
             member.resume()
 
     def add_client(self, client: socket.socket) -> None:
-        """Pair a client's socket with one to the target."""
+        """Open a socket to the target for a client's socket."""
         self._last_number += 1
         try:
             address = client.getpeername()

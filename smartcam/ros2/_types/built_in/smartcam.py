@@ -1,4 +1,4 @@
-"""The package ``smartcam_msgs``; ``ros2/smartcam_msgs`` has files with the same texts."""
+"""Define the ROS types of the package ``smartcam_msgs``, as its files in ``ros2/`` do."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ string[] status_names      # names of the bits that are set, lowest first
 string error               # why the camera is not connected, or another error; empty: no error
 """,
     "smartcam_msgs/srv/RequestImage": """\
-# Takes one picture; the camera needs no stream of pictures.
+# Takes one picture. It works without a stream of pictures, too.
 
 float64 timeout                      # seconds of the timeout; 0: the default
 ---
@@ -132,7 +132,7 @@ Localization[] localizations
 # Begins a calibration. PerformCurrentAndGetNextStep then returns the first step.
 
 string topic_image1                # topic with the camera's pictures; empty: none
-string topic_image2                # topic with pictures, or SMARTCAMERA for this camera's own
+string topic_image2                # second topic with pictures, or SMARTCAMERA: this camera's
 float64 checkerboard_squaresize_m  # side of a square of the checkerboard, metres; 0: unknown
 string tf_frame_robot_tcp          # TF frame of the tool's tip; empty: poses are entered by hand
 string tf_frame_robot_base         # TF frame of the robot's base; empty: root of the tip's tree
@@ -158,10 +158,10 @@ float64[] default_needed_values
 string[] descriptions_for_needed_strings
 string[] default_needed_strings
 string[] descriptions_for_needed_options
-string[] default_needed_options  # DEFAULT OPTION1 OPTION2 ...
+string[] default_needed_options  # for each: its default, then all its options, with blanks between
 """,
     "smartcam_msgs/srv/ExportCalibration": """\
-# Copies a calibration into the folder exports of the calibrations.
+# Copies a calibration into the subfolder exports of the folder of calibrations.
 
 string calibration_name  # as given in the calibration
 string target_path       # name of the file, such as table.json or table.yaml

@@ -51,7 +51,7 @@ class LiveCamera:
 
     @property
     def url(self) -> str:
-        """The camera's URL, with all options pinned, as a client's ``url`` shows it."""
+        """The camera's URL with the value of every option, as a client's ``url`` shows it."""
         raise NotImplementedError
 
     @property
@@ -61,7 +61,7 @@ class LiveCamera:
 
     @property
     def has_session(self) -> bool:
-        """True while a client has the camera."""
+        """True while a client is connected to the camera."""
         self._skip_check("tell whether a client has the camera")
 
     @property
@@ -73,7 +73,7 @@ class LiveCamera:
         """Trigger by the digital input; do nothing on a camera without one."""
 
     def switch(self, application: int) -> None:
-        """Load and run another application, like an operator."""
+        """Load and run another application, as an operator can at the camera."""
         self._skip_check("switch as an operator does")
 
     async def restart(self) -> None:
@@ -101,12 +101,12 @@ class CameraKind:
         numbers_with_sequence: ``numbers`` with the number marked as the sequence number, if
             that can be set.
         raw_request: id of a request that has an answer, None if there is none.
-        foreign_request: an id of another kind than the protocol's.
+        foreign_request: an id of a type that the protocol's request ids do not have.
         silent_request: id of a request that the camera leaves without an answer, None if there is
             none; unused if there are result codes.
         datagrams: True for a camera over UDP: messages may be lost, and the client gets no end of
             a connection.
-        exclusive: True if a second client takes the camera from the first.
+        exclusive: True if a first client loses the camera as soon as a second one connects.
         has_zero: True if an application may have the id 0.
     """
 

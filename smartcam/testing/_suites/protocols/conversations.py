@@ -1,4 +1,4 @@
-"""Recorded conversations of client and camera, and a player that runs them with a machine."""
+"""Check a protocol's state machine against recorded conversations of client and camera."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     Trace = Callable[[Sender, Frame | RemoteProtocolError], None]
 
 MAX_LENGTH = 1 << 12
-"""Length of the longest payload, in bytes, that the machines of a suite accept."""
+"""Length of the longest payload, in bytes, that the state machines under test accept."""
 
 MachineOutput: TypeAlias = Message | type[RemoteProtocolError]
-"""An output of a machine: a message, or the kind of error that ends the link."""
+"""An output of a state machine: a message, or the kind of error that ends the link."""
 
 
 class Sent(NamedTuple):
@@ -45,7 +45,7 @@ class Received(NamedTuple):
         data: the bytes.
         events: the machine's events for them: messages, and at the end possibly the type of the
             error that ends the link.
-        wire: bytes that the machine writes in reply, without a call.
+        wire: bytes that the machine writes in reply by itself: nothing asks it to send them.
     """
 
     data: bytes
@@ -65,7 +65,7 @@ class Conversation:
         steps: bytes that client and camera send, in order.
         dialect: name of the dialect.
         transport: transport that carries the conversation.
-        quirks: pinned deviations from the dialect.
+        quirks: deviations from the dialect that the camera is known to have.
         parameters: further parameters that a URL would have.
     """
 
@@ -80,7 +80,7 @@ class Conversation:
         return self.name
 
     def group(self, protocol: Protocol) -> tuple[Dialect, ...]:
-        """Return the dialects that a client tries on the link: one, or several of its name.
+        """Return the dialects that a client may use on the link: one, or several of one name.
 
         Raises:
             ConfigurationError: the dialect has no such quirk, or cannot use a parameter.
@@ -90,7 +90,7 @@ class Conversation:
 
 
 def flatten_events(events: Iterable[Event]) -> list[Any]:
-    """Return events with containers in place of bursts, and error types in place of failures."""
+    """Return the events; a burst becomes its containers, a failure the type of its error."""
     flattened: list[Any] = []
     for event in events:
         if isinstance(event, ResultBurst):
@@ -101,7 +101,7 @@ def flatten_events(events: Iterable[Event]) -> list[Any]:
 
 
 class Player:
-    """Runs a machine through a conversation, and checks each step."""
+    """Runs a state machine through a conversation, and checks its output after each step."""
 
     def __init__(
         self, protocol: Protocol, conversation: Conversation, trace: Trace | None = None
@@ -131,7 +131,7 @@ class Player:
     def step(
         self, step: Step, chunks: Sequence[bytes] | None = None, *, use_buffer: bool = True
     ) -> None:
-        """Do one step; ``chunks`` are the step's received bytes, cut in another way.
+        """Do one step; ``chunks`` are the bytes received in this step, cut at other places.
 
         With ``use_buffer``, received bytes of a stream are written into the machine's own buffer.
 

@@ -23,7 +23,7 @@ class Parameters(ExplainedChecks):
     Attributes:
         protocol: the protocol of the entry point.
         conversations: bytes from the protocol's documents, at least one for each dialect.
-        camera_kinds: cameras that speak it.
+        camera_kinds: cameras that speak the protocol.
     """
 
     protocol: ClassVar[Protocol]
@@ -72,7 +72,7 @@ def _label(value: object) -> str | None:
 
 
 def dialects_of(protocol: Protocol) -> list[Dialect]:
-    """Return the dialects of a protocol, and those with quirks that a client tries."""
+    """Return the dialects of a protocol, and their variants with quirks that a client tries."""
     dialects: list[Dialect] = list(protocol.dialects.values())
     groups = [group for tries in protocol.detection.values() for group in tries]
     for dialect in (each for group in groups for each in group):

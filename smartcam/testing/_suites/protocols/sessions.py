@@ -1,4 +1,4 @@
-"""Checks of a session: opened, closed, lost, taken."""
+"""Check how a session is opened, closed, lost, and taken over by another client."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FAST_RECONNECT = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
 
 
 class SessionChecks(Parameters):
-    """A session: opened, closed, lost, taken."""
+    """How a session is opened, closed, lost, and taken over by another client."""
 
     @with_event_loop
     async def test_connect_pinned_knows_the_camera(self, camera_kind: CameraKind) -> None:
@@ -153,7 +153,7 @@ class SessionChecks(Parameters):
     async def test_newcomer_takes_the_camera_or_stands_beside(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the newcomer is served or refused, by the kind of camera."""
+        """Check that the second client is served; an exclusive camera drops the first client."""
         async with (
             open_session(camera_kind) as (live, first),
             make_client(camera_kind, live) as second,
@@ -173,7 +173,7 @@ class SessionChecks(Parameters):
     async def test_two_that_want_the_camera_do_not_fight_for_it(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that one client gives up, and the other keeps the camera."""
+        """Check that one client gives up and the other keeps the camera, if it is exclusive."""
         async with (
             open_session(camera_kind, reconnect=FAST_RECONNECT) as (live, first),
             make_client(camera_kind, live, reconnect=FAST_RECONNECT) as second,

@@ -10,7 +10,7 @@ from smartcam.testing._suites.protocols.triggers import TriggerChecks
 
 
 class WireSuite(DialectChecks, MachineChecks):
-    """The checks of every protocol's dialects and machine, without a camera.
+    """Checks of a protocol's dialects and state machine, without a camera.
 
     A subclass has ``protocol``, which must be installed, and ``conversations``: at least one for
     each dialect, with the bytes of the protocol's documents.

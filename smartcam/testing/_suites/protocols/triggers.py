@@ -98,7 +98,7 @@ class TriggerChecks(Parameters):
     async def test_trigger_that_timed_out_leaves_the_next_one_its_own_result(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the late result does not pass for the next trigger's."""
+        """Check that the late result is not taken for the next trigger's result."""
         async with open_session(camera_kind, application=SLOW) as (_, camera):
             inspections = 0
             for _ in range(3):
@@ -114,7 +114,7 @@ class TriggerChecks(Parameters):
     async def test_trigger_that_was_cancelled_leaves_the_next_one_its_own_result(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the late result does not pass for the next trigger's."""
+        """Check that the late result is not taken for the next trigger's result."""
         async with open_session(camera_kind, application=SLOW) as (live, camera):
             task = asyncio.create_task(camera.trigger())
             await wait_until(lambda: live.inspects)
@@ -145,7 +145,7 @@ class TriggerChecks(Parameters):
     async def test_trigger_while_somebody_elses_inspection_runs_waits_for_its_end(
         self, camera_kind: CameraKind
     ) -> None:
-        """Check that the other inspection's result is not ours."""
+        """Check that the result of another inspection is not taken for the trigger's."""
         async with open_session(camera_kind, application=SLOW) as (live, camera):
             if not camera.capabilities.unasked_results:
                 return
@@ -187,7 +187,7 @@ class TriggerChecks(Parameters):
 
     @with_event_loop
     async def test_switch_loads_the_application(self, camera_kind: CameraKind) -> None:
-        """Check that the camera and its results name the new application."""
+        """Check that the camera's status and its results name the new application."""
         async with open_session(camera_kind) as (_, camera):
             if not camera.capabilities.switch:
                 await check_unsupported(camera, camera.switch_application(OTHER))

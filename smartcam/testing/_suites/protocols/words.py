@@ -67,7 +67,7 @@ _EXAMPLE_VALUES: Mapping[str, Any] = {
 
 
 def make_example(kind: type[m.Message], dialect: Dialect) -> m.Message:
-    """Return a message of a kind, with values that fit any dialect."""
+    """Return a message of the given type, with values that fit any dialect."""
     values = {name: _EXAMPLE_VALUES.get(name, 1) for name, _ in m.wire_fields(kind)}
     if "application" in values:
         values["application"] = dialect.application_ids[0]
