@@ -153,7 +153,7 @@ class RangeRule(PlacedRule):
         return None if self.count is None else self.at + self.count
 
     def change(self, data: bytes) -> bytes:
-        """Return what the proxy sends in place of these bytes of the range."""
+        """Return the bytes that the proxy sends for these bytes of the range."""
         return data
 
 

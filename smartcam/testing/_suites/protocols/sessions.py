@@ -41,7 +41,7 @@ FAST_RECONNECT = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
 
 
 class SessionChecks(Parameters):
-    """How a session is opened, closed, lost, and taken over by another client."""
+    """Checks of a session: opening, closing, loss, and takeover by another client."""
 
     @with_event_loop
     async def test_connect_pinned_knows_the_camera(self, camera_kind: CameraKind) -> None:
