@@ -297,7 +297,7 @@ async def test_reboot_port_taken_meanwhile_is_tried_again(
         thief = socket.create_server((emulator.host, emulator.port), reuse_port=False)
         with caplog.at_level(logging.WARNING, logger="smartcam.emulator"):
             clock.advance(30.0)
-            await until(lambda: "is not to be had" in caplog.text)
+            await until(lambda: "cannot be opened yet" in caplog.text)
         thief.close()
         opening = emulator._port._opening
         assert opening is not None
