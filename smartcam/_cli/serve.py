@@ -294,9 +294,9 @@ def _make_recorder(server: FleetServer, options: Options, as_lines: bool) -> Fle
             "at": datetime.now(UTC),
         }
         if trouble is None:
-            text = f"recorded again; {sum(lost.values())} records were not written"
+            text = f"records are written again; {sum(lost.values())} records were not written"
         else:
-            text = f"{trouble}; nothing is recorded until it is better"
+            text = f"{trouble}; nothing is recorded until the disk works again"
         if as_lines:
             logger.log(logging.INFO if trouble is None else logging.ERROR, "%s", text)
         if options.as_json:
