@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._least_squares import solve_scaled
+from smartcam.calibration._least_squares import RANK_TOLERANCE, inverse_scaled, solve_scaled
 from smartcam.calibration._lens.bundle import lens_values
 from smartcam.calibration._lens.projection import (
     SMOOTH_TERM_COUNT,
@@ -304,23 +304,33 @@ class _Misfit:
             f"other causes that were tried explain less: {self._other_causes}"
         )
 
-    def _change_fits(
-        self, changes: Mapping[str, Sequence[int]], order: NDArray[np.intp]
-    ) -> Iterator[tuple[float, int, str]]:
-        """Yield the squares, the first changed view and the question of each possible change.
+    def _change_costs(self, indices: Sequence[int], order: NDArray[np.intp]) -> Array:
+        """Return the squares (V - 3,) if unknowns changed once, from the view ``order[2 + k]`` on.
 
-        ``order`` (V,): indices of the views, in the order in which the change may have happened.
+        ``indices``: the K unknowns. ``order`` (V,): indices of the views, in the order in which the
+        change may have happened.
         """
-        for first_changed in range(2, len(order) - 1):
-            groups = [order[:first_changed], order[first_changed:]]
-            sums = SharedEquations(
-                *(
-                    np.array([values[group].sum(axis=0) for group in groups])
-                    for values in self.reduced
-                )
-            )
-            for cause, indices in changes.items():
-                yield sums.solve(self.free, indices)[1], first_changed, cause
+        free = self.free.copy()
+        free[indices] = True
+        # The later views have a change d of their own besides the change x of all. Eliminating x
+        # leaves (L - C M^-1 C^T) d = l - C M^-1 b, where L, C and l are sums over the later views.
+        inverse = inverse_scaled(self.reduced.matrix.sum(axis=0)[np.ix_(free, free)])
+        right = self.reduced.right.sum(axis=0)[free]
+        rows = self.reduced.matrix[np.ix_(order, indices)]
+        parts = (rows[..., free], rows[..., indices], self.reduced.right[np.ix_(order, indices)])
+        coupling, own, own_right = (part[::-1].cumsum(axis=0)[-3:0:-1] for part in parts)
+        projected = coupling @ inverse
+        reduced_right = own_right - projected @ right
+        blocks = own - projected @ coupling.transpose(0, 2, 1)
+        scales = np.sqrt(np.maximum(np.diagonal(blocks, axis1=1, axis2=2), np.finfo(float).tiny))
+        scaled = blocks / (scales[:, :, None] * scales[:, None, :])
+        solved = (
+            np.linalg.pinv(scaled, rcond=RANK_TOLERANCE, hermitian=True)
+            @ ((reduced_right / scales)[..., None])
+        )
+        gains = (reduced_right / scales * solved[..., 0]).sum(axis=1)
+        costs: Array = self.reduced.squares.sum() - right @ inverse @ right - gains
+        return costs
 
     def change_remarks(
         self, changes: Mapping[str, Sequence[int]], names: Sequence[str]
@@ -329,8 +339,12 @@ class _Misfit:
 
         ``changes``: question about each possible change, with the indices of its unknowns.
         """
-        fits = list(self._change_fits(changes, np.arange(len(names))))
-        after, first_changed, best_cause = min(fits)
+        costs = {
+            cause: self._change_costs(indices, np.arange(len(names)))
+            for cause, indices in changes.items()
+        }
+        after, best_cause = min((float(each.min()), cause) for cause, each in costs.items())
+        first_changed = 2 + int(costs[best_cause].argmin())
         max_score = self.score(after, len(changes[best_cause]) + 1) + MIN_CHANGE_EVIDENCE
         if not self.accept_cause(after, len(changes[best_cause]) + 1, evidence=MIN_CHANGE_EVIDENCE):
             return
@@ -339,12 +353,18 @@ class _Misfit:
         random = np.random.default_rng(len(names))
         for _ in range(RANDOM_ORDERS):
             order = random.permutation(len(names))
-            if min(self._change_fits(changes, order))[0] < (1.0 - 1e-9) * after:
+            if any(
+                self._change_costs(indices, order).min() < (1.0 - 1e-9) * after
+                for indices in changes.values()
+            ):
                 return
+        similar_costs = sorted(
+            (float(each[first_changed - 2]), cause) for cause, each in costs.items()
+        )
         similar_causes = [
             cause
-            for squares, start, cause in sorted(fits)
-            if start == first_changed and self.score(squares, len(changes[cause]) + 1) < max_score
+            for squares, cause in similar_costs
+            if self.score(squares, len(changes[cause]) + 1) < max_score
         ]
         code = Code.POOR_FIT if similar_causes == [MOVE_QUESTION] else Code.WRONG_LENS
         yield code.remark(
