@@ -316,8 +316,12 @@ class _Misfit:
         # leaves (L - C M^-1 C^T) d = l - C M^-1 b, where L, C and l are sums over the later views.
         inverse = inverse_scaled(self.reduced.matrix.sum(axis=0)[np.ix_(free, free)])
         right = self.reduced.right.sum(axis=0)[free]
-        rows = self.reduced.matrix[np.ix_(order, indices)]
-        parts = (rows[..., free], rows[..., indices], self.reduced.right[np.ix_(order, indices)])
+        rows = self.reduced.matrix[np.ix_(order, np.asarray(indices))]
+        parts = (
+            rows[..., free],
+            rows[..., indices],
+            self.reduced.right[np.ix_(order, np.asarray(indices))],
+        )
         coupling, own, own_right = (part[::-1].cumsum(axis=0)[-3:0:-1] for part in parts)
         projected = coupling @ inverse
         reduced_right = own_right - projected @ right
