@@ -202,13 +202,13 @@ def _simulated(plan: Plan, mix: Mix) -> Iterator[Comparison]:
                 distance=0.5,
                 random=random,
             )
-            poses, views = scene.measured(
+            poses, views = scene.simulate_measurements(
                 pixel_sigma=mix.pixels, robot_sigmas=mix.sigmas, random=random
             )
             begin = time.perf_counter()
             ours = calibrate_hand_eye(poses, views, setup=scene.setup, camera=CAMERA)
             seconds.append(time.perf_counter() - begin)
-            bound = scene.bound(pixel_sigma=mix.pixels, robot_sigmas=mix.sigmas)
+            bound = scene.cramer_rao_bound(pixel_sigma=mix.pixels, robot_sigmas=mix.sigmas)
             errors = {
                 "bound": bound,
                 "smartcam": scene.errors(ours.camera_pose),

@@ -199,7 +199,7 @@ def _read_address(url: str, model: str | None) -> Address:
     try:
         if dialect is None and address.quirks:
             raise ConfigurationError("quirks are a dialect's: name the dialect, too")
-        protocol.tries(protocol.schemes[address.scheme], dialect, address.quirks, values)
+        protocol.dialect_groups(protocol.schemes[address.scheme], dialect, address.quirks, values)
     except ConfigurationError as exc:
         raise ConfigurationError(f"camera address {shown!r}: {exc}") from exc
     return address

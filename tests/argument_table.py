@@ -258,7 +258,7 @@ FrameFeature.set  value: feature value, timeout: seconds
 FrameFeature.execute  timeout: seconds
 FrameReader.newest  max_age: age, timeout: seconds or None
 FrameReader.after  moment: moment, timeout: seconds or None
-FrameReader.fresh  since: moment, until: moment
+FrameReader.wait_newer  since: moment, until: moment
 FrameGroup.__init__  sources: object, within: seconds or None, timeout: seconds or None
 frames.open  url: path or url, camera_info: not judged, timeout: seconds or None,
     stall: seconds or None, linger: seconds

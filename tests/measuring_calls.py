@@ -49,7 +49,7 @@ def measuring_calls() -> dict[str, Call]:
     lefts, rights = lenskit.pairs(6)
     lens = calibration.calibrate_intrinsics(views)
     pair = calibration.calibrate_stereo(lefts, rights)
-    flanges, seen = scenes.scene("eye-in-hand").measured(
+    flanges, seen = scenes.scene("eye-in-hand").simulate_measurements(
         pixel_sigma=0.05,
         robot_sigmas=calibration.RobotSigmas(1e-4, 1e-4),
         random=np.random.default_rng(1),

@@ -396,7 +396,7 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "FrameFeature.execute": (source.features["Gain"].execute, {}),
             "FrameReader.newest": (reader.newest, {}),
             "FrameReader.after": (reader.after, {"moment": 0.0}),
-            "FrameReader.fresh": (reader.fresh, {"since": 0.0, "until": 0.0}),
+            "FrameReader.wait_newer": (reader.wait_newer, {"since": 0.0, "until": 0.0}),
             "FrameGroup.__init__": (FrameGroup, {"sources": {"a": source}}),
             "frames.open": (smartcam.frames.open, {"url": "synthetic://"}),
             "discover": (smartcam.frames.discover, {}),

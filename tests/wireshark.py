@@ -104,7 +104,7 @@ class Shown(NamedTuple):
 
     def status(self, dialect: FramedDialect) -> Status:
         """Return the status that the named and the other bits make."""
-        bits = int(self.fields.get("status.others", "0"), 0) << dialect.status_bits.others
+        bits = int(self.fields.get("status.others", "0"), 0) << dialect.status_bits.unnamed_shift
         for member in Status:
             if self.fields.get(f"status.{(member.name or '').lower()}") in {"True", "1"}:
                 bits |= member

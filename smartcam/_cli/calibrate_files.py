@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 DIFFERENT_EXIT_CODE = 7
 """Exit code after a comparison of calibrations that differ by more than noise explains."""
 
-COLUMNS = ("centre", "corners", "worst", "mean")
+COLUMNS = ("centre", "corners", "worst", "rms")
 """Names of a map's figures."""
 
 

@@ -164,8 +164,8 @@ class _Collector:
         A status may also come by itself, so it must come after each of several requests.
         """
         machine, first_dialect = self.link.machine, self.link.machine.dialect
-        with_status = [dialect for dialect in machine.kin if dialect.has(GetStatus)]
-        without_status = [dialect for dialect in machine.kin if not dialect.has(GetStatus)]
+        with_status = [dialect for dialect in machine.candidates if dialect.has(GetStatus)]
+        without_status = [dialect for dialect in machine.candidates if not dialect.has(GetStatus)]
         if with_status and without_status:
             # one missing answer is enough if no message can be lost
             silences_needed = 1 if machine.transport is Transport.TCP else 2
@@ -182,10 +182,10 @@ class _Collector:
                 answered, unanswered = answered + status_came, 0 if status_came else unanswered + 1
             machine.adopt((without_status if unanswered else with_status)[0])
         else:
-            machine.adopt(machine.kin[0])
+            machine.adopt(machine.candidates[0])
         for chunk in self.early:
             chunk.events[:] = [
-                machine.dialect.restate(event, first_dialect)
+                machine.dialect.reinterpret_status(event, first_dialect)
                 if isinstance(event, StatusReport)
                 else event
                 for event in chunk.events
@@ -244,7 +244,7 @@ async def attempt(
         progress.reach(CONNECTING)
         while collector.version is None:
             await collector.receive_chunk()
-        if len(link.machine.kin) > 1:
+        if len(link.machine.candidates) > 1:
             progress.reach("finding out the dialect")
             await collector.find_dialect()
         dialect = link.machine.dialect
@@ -279,7 +279,7 @@ def dialect_groups(address: Address) -> list[tuple[Dialect, ...]]:
 
 
 def _dialect_groups(protocol: Protocol, address: Address) -> list[tuple[Dialect, ...]]:
-    return protocol.tries(
+    return protocol.dialect_groups(
         protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
     )
 

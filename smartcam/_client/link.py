@@ -198,7 +198,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         # socket for reading waiting datagrams directly
         self._direct_socket: socket.socket | None = None
         self._machine_replies = machine.replies
-        self._get_buffer = machine.room
+        self._get_buffer = machine.get_buffer
         # a method of the machine, if it can send several messages at once
         send_singly: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
         self._send_all = getattr(machine, "send_all", send_singly)
@@ -386,7 +386,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         """asyncio: bytes of a TCP link."""
         self.last_byte_at = self.loop.time()
-        if self.machine.filled(nbytes, self.last_byte_at):
+        if self.machine.buffer_updated(nbytes, self.last_byte_at):
             self._queue_events()
         if self._machine_replies and self._loss_reason is None:
             self._flush()
@@ -657,7 +657,7 @@ async def open_link(
         transport,
         max_length=max_length,
         trace=frame_trace.note if traced else None,
-        kin=tuple(dialects),
+        candidates=tuple(dialects),
     )
     link = Link(machine, name=name, host=host, port=port, liveness_timeout=liveness_timeout)
     if traced:

@@ -362,6 +362,7 @@ class Requests:
     def _timeout_error(self, message: m.Message, failure: str, why: str) -> ResponseTimeoutError:
         dialect = self._connection.dialect
         return ResponseTimeoutError(
-            f"{self.name}: {failure} {dialect.called(message)} {why}; status: {self._state.status}",
+            f"{self.name}: {failure} {dialect.message_label(message)} {why}; "
+            f"status: {self._state.status}",
             message_id=dialect.message_id(message),
         )

@@ -131,17 +131,17 @@ def _status_table(bits: StatusBits) -> dict[str, Any]:
     """Return the statuses of the wire's bits; the keys are attributes of StatusBits.
 
     A bit of the wire that ``named`` does not have is the status with this value, shifted up by
-    ``others``.
+    ``unnamed_shift``.
     """
-    if bits.others:
-        status_by_bit = {member.value >> bits.others: member for member in Status}
+    if bits.unnamed_shift:
+        status_by_bit = {member.value >> bits.unnamed_shift: member for member in Status}
         status_by_bit.update(bits.named)
         status_by_bit.pop(0, None)
     else:
         status_by_bit = {member.value: member for member in Status if member.value < 1 << 32}
     return {
         "named": [[wire, _status_name(status_by_bit[wire])] for wire in sorted(status_by_bit)],
-        "without": [[wire, _status_name(status)] for wire, status in bits.without.items()],
+        "inverted": [[wire, _status_name(status)] for wire, status in bits.inverted.items()],
         "always": [_status_name(member) for member in bits.always],
     }
 

@@ -326,7 +326,7 @@ local function add_status(tree, range, word, dialect)
   for _, one in ipairs(dialect.status.named) do
     bit(one[1], one[2], taken(one[1]))
   end
-  for _, one in ipairs(dialect.status.without) do
+  for _, one in ipairs(dialect.status.inverted) do
     bit(one[1], one[2], not taken(one[1]))
   end
   if rest ~= 0 then

@@ -111,9 +111,9 @@ def ways(address: Address) -> list[Way]:
     found: list[Way] = []
     for scheme in sorted(protocol.schemes, key=lambda scheme: scheme != address.scheme):
         transport = protocol.schemes[scheme]
-        groups = protocol.tries(transport, parameters=parameters)
+        groups = protocol.dialect_groups(transport, parameters=parameters)
         if address.dialect is not None:
-            pinned = protocol.tries(transport, address.dialect, address.quirks, parameters)
+            pinned = protocol.dialect_groups(transport, address.dialect, address.quirks, parameters)
             others = [
                 tuple(dialect for dialect in group if dialect.name != address.dialect)
                 for group in groups

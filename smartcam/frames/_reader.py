@@ -151,7 +151,7 @@ class FrameReader:
         expected = "a frame exposed after the given moment"
         return await self._first_matching(expected, timeout, lambda frame: frame.began >= moment)
 
-    async def fresh(self, since: float, until: float) -> None:
+    async def wait_newer(self, since: float, until: float) -> None:
         """Wait until the next frame is newer than a moment, or until a deadline.
 
         Args:

@@ -202,7 +202,7 @@ class Dialect(ABC):
             UnsupportedError: the dialect has no such message.
         """
 
-    def called(self, message: Message) -> str:
+    def message_label(self, message: Message) -> str:
         """Return a message's name for errors, with its id or command."""
         return f"{type(message).__name__} ({self.message_id(message):#04x})"
 
@@ -214,7 +214,7 @@ class Dialect(ABC):
         """Return the names of the fields that a message has on the wire."""
         return tuple(name for name, _ in wire_fields(message_type))
 
-    def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
+    def reinterpret_status(self, report: StatusReport, reader: Dialect) -> StatusReport:
         """Return a status, read by the dialect ``reader``, as this dialect reads the same bits."""
         return report
 
@@ -322,7 +322,7 @@ class Protocol:
     emulator: str = ""
     greeting: bytes | None = None
 
-    def tries(
+    def dialect_groups(
         self,
         transport: Transport,
         dialect: str | None = None,

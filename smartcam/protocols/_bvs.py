@@ -343,9 +343,9 @@ BID = FramedDialect(
             0x0001: Status.WAITING_FOR_TRIGGER,  # p. 210, published
             0x0100: Status.OVERTRIGGERED,  # Trigger Error; from the example on p. 227, derived
         },
-        without={0x0020: Status.BUSY},  # Ready; from the example on p. 227, derived
+        inverted={0x0020: Status.BUSY},  # Ready; from the example on p. 227, derived
         always=Status.RUNNING,  # the dialect has neither start nor stop
-        others=32,
+        unnamed_shift=32,
     ),
     codes=CODES,
     status_by_itself=False,

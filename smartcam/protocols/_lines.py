@@ -205,7 +205,7 @@ class LineDialect(Dialect):
             raise self.unsupported(kind)
         return 0
 
-    def called(self, message: m.Message) -> str:
+    def message_label(self, message: m.Message) -> str:
         """Return a message's name for errors, with its line."""
         row = self.row(type(message))
         return f"{type(message).__name__} ({'' if row is None else row.line[:32]})"
@@ -400,7 +400,7 @@ class LineMachine:
         max_length: largest answer of several lines, bytes; the dialect bounds one line.
         trace: function that is called with each line in both directions, and with bytes that broke
             the protocol.
-        kin: unused, there is one dialect.
+        candidates: unused, there is one dialect.
 
     Raises:
         ConfigurationError: another role or transport.
@@ -414,12 +414,12 @@ class LineMachine:
         *,
         max_length: int,
         trace: Callable[[m.Sender, Frame | RemoteProtocolError], None] | None = None,
-        kin: Sequence[Dialect] = (),
+        candidates: Sequence[Dialect] = (),
     ) -> None:
         if role is not Role.CLIENT or transport is not Transport.TCP:
             raise ConfigurationError(f"dialect {dialect.name}: the client's side of TCP only")
         self.dialect: LineDialect = dialect
-        self.kin: Sequence[Dialect] = (dialect,)
+        self.candidates: Sequence[Dialect] = (dialect,)
         self.transport: Transport = transport
         self.replies: bool = True
         self.counters: Counters = Counters()
@@ -447,12 +447,12 @@ class LineMachine:
         """Copy of the bytes of an unfinished line."""
         return self._reader.pending
 
-    def room(self) -> memoryview:
-        """Return the buffer for the next bytes; call :meth:`filled` next."""
+    def get_buffer(self) -> memoryview:
+        """Return the buffer for the next bytes; call :meth:`buffer_updated` next."""
         return self._store
 
-    def filled(self, count: int, now: float = 0.0) -> bool:
-        """Accept ``count`` bytes that were written into :meth:`room`."""
+    def buffer_updated(self, count: int, now: float = 0.0) -> bool:
+        """Accept ``count`` bytes that were written into :meth:`get_buffer`."""
         self.receive_data(bytes(self._store[:count]))
         return True
 

@@ -97,7 +97,7 @@ Event = m.Message | ResultBurst | LinkFailed | LinkEnded
 class LinkMachine(Protocol):
     """The methods of a machine in the client's role that a link calls.
 
-    Received bytes are passed in by :meth:`room` and :meth:`filled` (a stream) or by
+    Received bytes are passed in by :meth:`get_buffer` and :meth:`buffer_updated` (a stream) or by
     :meth:`receive_data` (a datagram). :meth:`events` returns them as messages of
     :mod:`smartcam.protocols.messages`, whatever their form on the wire.
     """
@@ -115,7 +115,7 @@ class LinkMachine(Protocol):
         ...
 
     @property
-    def kin(self) -> Sequence[Dialect]:
+    def candidates(self) -> Sequence[Dialect]:
         """The dialects that the camera may speak: several until :meth:`adopt` chooses one."""
         ...
 
@@ -130,14 +130,14 @@ class LinkMachine(Protocol):
         ...
 
     def adopt(self, dialect: Dialect) -> None:
-        """Speak this dialect of :attr:`kin` from now on."""
+        """Speak this dialect of :attr:`candidates` from now on."""
 
-    def room(self) -> memoryview:
-        """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
+    def get_buffer(self) -> memoryview:
+        """Return the buffer for a stream's next bytes; call :meth:`buffer_updated` next."""
         ...
 
-    def filled(self, count: int, now: float) -> bool:
-        """Accept ``count`` bytes that were written into :meth:`room`.
+    def buffer_updated(self, count: int, now: float) -> bool:
+        """Accept ``count`` bytes that were written into :meth:`get_buffer`.
 
         ``now``: time of arrival, seconds of any clock; a machine that limits the time for a frame
         compares such times. Returns False if these bytes cannot have completed a message.

@@ -75,13 +75,13 @@ def test_around_looks_at_the_centre_from_within_the_cone() -> None:
 @pytest.mark.parametrize("setup", SETUPS)
 def test_scene_without_noise_gives_the_truth(setup: Setup) -> None:
     truth = scene(setup)
-    poses, views = truth.measured(
+    poses, views = truth.simulate_measurements(
         pixel_sigma=0.0, robot_sigmas=EXACT, random=np.random.default_rng(1)
     )
     assert [pose.label for pose in poses] == ["T_base_flange"] * len(poses)
     for pose, said, seen in zip(truth.robot_poses, poses, views, strict=True):
         np.testing.assert_allclose(said.rotation, pose.rotation, atol=1e-15)
-        expected = CAMERA.project(truth.seen(pose).apply(SHEET.points))
+        expected = CAMERA.project(truth.target_in_camera(pose).apply(SHEET.points))
         np.testing.assert_allclose(seen.points, expected[seen.ids], atol=1e-12)
 
 
@@ -90,7 +90,7 @@ def test_scene_noise_of_the_robot_has_its_sigmas(setup: Setup) -> None:
     truth, random = scene(setup), np.random.default_rng(4)
     turns, shifts = [], []
     for _ in range(40):
-        poses, _ = truth.measured(
+        poses, _ = truth.simulate_measurements(
             pixel_sigma=0.0, robot_sigmas=RobotSigmas(1e-3, 2e-4), random=random
         )
         for pose, said in zip(truth.robot_poses, poses, strict=True):
@@ -103,8 +103,8 @@ def test_scene_noise_of_the_robot_has_its_sigmas(setup: Setup) -> None:
 
 def test_bound_is_in_proportion_to_the_pixels_of_an_exact_robot() -> None:
     truth = scene("eye-in-hand")
-    one = truth.bound(pixel_sigma=0.1, robot_sigmas=EXACT)
-    three = truth.bound(pixel_sigma=0.3, robot_sigmas=EXACT)
+    one = truth.cramer_rao_bound(pixel_sigma=0.1, robot_sigmas=EXACT)
+    three = truth.cramer_rao_bound(pixel_sigma=0.3, robot_sigmas=EXACT)
     np.testing.assert_allclose(np.array(three), 3.0 * np.array(one), rtol=1e-9)
 
 
@@ -112,8 +112,8 @@ def test_bound_is_in_proportion_to_the_pixels_of_an_exact_robot() -> None:
 def test_bound_of_exact_pixels_is_that_of_the_robot_alone(setup: Setup) -> None:
     """Errors are in proportion to the robot's noise where the views are exact."""
     truth = scene(setup)
-    one = truth.bound(pixel_sigma=1e-3, robot_sigmas=RobotSigmas(1e-4, 1e-4))
-    two = truth.bound(pixel_sigma=1e-3, robot_sigmas=RobotSigmas(2e-4, 2e-4))
+    one = truth.cramer_rao_bound(pixel_sigma=1e-3, robot_sigmas=RobotSigmas(1e-4, 1e-4))
+    two = truth.cramer_rao_bound(pixel_sigma=1e-3, robot_sigmas=RobotSigmas(2e-4, 2e-4))
     np.testing.assert_allclose(np.array(two), 2.0 * np.array(one), rtol=1e-2)
 
 

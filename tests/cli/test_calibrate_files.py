@@ -61,7 +61,7 @@ def test_calibrations_of_one_lens_are_the_same() -> None:
     outcome = run(*compare("lens1.json", "lens2.json", "--distance", "0.5")).done()
     verdict, head, difference, noise, where = outcome.out.splitlines()
     assert verdict.startswith("camera: the same within their noise: ")
-    assert head.split() == ["centre", "corners", "worst", "mean"]
+    assert head.split() == ["centre", "corners", "worst", "rms"]
     assert difference.split()[0] == "difference"
     assert noise.split()[:2] == ["from", "noise"]
     assert where.startswith("  pixels, of a coordinate, at 0.5 m; after a turn of ")
@@ -75,7 +75,7 @@ def test_lens_that_is_another_is_an_exit_code() -> None:
     assert line["ratio"] > 5
     assert line["chance"] < 1e-9
     assert line["distance_m"] is None
-    assert line["difference_px"]["mean"] > 5 * line["predicted_px"]["mean"]
+    assert line["difference_px"]["rms"] > 5 * line["predicted_px"]["rms"]
 
 
 def test_bare_lens_gives_no_verdict() -> None:

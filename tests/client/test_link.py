@@ -542,17 +542,24 @@ async def test_trace_gets_the_frames_of_a_delivery_together_and_those_sent_at_on
 async def test_trace_of_kin_is_in_the_words_of_the_one_that_answers(server: Listener) -> None:
     """An answer to Connect that has a code is not shown as a version."""
     entries = Entries()
-    kin = BVS.tries(Transport.TCP)[0]
-    assert [one.label for one in kin] == ["b16", "bid", "b16 with quirk code"]
+    candidates = BVS.dialect_groups(Transport.TCP)[0]
+    assert [one.label for one in candidates] == ["b16", "bid", "b16 with quirk code"]
     link = await open_link(
-        BVS, kin, Transport.TCP, HOST, server.port, name="c", max_length=99, trace=entries.take
+        BVS,
+        candidates,
+        Transport.TCP,
+        HOST,
+        server.port,
+        name="c",
+        max_length=99,
+        trace=entries.take,
     )
     peer = await server.accept()
     link.send(m.Connect())
     assert await peer.read(4) == bytes.fromhex("01000000")
     peer.write(bytes.fromhex("01000400 0000 0100"))
     assert await take(link, 1) == [m.ConnectAnswer(code=0, version=1)]
-    assert link.machine.kin == kin[1:]
+    assert link.machine.candidates == candidates[1:]
     assert [entry[2:6] for entry in entries] == [
         (">", 0x01, "Connect", {}),
         ("<", 0x01, "ConnectAnswer", {"code": 0, "version": 1}),

@@ -99,7 +99,7 @@ WORLD = Transform("world", "base_link", np.eye(3), np.array([10.0, 0.0, 1.0]))
 @functools.cache
 def picture(number: int) -> bytes:
     """Return the pixels that the camera on the hand sees at a pose."""
-    image = render(SHEET, CAMERA, TRUTH.seen(TRUTH.robot_poses[number]), blur=0.7)
+    image = render(SHEET, CAMERA, TRUTH.target_in_camera(TRUTH.robot_poses[number]), blur=0.7)
     pixels: bytes = np.ascontiguousarray(image, np.uint8).tobytes()
     return pixels
 

@@ -89,16 +89,16 @@ async def test_reader_waits_past_what_has_waited() -> None:
         assert reader.last_arrival == loop.time()
         await asyncio.sleep(0.1)
         later = loop.call_later(0.05, driver.give, frame(2))
-        await reader.fresh(loop.time() - 0.01, loop.time() + 1.0)
+        await reader.wait_newer(loop.time() - 0.01, loop.time() + 1.0)
         assert (await anext(reader)).sequence == 2
         later.cancel()
         driver.give(frame(3))
         await asyncio.sleep(0.1)
         begun = loop.time()
-        await reader.fresh(begun, begun + 0.2)  # none comes
+        await reader.wait_newer(begun, begun + 0.2)  # none comes
         assert 0.2 <= loop.time() - begun < 0.3
         assert (await anext(reader)).sequence == 3
-        await reader.fresh(loop.time(), loop.time() - 1.0)  # too late already
+        await reader.wait_newer(loop.time(), loop.time() - 1.0)  # too late already
         source.ended(None)
-        await reader.fresh(loop.time(), loop.time() + 100.0)
+        await reader.wait_newer(loop.time(), loop.time() + 100.0)
         assert (reader.statistics().offered, reader.statistics().skipped) == (3, 1)

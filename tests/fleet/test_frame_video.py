@@ -283,7 +283,7 @@ async def test_bit_rate_of_a_stream_is_held_and_said() -> None:
         assert len(rates) == len(got)
         assert rates[-1].quality == 10  # noise: even the smallest are too large
         assert rates[-1].fps < 25.0
-        assert rates[-1].why == "bit rate, at the lowest quality"
+        assert rates[-1].reason == "bit rate, at the lowest quality"
         assert max(sizes) < 8_000
 
 

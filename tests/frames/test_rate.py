@@ -136,8 +136,8 @@ def test_bit_rate_is_kept(
         noise=noise,
     )
     link.run(20.0)
-    best = link.control.statistics().why == "at the highest quality"
-    fewest = link.control.statistics().why.endswith("fewer")
+    best = link.control.statistics().reason == "at the highest quality"
+    fewest = link.control.statistics().reason.endswith("fewer")
     for begin in (10.0, 15.0):
         found = link.bitrate(begin, begin + 5.0) / target
         assert found <= 1.1 or fewest
@@ -168,8 +168,8 @@ def test_latency_is_kept(
     statistics = link.control.statistics()
     for begin in (10.0, 15.0):
         found = link.latency(begin, begin + 5.0) / target
-        assert found <= 1.1 or "lowest" in statistics.why or statistics.why.endswith("fewer")
-        assert found >= 0.9 or statistics.why == "at the highest quality"
+        assert found <= 1.1 or "lowest" in statistics.reason or statistics.reason.endswith("fewer")
+        assert found >= 0.9 or statistics.reason == "at the highest quality"
     if statistics.quality > 11:
         assert statistics.fps == 30.0
     assert turns([one.quality for one in link.last(10.0, 20.0)], 0.2) <= 2
@@ -188,7 +188,7 @@ def test_rate_follows_a_slower_link_in_a_second_and_recovers_slowly(
     rises = [one.size for one in link.last(20.0, 40.0)]
     assert max(link.last(20.0, 20.9), key=lambda one: one.quality).size < 2.2 * rises[0]
     statistics = link.control.statistics()
-    assert statistics.why == "at the highest quality" or 0.09 <= link.latency(35.0, 40.0) <= 0.11
+    assert statistics.reason == "at the highest quality" or 0.09 <= link.latency(35.0, 40.0) <= 0.11
 
 
 @given(more=st.floats(1.5, 8.0))
@@ -214,11 +214,11 @@ def test_quality_goes_first_then_the_frame_rate_and_back_in_reverse(
     )
     link.run(10.0)
     assert control.fps == 30.0
-    assert control.statistics().why == "bit rate"
+    assert control.statistics().reason == "bit rate"
     assert not caplog.messages
     link.run(19.9)
     statistics = control.statistics()
-    assert (statistics.quality, statistics.why) == (10, "bit rate, at the lowest quality")
+    assert (statistics.quality, statistics.reason) == (10, "bit rate, at the lowest quality")
     assert statistics.fps < 15.0
     assert statistics.bitrate == pytest.approx(1e6, rel=0.1)
     assert f"{statistics.fps:.1f}"[:1] in caplog.messages[-1]
@@ -237,7 +237,7 @@ def test_reported_settings_are_the_used_ones(target: float) -> None:
     for until in np.arange(0.1, 20.0, 0.1):
         link.run(until)
         statistics = control.statistics()
-        fewer = "lowest" in statistics.why or statistics.why.endswith("fewer")
+        fewer = "lowest" in statistics.reason or statistics.reason.endswith("fewer")
         assert fewer or statistics.fps == 30.0
         if fewer:
             assert statistics.quality == 10
@@ -247,7 +247,7 @@ def test_latency_of_the_link_itself_does_not_stop_the_frames() -> None:
     link = Link(RateControl(latency=0.05), lambda _: 100e6, base=0.15)
     link.run(20.0)
     statistics = link.control.statistics()
-    assert statistics.why == "latency, at the lowest quality"
+    assert statistics.reason == "latency, at the lowest quality"
     assert 3.0 < statistics.fps < 12.0
     assert statistics.latency == pytest.approx(0.151, abs=0.01)
 
@@ -255,9 +255,9 @@ def test_latency_of_the_link_itself_does_not_stop_the_frames() -> None:
 def test_lower_of_both_limits_counts() -> None:
     link = Link(RateControl(bitrate=8e6, latency=0.1), lambda at: 1.5e6 if at > 10 else 100e6)
     link.run(9.5)
-    assert link.control.statistics().why == "bit rate"
+    assert link.control.statistics().reason == "bit rate"
     link.run(20.0)
-    assert link.control.statistics().why == "latency"
+    assert link.control.statistics().reason == "latency"
     assert 0.09 <= link.latency(15.0, 20.0) <= 0.11
 
 
@@ -266,7 +266,7 @@ def test_limit_that_cannot_be_kept_is_reported() -> None:
     link.run(10.0)
     statistics = link.control.statistics()
     assert (statistics.quality, statistics.fps) == (10, 1.0)
-    assert statistics.why == "bit rate, at the lowest quality and frame rate"
+    assert statistics.reason == "bit rate, at the lowest quality and frame rate"
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def check_framer(data: bytes) -> None:
         count = len(chunk)
         if kind is None:
             count = write(framer, chunk)
-            assert len(framer.room()) <= max(MAX_READ, header.size + limit)
+            assert len(framer.get_buffer()) <= max(MAX_READ, header.size + limit)
         else:
             framer.feed(kind(chunk))
         fed += count
@@ -85,11 +85,11 @@ def check_framer(data: bytes) -> None:
 
 def write(taker: Framer | Machine, data: bytes) -> int:
     """Read as a transport does, over junk; return how many bytes there was room for."""
-    room = taker.room()
+    room = taker.get_buffer()
     count = min(len(room), len(data))
     room[:] = b"\xee" * len(room)
     room[:count] = data[:count]
-    taker.filled(count)
+    taker.buffer_updated(count)
     return count
 
 

@@ -424,7 +424,7 @@ def datagram_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[
             "soon": rules.Late(**picked, seconds=0.02),
             "late": rules.Late(**picked, seconds=0.25),
             "behind the next": rules.Reorder(**picked, seconds=0.05),
-            "behind two": rules.Reorder(**picked, behind=2, seconds=0.05),
+            "behind two": rules.Reorder(**picked, overtaken_by=2, seconds=0.05),
         }
         for label, rule in changes.items():
             more: dict[str, Any] = {"allowed": SILENT}

@@ -29,10 +29,10 @@ def _session(dialect: FramedDialect, role: Role, transport: Transport, pieces: l
         else:
             at = 0
             while at < len(piece):
-                room = machine.room()
+                room = machine.get_buffer()
                 part = piece[at : at + len(room)]
                 room[: len(part)] = part
-                machine.filled(len(part), number * 0.1)
+                machine.buffer_updated(len(part), number * 0.1)
                 at += len(part)
         drain(machine.events())
 

@@ -118,7 +118,7 @@ def test_dialect_without_more_has_no_quirks_and_all_fields() -> None:
     assert (SPOKEN.quirks, SPOKEN.label) == ((), "spoken")
     assert SPOKEN.fields(m.QueryAnswer) == ("code", "application")
     report = m.StatusReport(status=Status(1))
-    assert SPOKEN.restate(report, BID) is report
+    assert SPOKEN.reinterpret_status(report, BID) is report
     assert SPOKEN.with_quirks([]) is SPOKEN
     with pytest.raises(ConfigurationError) as caught:
         SPOKEN.with_quirks(["loud"])
@@ -149,7 +149,7 @@ def test_dialect_unsupported_names_itself_the_message_and_what_it_can() -> None:
 def test_tries_without_a_dialect_are_the_most_probable_first(
     transport: Transport, groups: list[tuple[Dialect, ...]]
 ) -> None:
-    assert BVS.tries(transport) == groups
+    assert BVS.dialect_groups(transport) == groups
     assert {one.name for group in groups for one in group} == {*BVS.dialects}
 
 
@@ -161,40 +161,40 @@ def test_tries_without_a_dialect_are_the_most_probable_first(
 def test_tries_of_a_pinned_dialect_are_it_and_its_quirks(
     name: str, group: tuple[Dialect, ...], transport: Transport
 ) -> None:
-    assert BVS.tries(transport, name) == [group]
+    assert BVS.dialect_groups(transport, name) == [group]
 
 
 @pytest.mark.parametrize("transport", Transport)
 def test_tries_of_pinned_quirks_are_that_one(transport: Transport) -> None:
-    assert BVS.tries(transport, "b16", ["code"]) == [(CODE,)]
-    assert BVS.tries(transport, "b16", ["no_id"]) == [(NO_ID,)]
+    assert BVS.dialect_groups(transport, "b16", ["code"]) == [(CODE,)]
+    assert BVS.dialect_groups(transport, "b16", ["no_id"]) == [(NO_ID,)]
     both = B16.with_quirks(["code", "no_id"])
-    assert BVS.tries(transport, "b16", ("no_id", "code")) == [(both,)]
+    assert BVS.dialect_groups(transport, "b16", ("no_id", "code")) == [(both,)]
 
 
 def test_tries_of_an_unknown_quirk_is_reported() -> None:
     with pytest.raises(ConfigurationError) as caught:
-        BVS.tries(TCP, "handbook", ["code"])
+        BVS.dialect_groups(TCP, "handbook", ["code"])
     assert str(caught.value) == "dialect handbook has no quirk 'code'; it has none"
 
 
 def test_tries_without_detection_are_the_dialects_one_by_one() -> None:
-    assert protocol().tries(UDP) == [(SPOKEN,), (B16,)]
-    assert protocol().tries(UDP, "b16") == [(B16,)]
+    assert protocol().dialect_groups(UDP) == [(SPOKEN,), (B16,)]
+    assert protocol().dialect_groups(UDP, "b16") == [(B16,)]
     known = protocol(detection={TCP: ((B16, SPOKEN),)})
-    assert known.tries(TCP) == [(B16, SPOKEN)]
-    assert known.tries(UDP) == [(SPOKEN,), (B16,)]
+    assert known.dialect_groups(TCP) == [(B16, SPOKEN)]
+    assert known.dialect_groups(UDP) == [(SPOKEN,), (B16,)]
 
 
 def test_tries_of_a_dialect_that_is_not_found_out_are_that_one() -> None:
     made = protocol(detection={TCP: ((B16,),)})
-    assert made.tries(TCP, "spoken") == [(SPOKEN,)]
+    assert made.dialect_groups(TCP, "spoken") == [(SPOKEN,)]
 
 
 def test_tries_with_parameters_hand_them_to_every_dialect() -> None:
     made = protocol(parameters={"room": "where"})
-    (first,), (second,) = made.tries(TCP, parameters={"room": "attic"})
+    (first,), (second,) = made.dialect_groups(TCP, parameters={"room": "attic"})
     assert isinstance(first, Spoken)
     assert (first.room, second) == ("attic", B16)
     with pytest.raises(ConfigurationError, match=r"^a room has a name$"):
-        made.tries(TCP, "spoken", parameters={"room": ""})
+        made.dialect_groups(TCP, "spoken", parameters={"room": ""})

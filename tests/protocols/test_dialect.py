@@ -387,17 +387,17 @@ def test_restate_reads_the_word_of_a_kin_as_its_own() -> None:
     read = B16.decode(CAMERA, frame)
     assert read == m.StatusReport(status=Status(0x120))
     assert isinstance(read, m.StatusReport)
-    assert BID.restate(read, B16) == BID.decode(CAMERA, frame)
-    assert CODE.restate(read, B16) is not read
-    assert CODE.restate(read, B16) == read
+    assert BID.reinterpret_status(read, B16) == BID.decode(CAMERA, frame)
+    assert CODE.reinterpret_status(read, B16) is not read
+    assert CODE.reinterpret_status(read, B16) == read
 
 
 @pytest.mark.long
 def test_restate_there_and_back_keeps_every_word() -> None:
     for word in range(1 << 16):
         read = m.StatusReport(status=BITS.read(word))
-        assert B16.restate(read, BID) == m.StatusReport(status=Status(word))
-        assert BID.restate(B16.restate(read, BID), B16) == read
+        assert B16.reinterpret_status(read, BID) == m.StatusReport(status=Status(word))
+        assert BID.reinterpret_status(B16.reinterpret_status(read, BID), B16) == read
 
 
 # ---------------------------------------------------------------------- quirks

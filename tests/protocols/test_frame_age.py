@@ -32,11 +32,11 @@ def read(made: Machine, data: bytes, now: float) -> list[Event]:
     """Make it read bytes as a transport does, all at one time."""
     events: list[Event] = []
     while data and made.state is not State.FAILED:
-        room = made.room()
+        room = made.get_buffer()
         count = min(len(room), len(data))
         room[:count] = data[:count]
         data = data[count:]
-        if made.filled(count, now):
+        if made.buffer_updated(count, now):
             events += made.events()
     return events
 

@@ -552,10 +552,10 @@ def test_any_bytes_give_events_or_end_the_link(heard: bytes) -> None:
 def test_room_takes_what_a_link_writes_into_it() -> None:
     talk = Talk()
     talk.send(m.Connect())
-    room = talk.machine.room()
+    room = talk.machine.get_buffer()
     assert len(room) == MAX_READ_BYTES
     room[: len(LOGIN)] = LOGIN
-    assert talk.machine.filled(len(LOGIN))
+    assert talk.machine.buffer_updated(len(LOGIN))
     assert talk.told() == [WELCOME]
 
 
@@ -630,7 +630,7 @@ def test_dialect_says_what_it_can() -> None:
     )
     for kind in (m.GetClock, m.SetInput, m.SetSequenceNumber, m.ResetErrors, m.UnknownMessage):
         assert not NATIVE.has(kind)
-    assert INSIGHT.tries(Transport.TCP) == [(NATIVE,)]
+    assert INSIGHT.dialect_groups(Transport.TCP) == [(NATIVE,)]
 
 
 @pytest.mark.parametrize(

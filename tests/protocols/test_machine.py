@@ -1153,9 +1153,9 @@ def test_camera_that_does_not_tell_drops_a_wrong_length() -> None:
 # ---------------------------------------------------------------------- dialects that begin alike
 
 
-def asking(transport: Transport = TCP, *, kin: tuple[FramedDialect, ...] = KIN) -> Machine:
+def asking(transport: Transport = TCP, *, candidates: tuple[FramedDialect, ...] = KIN) -> Machine:
     """Return a client that has sent Disconnect and Connect to a camera of unknown dialect."""
-    made = Machine(kin[0], Role.CLIENT, transport, kin=kin)
+    made = Machine(candidates[0], Role.CLIENT, transport, candidates=candidates)
     made.send(m.Disconnect())
     made.send(m.Connect())
     assert made.data_to_send() == [b"\x02\0\0\0", b"\x01\0\0\0"]
@@ -1163,36 +1163,40 @@ def asking(transport: Transport = TCP, *, kin: tuple[FramedDialect, ...] = KIN) 
 
 
 def test_kin_of_a_machine_that_knows_is_its_dialect() -> None:
-    assert Machine(BID, Role.CLIENT, TCP).kin == (BID,)
-    assert asking().kin == KIN
+    assert Machine(BID, Role.CLIENT, TCP).candidates == (BID,)
+    assert asking().candidates == KIN
     assert asking().dialect is B16
 
 
 @each_transport
 @pytest.mark.parametrize(
-    ("answer", "kin"),
+    ("answer", "candidates"),
     [("01000200 0100", (B16,)), ("01000400 0000 0100", BID_OR_CODE)],
     ids=["two bytes", "four bytes"],
 )
 def test_kin_are_narrowed_by_the_length_of_the_answer_to_connect(
-    answer: str, kin: tuple[FramedDialect, ...], transport: Transport
+    answer: str, candidates: tuple[FramedDialect, ...], transport: Transport
 ) -> None:
     made = asking(transport)
     assert feed(made, bytes.fromhex(answer)) == [m.ConnectAnswer(code=0, version=1)]
-    assert (made.kin, made.dialect, made.state) == (kin, kin[0], State.CONNECTED)
+    assert (made.candidates, made.dialect, made.state) == (
+        candidates,
+        candidates[0],
+        State.CONNECTED,
+    )
 
 
 def test_kin_are_narrowed_by_the_first_byte_wise_too() -> None:
     made = asking()
     data = bytes.fromhex("01000400 0000 0100")
     assert feed(made, *[bytes([byte]) for byte in data]) == [m.ConnectAnswer(version=1)]
-    assert made.kin == BID_OR_CODE
+    assert made.candidates == BID_OR_CODE
 
 
 def test_kin_are_narrowed_by_an_answer_to_disconnect() -> None:
     made = asking()
     assert feed(made, bytes.fromhex("02000200 0000")) == [m.DisconnectAnswer()]
-    assert (made.kin, made.dialect, made.state) == ((BID,), BID, State.CONNECTING)
+    assert (made.candidates, made.dialect, made.state) == ((BID,), BID, State.CONNECTING)
     assert feed(made, bytes.fromhex("01000400 0000 0100")) == [m.ConnectAnswer(version=1)]
     assert feed(made, bytes.fromhex("12000200 2000")) == [m.StatusReport(status=Status.RUNNING)]
 
@@ -1205,7 +1209,7 @@ def test_kin_are_narrowed_by_an_answer_to_disconnect() -> None:
 def test_kin_that_an_answer_of_no_known_length_leaves_are_all(answer: str, taken: bool) -> None:
     made = asking()
     events = feed(made, bytes.fromhex(answer))
-    assert made.kin == KIN
+    assert made.candidates == KIN
     if taken:
         assert events == [m.ConnectAnswer(version=1)]
         assert made.counters.long_bodies == 1
@@ -1220,7 +1224,7 @@ def test_kin_are_narrowed_before_the_trace_sees_the_frame() -> None:
     def trace(sender: m.Sender, frame: Frame | RemoteProtocolError) -> None:
         seen.append(made.dialect.name)
 
-    made = Machine(B16, Role.CLIENT, TCP, kin=KIN, trace=trace)
+    made = Machine(B16, Role.CLIENT, TCP, candidates=KIN, trace=trace)
     made.send(m.Connect())
     feed(made, bytes.fromhex("01000400 0000 0100"))
     assert seen == ["b16", "bid"]
@@ -1234,7 +1238,7 @@ def test_kin_are_left_alone_by_what_comes_in_the_session() -> None:
         m.StatusReport(status=Status.RUNNING | Status.OVERTRIGGERED),
         m.QueryAnswer(code=2, application=21),
     ]
-    assert made.kin == BID_OR_CODE
+    assert made.candidates == BID_OR_CODE
 
 
 @pytest.mark.parametrize("dialect", BID_OR_CODE, ids=label)
@@ -1242,7 +1246,7 @@ def test_adopt_one_of_the_kin_reads_as_it_from_then_on(dialect: FramedDialect) -
     made = asking()
     feed(made, bytes.fromhex("01000400 0000 0100"))
     made.adopt(dialect)
-    assert (made.kin, made.dialect) == ([dialect], dialect)
+    assert (made.candidates, made.dialect) == ([dialect], dialect)
     (report,) = feed(made, bytes.fromhex("12000200 2001"))
     assert report == dialect.decode(CAMERA, Frame(0x12, b"\x20\x01"))
     if dialect is BID:
@@ -1259,7 +1263,7 @@ def test_adopt_a_stranger_is_refused() -> None:
         with pytest.raises(LocalProtocolError) as caught:
             made.adopt(stranger)
         assert str(caught.value) == f"{stranger.name} is none of ['bid', 'b16']"
-    assert (made.kin, made.dialect) == (BID_OR_CODE, BID)
+    assert (made.candidates, made.dialect) == (BID_OR_CODE, BID)
 
 
 def test_adopt_bid_has_containers_in_bursts_as_before() -> None:
@@ -1274,7 +1278,7 @@ def test_kin_of_the_other_header_are_not_told_apart_by_it() -> None:
     """A frame with a magic number is waited for, as one of 16,982 bytes."""
     made = asking()
     assert feed(made, HANDBOOK.encode(m.ConnectAnswer(version=1))) == []
-    assert (made.kin, made.buffered) == (KIN, 16)
+    assert (made.candidates, made.buffered) == (KIN, 16)
 
 
 @pytest.mark.parametrize("dialect", [*KIN, NO_ID], ids=label)

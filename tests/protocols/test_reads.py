@@ -65,12 +65,12 @@ def payload(size: int) -> bytes:
 
 def read_into(taker: Framer | Machine, data: bytes, most: int) -> int:
     """Read as a transport does; return how many of the bytes it took."""
-    room = taker.room()
+    room = taker.get_buffer()
     count = min(most, len(room), len(data))
     assert room
     room[:] = b"\xee" * len(room)
     room[:count] = data[:count]
-    taker.filled(count)
+    taker.buffer_updated(count)
     return count
 
 
@@ -160,7 +160,7 @@ def test_written_frames_around_every_limit_come_out_whole(
         found += iter(framer.next_frame, None)
     assert found == frames
     assert framer.buffered == 0
-    assert len(framer.room()) <= dialect.header.size + DEFAULT_MAX_LENGTH
+    assert len(framer.get_buffer()) <= dialect.header.size + DEFAULT_MAX_LENGTH
 
 
 @each_header
@@ -180,7 +180,7 @@ def test_written_large_frame_is_not_copied_and_small_ones_are_at_once(
 def test_written_reads_grow_while_they_are_filled_and_stop() -> None:
     framer, stream, rooms = Framer(HANDBOOK.header), HANDBOOK.encode(m.Connect()) * 99_999, []
     while stream:
-        rooms.append(len(framer.room()))
+        rooms.append(len(framer.get_buffer()))
         stream = stream[read_into(framer, stream, 1 << 30) :]
         assert taken(framer)
     doublings = (framing.MAX_READ_BYTES // framing.FIRST_READ_BYTES).bit_length()
@@ -188,7 +188,7 @@ def test_written_reads_grow_while_they_are_filled_and_stop() -> None:
     assert rooms[:doublings] == growing
     assert {*rooms[doublings:]} == {framing.MAX_READ_BYTES}
     read_into(framer, b"P", 1)
-    assert len(framer.room()) == framing.MAX_READ_BYTES
+    assert len(framer.get_buffer()) == framing.MAX_READ_BYTES
 
 
 def test_written_reads_never_keep_more_than_the_longest() -> None:
@@ -199,7 +199,7 @@ def test_written_reads_never_keep_more_than_the_longest() -> None:
     while stream:
         stream = stream[read_into(framer, stream, 1 << 30) :]
         taken(framer)
-        assert len(framer.room()) <= len(framer._store) <= framing.MAX_READ_BYTES
+        assert len(framer.get_buffer()) <= len(framer._store) <= framing.MAX_READ_BYTES
 
 
 @pytest.mark.parametrize("write", [True, False], ids=["written", "fed"])
@@ -348,4 +348,4 @@ def test_reads_shrink_until_they_have_no_more_frames_than_one_turn_takes(
     grown = framing.MAX_READ_BYTES.bit_length()
     assert max(counts[:grown]) > most
     assert most // 4 < max(counts[grown:]) <= most
-    assert len(made.room()) < framing.MAX_READ_BYTES
+    assert len(made.get_buffer()) < framing.MAX_READ_BYTES

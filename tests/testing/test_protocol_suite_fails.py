@@ -154,7 +154,7 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"capabilities": can()}, "get_status is False, but has() is True for GetStatus"),
     ],
     "test_messages_have_ids_names_and_fields": [
-        ({"called": lambda self, message: "it"}, "is 'it'"),
+        ({"message_label": lambda self, message: "it"}, "is 'it'"),
         ({"fields": lambda self, kind: ("speed",)}, "has {'speed'}"),
     ],
     "test_message_that_it_has_not_is_unsupported": [
@@ -366,10 +366,10 @@ class Answering(Machine):
             self._outbox.append(b"BYE\n")
 
 
-class Kinless(Machine):
+class WrongCandidates(Machine):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self.kin = (HANDBOOK,)
+        self.candidates = (HANDBOOK,)
 
 
 class Sharing(Machine):
@@ -425,7 +425,7 @@ MISTAKES = [
     ("test_answer_that_nobody_asked_for_is_not_told", Credulous, "no request was open"),
     ("test_disconnect_is_the_last_word", Restless, "GetStatus() was taken"),
     ("test_disconnect_is_the_last_word", Answering, "it said b'BYE"),
-    ("test_machine_says_what_it_is", Kinless, "was not asked for"),
+    ("test_machine_says_what_it_is", WrongCandidates, "was not asked for"),
     ("test_machine_says_what_it_is", Sharing, "an earlier list"),
     ("test_bytes_are_counted", Uncounted, "bytes_received is 0"),
     ("test_trace_shows_what_is_said", Untraced, "was traced"),

@@ -208,7 +208,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: Lose(probability=1.5), "probability must be 0 to 1"),
     (lambda: Repeat(copies=0), "copies must be 1 to 100"),
     (lambda: Late(seconds=-1), "times must be 0 or more seconds"),
-    (lambda: Reorder(behind=0), "behind must be 1 or more datagrams"),
+    (lambda: Reorder(overtaken_by=0), "overtaken_by must be 1 or more datagrams"),
     (lambda: Reorder(seconds=0), "seconds must be more than 0"),
     (lambda: LinkProxy("h", 1, rules=[Lose()]), "it means nothing on TCP"),
     (lambda: LinkProxy("h", 1, transport="udp", rules=[Cut()]), "it means nothing on UDP"),

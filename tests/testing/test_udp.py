@@ -97,7 +97,7 @@ async def test_repeated_datagram_comes_again_at_once(number: int) -> None:
 async def test_reordered_datagram_comes_after_two_others_or_at_its_time(
     number: int, order: bytes
 ) -> None:
-    async with linked(Reorder(number=number, behind=2, seconds=SHORT)) as (_, client, _):
+    async with linked(Reorder(number=number, overtaken_by=2, seconds=SHORT)) as (_, client, _):
         client.send(*FIVE)
         await receives(client, [order[at : at + 1] for at in range(5)])
 
@@ -112,7 +112,7 @@ async def test_late_datagram_is_overtaken() -> None:
 
 
 async def test_late_and_reordered_datagram_is_both() -> None:
-    rules = [Reorder(number=1, behind=4), Late(number=1, seconds=SHORT), Repeat(number=1)]
+    rules = [Reorder(number=1, overtaken_by=4), Late(number=1, seconds=SHORT), Repeat(number=1)]
     async with linked(*rules) as (proxy, client, _):
         client.send(*FIVE)
         await receives(client, [b"2", b"3", b"4", b"5"])
@@ -256,7 +256,10 @@ async def test_datagrams_held_back_are_bounded(monkeypatch: pytest.MonkeyPatch) 
 
 
 async def test_forgotten_client_gets_nothing_that_was_held_back() -> None:
-    rules = [Late(number=1, seconds=SHORT / 2), Reorder(number=2, behind=9, seconds=SHORT / 2)]
+    rules = [
+        Late(number=1, seconds=SHORT / 2),
+        Reorder(number=2, overtaken_by=9, seconds=SHORT / 2),
+    ]
     async with linked(*rules) as (proxy, client, _):
         client.send(b"1", b"2")
         await proxy.wait_for("reorder")
@@ -265,7 +268,7 @@ async def test_forgotten_client_gets_nothing_that_was_held_back() -> None:
 
 
 async def test_closing_forgets_what_is_on_its_way() -> None:
-    rules = [Late(number=1, seconds=60), Reorder(number=2, behind=9, seconds=60)]
+    rules = [Late(number=1, seconds=60), Reorder(number=2, overtaken_by=9, seconds=60)]
     async with mailbox(echo=True) as camera:
         async with (
             LinkProxy(HOST, camera.port, transport="udp", rules=rules) as proxy,

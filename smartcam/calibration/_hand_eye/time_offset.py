@@ -49,14 +49,14 @@ class TimeOffset(NamedTuple):
     Attributes:
         seconds: time to add to a picture's time to ask the robot's history for its pose.
         sigma: standard deviation of ``seconds``, by the scatter between views, seconds.
-        before: rms difference of poses and views without the offset, metres.
-        after: rms difference of poses and views with the offset, metres.
+        rms_before: rms difference of poses and views without the offset, metres.
+        rms_after: rms difference of poses and views with the offset, metres.
     """
 
     seconds: float
     sigma: float
-    before: float
-    after: float
+    rms_before: float
+    rms_after: float
 
 
 @check_arguments(history=of_class("PoseHistory"), most=a_number)

@@ -74,15 +74,15 @@ class NextView(NamedTuple):
         text: text for people: place and tilt of the target.
         transform: ``T_camera_target``.
         outline: (4, 2), the target's corners as they would be seen, pixels.
-        mean: RMS uncertainty of a coordinate over the field with this view, pixels.
-        present: RMS uncertainty of a coordinate over the field without this view, pixels.
+        rms_with: RMS uncertainty of a coordinate over the field with this view, pixels.
+        rms_without: RMS uncertainty of a coordinate over the field without this view, pixels.
     """
 
     text: str
     transform: Transform
     outline: Array
-    mean: float
-    present: float
+    rms_with: float
+    rms_without: float
 
 
 class CandidateViews(NamedTuple):

@@ -31,13 +31,13 @@ class MapFigures(NamedTuple):
         centre: value at the centre of the image.
         corners: RMS of the four corners, or of those that the model reaches.
         worst: largest value.
-        mean: RMS over the field.
+        rms: RMS over the field.
     """
 
     centre: float
     corners: float
     worst: float
-    mean: float
+    rms: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

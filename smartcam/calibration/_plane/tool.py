@@ -28,19 +28,19 @@ class ToolTip(NamedTuple):
     """The position of a tool's tip on the flange.
 
     Attributes:
-        tip: (3,), in the flange's frame, metres. Its component along ``blind`` is 0.
-        point: (3,), the point that was touched, in the robot's frame, metres. If ``blind`` is not
-            None, the point has the same error as the tip.
+        tip: (3,), in the flange's frame, metres. Its component along ``unknown_axis`` is 0.
+        point: (3,), the point that was touched, in the robot's frame, metres. If
+            ``unknown_axis`` is not None, the point has the same error as the tip.
         residuals: (N, 3), offset of each touch from the point, metres, in the robot's frame.
-        blind: (3,), the axis about which the flange was turned, in the flange's frame, if it was
-            turned about one axis only: the tip's place along it is not known. None if it was turned
-            about two or more.
+        unknown_axis: (3,), the axis about which the flange was turned, in the flange's frame, if
+            it was turned about one axis only: the tip's place along it is not known. None if it
+            was turned about two or more.
     """
 
     tip: Array
     point: Array
     residuals: Array
-    blind: Array | None
+    unknown_axis: Array | None
 
 
 def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:

@@ -158,12 +158,12 @@ class HandEyeScene:
     target_pose: Transform
     robot_poses: Sequence[Transform]
 
-    def seen(self, robot_pose: Transform) -> Transform:
+    def target_in_camera(self, robot_pose: Transform) -> Transform:
         """Return ``T_camera_target`` at a pose of the robot."""
         carrier_motion = robot_pose.inverse() if self.setup == "eye-in-hand" else robot_pose
         return self.camera_pose.inverse() @ carrier_motion @ self.target_pose
 
-    def measured(
+    def simulate_measurements(
         self, *, pixel_sigma: float, robot_sigmas: RobotSigmas, random: np.random.Generator
     ) -> tuple[list[Transform], list[TargetView]]:
         """Return the robot's poses with its controller's noise, and the views.
@@ -180,7 +180,7 @@ class HandEyeScene:
             view(
                 self.target,
                 self.camera,
-                self.seen(pose),
+                self.target_in_camera(pose),
                 sigma=pixel_sigma,
                 random=random,
                 name=f"view {number}",
@@ -190,7 +190,7 @@ class HandEyeScene:
         poses = [self._add_noise(pose, robot_sigmas, random) for pose in self.robot_poses]
         return poses, views
 
-    def bound(self, *, pixel_sigma: float, robot_sigmas: RobotSigmas) -> Bound:
+    def cramer_rao_bound(self, *, pixel_sigma: float, robot_sigmas: RobotSigmas) -> Bound:
         """Return the Cramer-Rao bound of the camera's pose.
 
         The target's pose and the robot's true poses are unknown, too. A sigma of 0 means values
@@ -202,7 +202,7 @@ class HandEyeScene:
         points = [self.target.points] * len(self.robot_poses)
         count = len(self.target.points)
         whitening = np.broadcast_to(np.eye(2) / pixel_sigma, (len(points), count, 2, 2))
-        transforms = [self.seen(pose) for pose in self.robot_poses]
+        transforms = [self.target_in_camera(pose) for pose in self.robot_poses]
         pixels = [
             self.camera.project(transform.apply(self.target.points)) for transform in transforms
         ]

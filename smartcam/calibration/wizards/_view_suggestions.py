@@ -82,8 +82,8 @@ def suggest_view(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion
     return Suggestion(
         f"with the sheet {next_view.text}",
         next_view.outline,
-        f"the lens is sure to {next_view.present:.2g} pixels over the image, with this view to "
-        f"{next_view.mean:.2g}",
+        f"the lens is sure to {next_view.rms_without:.2g} pixels over the image, with this view to "
+        f"{next_view.rms_with:.2g}",
     )
 
 

@@ -121,7 +121,7 @@ class PictureStream(FrameStream):
             loop.time(), reader.last_arrival, order.min_interval
         )
         async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
-            await reader.fresh(oldest_arrival, wait_until)
+            await reader.wait_newer(oldest_arrival, wait_until)
             frame = await anext(reader)
         self.pace.note_taken(reader.last_arrival, reader.statistics().offered)
         async with asyncio.timeout(order.timeout):

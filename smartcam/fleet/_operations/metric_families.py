@@ -183,7 +183,7 @@ def _outlet_families(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         "smartcam_outlet_spooled", "Results that wait for the far end", labels=labels
     )
     well = core.GaugeMetricFamily(
-        "smartcam_outlet_well", "Whether nothing keeps results from the far end", labels=labels
+        "smartcam_outlet_up", "Whether nothing keeps results from the far end", labels=labels
     )
     dropped = core.CounterMetricFamily(
         "smartcam_outlet_dropped", "Results that were given up", labels=[*labels, "reason"]

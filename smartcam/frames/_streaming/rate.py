@@ -59,8 +59,8 @@ class RateStatistics:
     Attributes:
         quality: JPEG quality of the next frame.
         fps: largest frame rate, frames per second.
-        why: reason for these values: "bit rate", "latency" or "at the highest quality"; "" before
-            the first frame. "at the lowest quality" follows if the frame rate is lowered, too, and
+        reason: why these values: "bit rate", "latency" or "at the highest quality"; "" before the
+            first frame. "at the lowest quality" follows if the frame rate is lowered, too, and
             "at the lowest quality and frame rate" if neither can be lowered further.
         bitrate: recent bit rate, bits per second.
         latency: recent time from capture to arrival, seconds.
@@ -68,7 +68,7 @@ class RateStatistics:
 
     quality: int
     fps: float
-    why: str
+    reason: str
     bitrate: float
     latency: float
 
@@ -137,7 +137,7 @@ class RateControl:
         self._qualities, self._rates = quality, fps
         self._quality, self._fps = float(quality[0]), float(fps[1])
         self._max_rise = MAX_FIRST_RISE_PER_SECOND
-        self._why: str = ""
+        self._reason: str = ""
         self._logged_fps = self._fps
         self._last_sent_at: float | None = None
         # frame rate of the source, frames per second; 0: unknown
@@ -168,7 +168,7 @@ class RateControl:
         return RateStatistics(
             self.quality,
             self._fps,
-            self._why,
+            self._reason,
             8 * recent.bytes / recent.seconds if recent.seconds else 0.0,
             self._age.value + self._transit_time.value,
         )
@@ -237,7 +237,7 @@ class RateControl:
                 reason = f"{reason}, at the lowest quality"
             elif self._quality >= best:
                 reason = "at the highest quality"
-        self._why = reason
+        self._reason = reason
         self._log_change()
 
     def _target(self) -> tuple[float, float, str]:
@@ -277,7 +277,7 @@ class RateControl:
         change = self._fps / self._logged_fps
         if recovered or not 1 / LOGGED_CHANGE_FACTOR < change < LOGGED_CHANGE_FACTOR:
             self._logged_fps = self._fps
-            logger.info("frames: at most %.3g per second: %s", self._fps, self._why)
+            logger.info("frames: at most %.3g per second: %s", self._fps, self._reason)
 
 
 def _step_scale(quality: float) -> float:

@@ -85,38 +85,38 @@ class StatusBits:
 
     Attributes:
         named: bit on the wire to the status bit that means the same.
-        without: bit on the wire to the status bit that means its absence.
+        inverted: bit on the wire to the status bit that means its absence.
         always: status bits that are always set, since no bit on the wire shows them.
-        others: number of bits by which all other bits of the wire are shifted up.
+        unnamed_shift: number of bits by which all other bits of the wire are shifted up.
     """
 
     named: Mapping[int, Status] = field(default_factory=dict[int, Status])
-    without: Mapping[int, Status] = field(default_factory=dict[int, Status])
+    inverted: Mapping[int, Status] = field(default_factory=dict[int, Status])
     always: Status = NO_STATUS
-    others: int = 0
+    unnamed_shift: int = 0
 
     def read(self, word: int) -> Status:
         """Return the status for a word on the wire."""
-        if not self.others:
+        if not self.unnamed_shift:
             return as_status(word)
         status, remaining = int(self.always), word
         for bit, meaning in self.named.items():
             status |= meaning if word & bit else 0
             remaining &= ~bit
-        for bit, meaning in self.without.items():
+        for bit, meaning in self.inverted.items():
             status |= 0 if word & bit else meaning
             remaining &= ~bit
-        return Status(status | remaining << self.others)
+        return Status(status | remaining << self.unnamed_shift)
 
     def write(self, status: Status) -> int:
         """Return the word on the wire; bits without a place there are left out."""
-        if not self.others:
+        if not self.unnamed_shift:
             return int(status)
         bits = int(status)
-        word = bits >> self.others
+        word = bits >> self.unnamed_shift
         for bit, meaning in self.named.items():
             word = word & ~bit | (bit if bits & meaning else 0)
-        for bit, meaning in self.without.items():
+        for bit, meaning in self.inverted.items():
             word = word & ~bit | (0 if bits & meaning else bit)
         return word
 
@@ -496,7 +496,7 @@ class FramedDialect(Dialect):
             return message.message_id
         return self.encoder(message if isinstance(message, type) else type(message)).message_id
 
-    def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
+    def reinterpret_status(self, report: StatusReport, reader: Dialect) -> StatusReport:
         """Return a status, read by the dialect ``reader``, as this dialect reads the same bits."""
         if not isinstance(reader, FramedDialect):
             return report

@@ -185,17 +185,17 @@ class Framer:
             unread = bytes(buffer[start:]) if start < len(buffer) else b""
             self.buffer, self.start = unread + data if unread else bytes(data), 0
             return
-        filled, missing = self._filled, len(large) - self._filled
+        filled_size, missing = self._filled, len(large) - self._filled
         if len(data) <= missing:
-            large[filled : filled + len(data)] = data
+            large[filled_size : filled_size + len(data)] = data
             self._count_large_bytes(len(data))
             return
-        self.buffer, self.start, self._large = b"".join((large[:filled], data)), 0, None
+        self.buffer, self.start, self._large = b"".join((large[:filled_size], data)), 0, None
 
-    def room(self) -> memoryview:
-        """Return the buffer for a transport's next bytes; call :meth:`filled` next.
+    def get_buffer(self) -> memoryview:
+        """Return the buffer for a transport's next bytes; call :meth:`buffer_updated` next.
 
-        It is the remaining part of a large frame, or a buffer that grows whenever it is filled: so
+        It is the remaining part of a large frame, or a buffer that grows whenever it is full: so
         an idle camera has a small buffer, and a fast camera needs few reads.
         """
         if self._large is not None:
@@ -204,8 +204,8 @@ class Framer:
             self._read_buffer = self._store = memoryview(bytearray(FIRST_READ_BYTES))
         return self._read_buffer
 
-    def filled(self, count: int) -> bool:
-        """Accept ``count`` bytes that were written into :meth:`room`, like :meth:`feed`.
+    def buffer_updated(self, count: int) -> bool:
+        """Accept ``count`` bytes that were written into :meth:`get_buffer`, like :meth:`feed`.
 
         Returns False if a large frame is unfinished, so that there is nothing to cut yet.
         """

@@ -219,12 +219,13 @@ class Machine:
         policy: policy in place of the role's own; the emulator's quirks use it.
         trace: function that is called with the sender and each whole frame, in both directions, and
             with the error for bytes that make no frame.
-        kin: dialects whose sessions begin alike, of which the camera speaks one; ``dialect`` is the
-            first. The answer to Connect removes the dialects that it does not fit; if several
-            remain, :meth:`adopt` decides.
+        candidates: dialects whose sessions begin alike, of which the camera speaks one;
+            ``dialect`` is the first. The answer to Connect removes the dialects that it does not
+            fit; if several remain, :meth:`adopt` decides.
 
     Attributes:
-        room: function that returns the buffer for a stream's next bytes; call :meth:`filled` next.
+        get_buffer: function that returns the buffer for a stream's next bytes; call
+            :meth:`buffer_updated` next.
         transitions: the next state by state, sender and type of message; all other messages are
             illegal.
     """
@@ -240,7 +241,16 @@ class Machine:
         *("_send_transitions", "_sendable", "_sent_data_key", "_sent_frames", "_sent_together"),
         *("_state", "_status_id", "_status_size", "_trace", "_unfinished_age"),
         *("_unfinished_number", "_unfinished_since"),
-        *("counters", "dialect", "error", "kin", "replies", "role", "room", "transport"),
+        *(
+            "counters",
+            "dialect",
+            "error",
+            "candidates",
+            "replies",
+            "role",
+            "get_buffer",
+            "transport",
+        ),
     )
 
     transitions: ClassVar[Mapping[tuple[State, m.Sender, type[Message]], State]] = TRANSITIONS
@@ -254,10 +264,10 @@ class Machine:
         max_length: int = DEFAULT_MAX_LENGTH,
         policy: Policy | None = None,
         trace: Callable[[m.Sender, Frame | RemoteProtocolError], None] | None = None,
-        kin: Sequence[FramedDialect] = (),
+        candidates: Sequence[FramedDialect] = (),
     ) -> None:
         self.dialect: FramedDialect = dialect
-        self.kin: Sequence[FramedDialect] = kin or (dialect,)
+        self.candidates: Sequence[FramedDialect] = candidates or (dialect,)
         self.role = role
         self.transport = transport
         self.replies: bool = False
@@ -267,7 +277,7 @@ class Machine:
         self._bounded = self._policy.bounded
         self._header_size = dialect.header.size
         self._framer = Framer(dialect.header, max_length)
-        self.room: Callable[[], memoryview] = self._framer.room
+        self.get_buffer: Callable[[], memoryview] = self._framer.get_buffer
         self._unfinished_number = -1  # number of the unfinished frame
         self._unfinished_since = 0.0  # time at which its first bytes came
         self._unfinished_age = frame_age.UnfinishedFrame()
@@ -302,15 +312,17 @@ class Machine:
         self._use_dialect(dialect)
 
     def adopt(self, dialect: Dialect) -> None:
-        """Speak this dialect of :attr:`kin`; statuses that were returned before stay unchanged.
+        """Speak this one of :attr:`candidates`; statuses that were returned before stay unchanged.
 
         Raises:
-            LocalProtocolError: the dialect is not in :attr:`kin`.
+            LocalProtocolError: the dialect is not in :attr:`candidates`.
         """
-        chosen = [kin for kin in self.kin if kin is dialect]
+        chosen = [candidate for candidate in self.candidates if candidate is dialect]
         if not chosen:
-            raise LocalProtocolError(f"{dialect.name} is none of {[d.name for d in self.kin]}")
-        self.kin = chosen
+            raise LocalProtocolError(
+                f"{dialect.name} is none of {[d.name for d in self.candidates]}"
+            )
+        self.candidates = chosen
         self._use_dialect(chosen[0])
 
     def _use_dialect(self, dialect: FramedDialect) -> None:
@@ -408,8 +420,8 @@ class Machine:
             if b"".join(map(self.dialect.encode_frame, frames)) == data:
                 self._known_chunks[data] = messages, frames
 
-    def filled(self, count: int, now: float = 0.0) -> bool:
-        """Accept ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
+    def buffer_updated(self, count: int, now: float = 0.0) -> bool:
+        """Accept ``count`` bytes in the buffer of :meth:`get_buffer`, like :meth:`receive_data`.
 
         If the policy bounds frames, a frame that is not complete in time counts as broken.
 
@@ -423,7 +435,7 @@ class Machine:
         if self._ignores_bytes:
             return False
         self.counters.bytes_received += count
-        has_frames, is_unfinished = self._framer.filled(count), True
+        has_frames, is_unfinished = self._framer.buffer_updated(count), True
         if has_frames and self._known_deliveries and self._receive_known_delivery():
             return True
         if has_frames:
@@ -762,7 +774,7 @@ class Machine:
         """
         counters, framer, size = self.counters, self._framer, end - begin
         counters.frames_received += 1
-        if self._is_connecting and len(self.kin) > 1:
+        if self._is_connecting and len(self.candidates) > 1:
             self._narrow_kin(message_id, size)
         if self._trace is not None:
             self._trace(self._peer_sender, Frame(message_id, framer.take(begin, end)))
@@ -849,15 +861,17 @@ class Machine:
             self._known_messages = {self._status_id: self._known_statuses}
 
     def _narrow_kin(self, message_id: int, size: int) -> None:
-        """Remove the dialects of ``kin`` that have no such message, or another length for it."""
-        decoders = [dialect.decoders(self._peer_sender).get(message_id) for dialect in self.kin]
+        """Remove the candidates that have no such message, or another length for it."""
+        decoders = [
+            dialect.decoders(self._peer_sender).get(message_id) for dialect in self.candidates
+        ]
         fitting_dialects = tuple(
             dialect
-            for dialect, codec in zip(self.kin, decoders, strict=True)
+            for dialect, codec in zip(self.candidates, decoders, strict=True)
             if codec is not None and codec.fits(size)
         )
-        if fitting_dialects and fitting_dialects != self.kin:
-            self.kin = fitting_dialects
+        if fitting_dialects and fitting_dialects != self.candidates:
+            self.candidates = fitting_dialects
             self._use_dialect(fitting_dialects[0])
 
     def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:

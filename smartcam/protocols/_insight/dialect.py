@@ -170,7 +170,7 @@ class InSightDialect(Dialect):
             raise self.unsupported(kind)
         return 0
 
-    def called(self, message: m.Message) -> str:
+    def message_label(self, message: m.Message) -> str:
         """Return a message's name for errors, with its command."""
         kind = type(message)
         command = message.line if isinstance(message, Command) else _MNEMONICS.get(kind, "")

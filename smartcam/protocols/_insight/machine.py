@@ -121,7 +121,7 @@ class InSightMachine:
         max_length: longest data of an answer, bytes; an image may have 64 MiB.
         trace: function that is called with each piece in both directions, see :class:`Piece`, and
             with the error of bytes that broke the protocol; never with the password.
-        kin: unused, there is one dialect.
+        candidates: unused, there is one dialect.
 
     Raises:
         ConfigurationError: another role or transport.
@@ -135,12 +135,12 @@ class InSightMachine:
         *,
         max_length: int,
         trace: Callable[[m.Sender, Frame | RemoteProtocolError], None] | None = None,
-        kin: Sequence[Dialect] = (),
+        candidates: Sequence[Dialect] = (),
     ) -> None:
         if role is not Role.CLIENT or transport is not Transport.TCP:
             raise ConfigurationError("In-Sight native mode: the client's side of TCP only")
         self.dialect: InSightDialect = dialect
-        self.kin: Sequence[Dialect] = (dialect,)
+        self.candidates: Sequence[Dialect] = (dialect,)
         self.transport: Transport = transport
         self.replies: bool = True
         self.counters: Counters = Counters()
@@ -182,12 +182,12 @@ class InSightMachine:
         """Copy of the bytes of an unfinished line or text."""
         return self._reader.pending
 
-    def room(self) -> memoryview:
-        """Return the buffer for the next bytes; call :meth:`filled` next."""
+    def get_buffer(self) -> memoryview:
+        """Return the buffer for the next bytes; call :meth:`buffer_updated` next."""
         return self._store
 
-    def filled(self, count: int, now: float = 0.0) -> bool:
-        """Accept ``count`` bytes that were written into :meth:`room`."""
+    def buffer_updated(self, count: int, now: float = 0.0) -> bool:
+        """Accept ``count`` bytes that were written into :meth:`get_buffer`."""
         self.receive_data(bytes(self._store[:count]))
         return True
 

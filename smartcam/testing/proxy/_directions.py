@@ -80,7 +80,7 @@ class Pipe:
     def add_rules(self, rules: Sequence[Rule]) -> None:
         """Add rules after the present ones; their offsets count from the current position."""
         self._set_timing_rules(rules)
-        self._editor.add_rules([rule.ahead(self._editor.position) for rule in rules])
+        self._editor.add_rules([rule.moved_later(self._editor.position) for rule in rules])
         self._queue_edits(self._editor.feed(b""))
         self.run()
 

@@ -60,7 +60,7 @@ _BOUNDS: Mapping[str, _Bound] = {
     "number": ("datagrams count from 1", lambda number: number is None or number >= 1),
     "probability": ("probability must be 0 to 1", lambda share: 0 <= share <= 1),
     "copies": ("copies must be 1 to 100", lambda copies: 1 <= copies <= 100),
-    "behind": ("behind must be 1 or more datagrams", lambda count: count >= 1),
+    "overtaken_by": ("overtaken_by must be 1 or more datagrams", lambda count: count >= 1),
 }
 """Bounds of a rule's fields."""
 
@@ -99,7 +99,7 @@ class Rule:
         """Return True if the rule is for this direction of this connection."""
         return self.direction == direction and self.connection in {None, connection}
 
-    def ahead(self, by: int) -> Self:
+    def moved_later(self, by: int) -> Self:
         """Return a copy of the rule that acts ``by`` bytes, or datagrams, later."""
         return self
 
@@ -132,7 +132,7 @@ class PlacedRule(StreamRule):
 
     at: int = 0
 
-    def ahead(self, by: int) -> Self:
+    def moved_later(self, by: int) -> Self:
         """Return a copy of the rule that acts ``by`` bytes later."""
         return replace(self, at=self.at + by)
 
@@ -314,7 +314,7 @@ class DatagramRule(Rule):
             return chance.random() < self.probability
         return number == self.number
 
-    def ahead(self, by: int) -> Self:
+    def moved_later(self, by: int) -> Self:
         """Return the rule for the datagram that comes ``by`` datagrams later."""
         return self if self.number is None else replace(self, number=self.number + by)
 
@@ -352,10 +352,10 @@ class Reorder(DatagramRule):
     """Send the datagram after the datagrams that follow it.
 
     Args:
-        behind: number of datagrams of the same direction and connection that overtake it.
+        overtaken_by: number of datagrams of the same direction and connection that overtake it.
         seconds: the longest wait for them.
     """
 
-    behind: int = 1
+    overtaken_by: int = 1
     seconds: float = 1.0
     _bounds: ClassVar[Mapping[str, _Bound]] = _POSITIVE

@@ -75,7 +75,9 @@ class _Peer(Proxied):
                 if isinstance(rule, DatagramRule) and rule.concerns(self.number, direction):
                     seed = f"{rule.seed}:{self.number}:{direction}"
                     rng = Random(seed)  # noqa: S311 - no secret
-                    self._rules[direction].append((rule.ahead(self._datagrams[direction]), rng))
+                    self._rules[direction].append(
+                        (rule.moved_later(self._datagrams[direction]), rng)
+                    )
 
     def pass_datagram(self, direction: Direction, data: bytes) -> None:
         """Apply the rules to a datagram, and send what they leave of it."""
@@ -97,7 +99,10 @@ class _Peer(Proxied):
             elif isinstance(rule, Late):
                 transmission.delay += rule.seconds + rng.random() * rule.jitter
             elif isinstance(rule, Reorder):
-                transmission.gather, transmission.after_gathered = (rule.behind, rule.seconds), True
+                transmission.gather, transmission.after_gathered = (
+                    (rule.overtaken_by, rule.seconds),
+                    True,
+                )
         if (transmission.delay or transmission.after_gathered) and sum(
             map(len, self._delay_lines.values())
         ) >= MAX_WAITING_DATAGRAMS:

@@ -22,7 +22,7 @@ METHODS = ("tsai", "park", "horaud", "andreff", "daniilidis")
 @pytest.mark.long
 def test_trap_hand_eye_methods_are_not_all_tsais() -> None:
     """``calibrateHandEye(a, b, c, d, METHOD)`` takes the method as an output, and runs Tsai's."""
-    poses, views = scene("eye-in-hand", poses=5).measured(
+    poses, views = scene("eye-in-hand", poses=5).simulate_measurements(
         pixel_sigma=0.3, robot_sigmas=SIGMAS, random=np.random.default_rng(2)
     )
     found = [
@@ -68,7 +68,7 @@ def test_trap_rotation_of_a_line_is_refused() -> None:
 @pytest.mark.parametrize("name", METHODS)
 def test_trap_turns_about_one_axis_are_refused_by_each_method(name: str) -> None:
     """Tsai's gives 89 mm of error without a warning, Daniilidis' 3155 mm, Park's NaN."""
-    poses, views = scene("eye-in-hand").measured(
+    poses, views = scene("eye-in-hand").simulate_measurements(
         pixel_sigma=0.1, robot_sigmas=SIGMAS, random=np.random.default_rng(2)
     )
     turned = [

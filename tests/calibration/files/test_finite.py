@@ -100,7 +100,7 @@ def sheet_gives(found: SheetCalibration) -> list[np.ndarray]:
 
 @functools.cache
 def hand_eye() -> HandEyeCalibration:
-    poses, views = scene("eye-in-hand").measured(
+    poses, views = scene("eye-in-hand").simulate_measurements(
         pixel_sigma=0.0, robot_sigmas=RobotSigmas(0.0, 0.0), random=np.random.default_rng(1)
     )
     return calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=ROBOT_CAMERA)

@@ -42,7 +42,7 @@ Pairs = tuple[list[Transform], "list[TargetView]"]
 
 def measured(setup: Setup, pixel_sigma: float, robot_sigmas: RobotSigmas, **options: Any) -> Pairs:
     truth = scene(setup, **options)
-    return truth.measured(
+    return truth.simulate_measurements(
         pixel_sigma=pixel_sigma, robot_sigmas=robot_sigmas, random=np.random.default_rng(11)
     )
 
@@ -57,7 +57,7 @@ def calibrated(setup: Setup) -> HandEyeCalibration:
 @functools.cache
 def calibrated_from_poses(setup: Setup) -> HandEyeCalibration:
     truth = scene(setup, poses=6)
-    seen = [truth.seen(pose) for pose in truth.robot_poses]
+    seen = [truth.target_in_camera(pose) for pose in truth.robot_poses]
     return calibrate_hand_eye_from_poses(truth.robot_poses, seen, setup=setup)
 
 
@@ -89,7 +89,7 @@ def test_hand_eye_without_noise_is_exact(exact: HandEyeCalibration) -> None:
 
 def test_hand_eye_with_noise_is_as_good_as_it_expects(noisy: HandEyeCalibration) -> None:
     truth = scene(noisy.setup, poses=12)
-    bound = truth.bound(pixel_sigma=0.1, robot_sigmas=NOISE)
+    bound = truth.cramer_rao_bound(pixel_sigma=0.1, robot_sigmas=NOISE)
     turn, shift = truth.errors(noisy.camera_pose)
     assert turn < 2.5 * bound.rotation
     assert shift < 2.5 * bound.translation
@@ -188,7 +188,9 @@ def ratio(count: int, *, known: bool, bent: float = 0.0, board: Checkerboard = S
         truth = hand_eye_scene(
             board, CAMERA, setup=setup, poses=12, tilt=0.6, distance=0.5, random=random
         )
-        poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+        poses, views = truth.simulate_measurements(
+            pixel_sigma=0.1, robot_sigmas=NOISE, random=random
+        )
         if bent:
             heights = random.normal(0.0, bent, 12 if known else 1)
             views = [bowed(one, heights[i % len(heights)]) for i, one in enumerate(views)]
@@ -237,7 +239,7 @@ def test_lens_of_the_views_themselves_is_never_said_to_be_another_camera_s() -> 
     truth = hand_eye_scene(
         board, CAMERA, setup=SETUPS[0], poses=12, tilt=0.6, distance=0.5, random=random
     )
-    poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+    poses, views = truth.simulate_measurements(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
     views = [bowed(one, 2e-3) for one in views]
     found = calibrate_hand_eye(poses, views, setup=SETUPS[0], adjust="nothing")
     assert {one.code for one in found.warnings} == {Code.SHEET_NOT_EXACT}
@@ -256,7 +258,7 @@ def test_hand_eye_of_four_points_with_its_own_lens_is_not_suspected() -> None:
         distance=0.6,
         random=np.random.default_rng(1),
     )
-    poses, whole = truth.measured(
+    poses, whole = truth.simulate_measurements(
         pixel_sigma=0.05, robot_sigmas=NOISE, random=np.random.default_rng(3)
     )
     corners = [0, 7, 32, 39]
@@ -283,7 +285,7 @@ def test_hand_eye_numbers_a_target_that_looks_alike_after_half_a_turn(
     truth = hand_eye_scene(
         board, CAMERA, setup=setup, poses=9, tilt=0.6, distance=0.5, random=random
     )
-    poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+    poses, views = truth.simulate_measurements(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
     said = [half_turned(one) if number in (1, 4, 8) else one for number, one in enumerate(views)]
     camera = CAMERA if known else None
     found = calibrate_hand_eye(poses, said, setup=setup, camera=camera, adjust="nothing")
@@ -303,7 +305,9 @@ def test_hand_eye_of_a_bent_sheet_does_not_bend_its_lens() -> None:
         truth = hand_eye_scene(
             SHEET, CAMERA, setup=SETUPS[seed % 2], poses=12, tilt=0.6, distance=0.5, random=random
         )
-        poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+        poses, views = truth.simulate_measurements(
+            pixel_sigma=0.1, robot_sigmas=NOISE, random=random
+        )
         bent = [bowed(one, 7e-4) for one in views]
         found = calibrate_hand_eye(poses, bent, setup=truth.setup, adjust="nothing")
         assert Code.SHEET_NOT_EXACT in {one.code for one in found.warnings}
@@ -321,7 +325,9 @@ def test_hand_eye_without_a_lens_has_the_robots_motions_tell_it() -> None:
         truth = hand_eye_scene(
             board, CAMERA, setup=SETUPS[seed % 2], poses=12, tilt=0.6, distance=0.5, random=random
         )
-        poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+        poses, views = truth.simulate_measurements(
+            pixel_sigma=0.1, robot_sigmas=NOISE, random=random
+        )
         bent = [bowed(one, float(random.normal(0.0, 5e-4))) for one in views]
         both = [
             calibrate_hand_eye(poses, bent, setup=truth.setup, adjust=adjust)
@@ -381,7 +387,7 @@ def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
         random=random,
     )
     sigmas = RobotSigmas(math.radians(0.05), 3e-4)
-    poses, views = truth.measured(pixel_sigma=0.3, robot_sigmas=sigmas, random=random)
+    poses, views = truth.simulate_measurements(pixel_sigma=0.3, robot_sigmas=sigmas, random=random)
     found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=camera)
     assert found.target_scale == 1.0
     assert truth.errors(found.camera_pose)[1] < 1e-3
@@ -393,7 +399,7 @@ def test_second_camera_on_the_hand_is_where_the_pair_has_it() -> None:
     poses, views = measured("eye-in-hand", 0.1, NOISE)
     turn, shift = exp_rotation(np.array([0, -0.1, 0])), np.array([-0.06, 0, 0])
     beside = Transform("right", "camera", turn, shift)
-    seen = [(beside @ truth.seen(pose)).rigid for pose in truth.robot_poses]
+    seen = [(beside @ truth.target_in_camera(pose)).rigid for pose in truth.robot_poses]
     placed = [Transform("camera", "target", *one) for one in seen]
     others = [view(SHEET, CAMERA, one, sigma=0.1, random=random) for one in placed]
     hand = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
@@ -496,7 +502,7 @@ def test_hand_eye_of_few_poses_keeps_a_wrong_one() -> None:
 
 def test_hand_eye_from_poses_leaves_a_wrong_one_out() -> None:
     truth = scene("eye-to-hand", poses=9)
-    seen = [truth.seen(pose) for pose in truth.robot_poses]
+    seen = [truth.target_in_camera(pose) for pose in truth.robot_poses]
     shift = Transform("camera", "camera", np.eye(3), np.array([0.0, 0.01, 0.0]))
     seen[7] = shift @ seen[7]
     found = calibrate_hand_eye_from_poses(truth.robot_poses, seen, setup="eye-to-hand")
@@ -555,7 +561,7 @@ def test_hand_eye_of_pure_shifts_is_refused() -> None:
         )
         for i in range(6)
     ]
-    seen = [truth.seen(pose) for pose in poses]
+    seen = [truth.target_in_camera(pose) for pose in poses]
     with refused("POSES_TOO_SIMILAR", "0.5 deg apart or more, got 1: pure shifts do not tell"):
         calibrate_hand_eye_from_poses(poses, seen, setup="eye-in-hand")
 
@@ -572,7 +578,7 @@ def test_hand_eye_of_turns_about_one_axis_is_refused() -> None:
         )
         for i in range(8)
     ]
-    seen = [truth.seen(pose) for pose in poses]
+    seen = [truth.target_in_camera(pose) for pose in poses]
     with refused("INSUFFICIENT_ROTATION", "2 deg rms about the second one, got"):
         calibrate_hand_eye_from_poses(poses, seen, setup="eye-in-hand")
 
@@ -664,7 +670,9 @@ def test_predicted_error_is_that_of_many_calibrations() -> None:
     pixels = CAMERA.project((pose @ truth.camera_pose).inverse().apply(centre))
     random, off, predicted = np.random.default_rng(9), [], []
     for _ in range(9):
-        poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+        poses, views = truth.simulate_measurements(
+            pixel_sigma=0.1, robot_sigmas=NOISE, random=random
+        )
         found = calibrate_hand_eye(
             poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing", method="robot"
         )
@@ -710,7 +718,7 @@ def test_point_errors_of_other_poses_are_the_held_out_error(setup: Setup) -> Non
 @pytest.mark.parametrize("setup", ONE_LONG)
 def test_point_errors_of_poses_of_the_target_are_its_origins(setup: Setup) -> None:
     truth = scene(setup, poses=6)
-    seen = [truth.seen(pose) for pose in truth.robot_poses]
+    seen = [truth.target_in_camera(pose) for pose in truth.robot_poses]
     found = calibrated_from_poses(setup)
     up = Transform("camera", "camera", np.eye(3), np.array([0.0, 0.003, 0.004]))
     errors = found.point_errors(truth.robot_poses, [up @ one for one in seen])
@@ -757,7 +765,7 @@ def test_hand_eye_is_stored_bit_by_bit(noisy: HandEyeCalibration, tmp_path: Path
 
 def test_hand_eye_from_poses_is_stored_bit_by_bit() -> None:
     truth = scene("eye-to-hand", poses=3)
-    seen = [truth.seen(pose) for pose in truth.robot_poses]
+    seen = [truth.target_in_camera(pose) for pose in truth.robot_poses]
     found = calibrate_hand_eye_from_poses(truth.robot_poses, seen, setup="eye-to-hand")
     data = json.loads(json.dumps(found.to_data()))
     assert HandEyeCalibration.from_data(data).to_data() == found.to_data()

@@ -67,7 +67,7 @@ def test_hand_eye_that_takes_noise_for_another_error_expects_the_difference() ->
     truth = hand_eye_scene(
         SHEET, CAMERA, setup="eye-to-hand", poses=12, tilt=0.6, distance=0.5, random=random
     )
-    poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+    poses, views = truth.simulate_measurements(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
     found = calibrate_hand_eye(poses, views, setup="eye-to-hand", camera=CAMERA, adjust="nothing")
     assert found.method == "reprojection"
     assert truth.errors(found.camera_pose)[1] < 1.5 * found.translation_error
@@ -103,7 +103,7 @@ def test_remark_on_rotation_does_not_come_and_go_with_a_pose(rms: float, told: b
     truth, poses = scene("eye-in-hand"), _nodding(rms)
     for out in (None, 0, 5):
         some = [pose for number, pose in enumerate(poses) if number != out]
-        seen = [truth.seen(pose) for pose in some]
+        seen = [truth.target_in_camera(pose) for pose in some]
         found = calibrate_hand_eye_from_poses(some, seen, setup="eye-in-hand", method="shah")
         codes = {one.code for one in found.warnings}
         assert (Code.INSUFFICIENT_ROTATION in codes) == told

@@ -40,7 +40,9 @@ Pairs = tuple[list[Transform], "list[TargetView]"]
 
 def measured(setup: Setup, *, poses: int = 10, sigmas: RobotSigmas = NOISE) -> Pairs:
     random = np.random.default_rng(11)
-    return scene(setup, poses=poses).measured(pixel_sigma=0.1, robot_sigmas=sigmas, random=random)
+    return scene(setup, poses=poses).simulate_measurements(
+        pixel_sigma=0.1, robot_sigmas=sigmas, random=random
+    )
 
 
 def calibrated(
@@ -60,7 +62,7 @@ def problem(poses: list[Transform], setup: Setup) -> Problem:
     truth = scene(setup, poses=len(poses))
     seen, said = (
         Rigid.stack(one.rigid for one in some)
-        for some in ([truth.seen(pose) for pose in truth.robot_poses], poses)
+        for some in ([truth.target_in_camera(pose) for pose in truth.robot_poses], poses)
     )
     white = np.broadcast_to(np.eye(6), (len(poses), 6, 6))
     return Problem(RobotPoses(said, setup == "eye-in-hand"), PoseObservations(white, seen), seen)
@@ -89,7 +91,7 @@ def test_hand_eye_of_poses_in_millimetres_is_refused() -> None:
     with refused("POOR_FIT", "mm when read as millimetres: expected metres"):
         calibrated(wrong, views)
     truth = scene("eye-in-hand", poses=10)
-    seen = [truth.seen(one) for one in truth.robot_poses]
+    seen = [truth.target_in_camera(one) for one in truth.robot_poses]
     with refused("POOR_FIT", "as millimetres"):
         calibrate_hand_eye_from_poses(wrong, seen, setup="eye-in-hand")
 
@@ -180,7 +182,7 @@ def test_hand_eye_of_a_robot_that_stood_for_half_of_the_views_is_refused() -> No
         distance=0.5,
         random=np.random.default_rng(3),
     )
-    poses, views = truth.measured(
+    poses, views = truth.simulate_measurements(
         pixel_sigma=0.1, robot_sigmas=NOISE, random=np.random.default_rng(4)
     )
     with refused("POOR_FIT"):

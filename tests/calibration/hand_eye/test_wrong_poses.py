@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 TRUTH = scene("eye-in-hand", poses=6)
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)
-SEEN = [TRUTH.seen(one) for one in TRUTH.robot_poses]
+SEEN = [TRUTH.target_in_camera(one) for one in TRUTH.robot_poses]
 ROBOT = TRUTH.robot_poses
 MIRRORS = [np.diag(one) for one in ([1.0, -1, 1], [1.0, 1, -1], [-1.0, -1, -1])]
 IMAGE = np.zeros((480, 640), dtype=np.uint8)
@@ -38,7 +38,9 @@ def matrix(pose: Transform) -> Any:
 
 
 def views() -> list[TargetView]:
-    return TRUTH.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=np.random.default_rng(1))[1]
+    return TRUTH.simulate_measurements(
+        pixel_sigma=0.1, robot_sigmas=NOISE, random=np.random.default_rng(1)
+    )[1]
 
 
 def from_poses(robot: Any, seen: Any = SEEN, **options: Any) -> None:
@@ -52,7 +54,7 @@ def from_poses(robot: Any, seen: Any = SEEN, **options: Any) -> None:
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
 def test_hand_eye_of_a_left_handed_base_is_refused(setup: Setup, mirror: Any) -> None:
     truth = scene(setup, poses=6)
-    seen = [truth.seen(one) for one in truth.robot_poses]
+    seen = [truth.target_in_camera(one) for one in truth.robot_poses]
     robot = [
         Transform(one.target, one.source, mirror @ one.rotation @ mirror, mirror @ one.translation)
         for one in truth.robot_poses
@@ -161,7 +163,7 @@ def test_matrices_in_place_of_transforms_are_refused(make: Any, text: str) -> No
 
 @pytest.mark.judged
 def test_poses_visited_thrice_tell_no_more_than_once() -> None:
-    robot, seen = TRUTH.measured(
+    robot, seen = TRUTH.simulate_measurements(
         pixel_sigma=0.1, robot_sigmas=NOISE, random=np.random.default_rng(1)
     )
     options: dict[str, Any] = {"setup": "eye-in-hand", "camera": TRUTH.camera, "method": "robot"}
@@ -176,4 +178,4 @@ def test_poses_visited_thrice_tell_no_more_than_once() -> None:
 
 def more_views(seed: int) -> list[TargetView]:
     random = np.random.default_rng(seed)
-    return TRUTH.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)[1]
+    return TRUTH.simulate_measurements(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)[1]

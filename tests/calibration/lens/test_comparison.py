@@ -32,7 +32,7 @@ def test_calibrations_of_one_lens_are_the_same_within_their_noise(distance: floa
     assert found.ratio is not None
     assert 0.4 < found.ratio < 1.6
     assert found.predicted is not None
-    assert 0.3 < found.observed.mean / found.predicted.mean < 3.0
+    assert 0.3 < found.observed.rms / found.predicted.rms < 3.0
     assert found.verdict.startswith("the same within their noise: ")
 
 
@@ -57,7 +57,7 @@ def test_bare_lenses_are_compared_without_a_verdict() -> None:
     assert (found.same, found.ratio, found.chance, found.expected) == (None, None, None, None)
     assert found.predicted is None
     assert found.verdict.startswith("no verdict: ")
-    assert 0.0 < found.observed.mean < 0.3
+    assert 0.0 < found.observed.rms < 0.3
 
 
 def test_turned_camera_is_no_difference() -> None:
@@ -94,7 +94,7 @@ def test_places_beyond_a_model_have_no_difference() -> None:
     folding = dataclasses.replace(LENS, distortion=np.array([-0.5, 0, 0, 0, 0]))
     found = compare(folding, folding)
     assert np.isnan(found.difference[0, 0]).all()
-    assert found.observed.mean < 1e-4
+    assert found.observed.rms < 1e-4
 
 
 def test_images_of_two_sizes_are_refused() -> None:

@@ -89,7 +89,7 @@ def pair(count: int = 6) -> StereoCalibration:
 
 def hand(setup: Setup, *, count: int = 8, views: bool = True) -> HandEyeCalibration:
     truth = scene(setup, poses=count, seed=7)
-    seen = [truth.seen(pose) for pose in truth.robot_poses]
+    seen = [truth.target_in_camera(pose) for pose in truth.robot_poses]
     return HandEyeCalibration(
         setup=setup,
         camera_pose=truth.camera_pose,

@@ -22,21 +22,21 @@ CHARUCO = Charuco(columns=7, rows=5, square=0.03, marker=0.0225)
 
 def test_best_view_comes_first_and_each_view_has_its_gain() -> None:
     found = suggest_views(CENTRE.calibration())
-    means = [one.mean for one in found]
+    means = [one.rms_with for one in found]
     assert len(found) > 60
     assert means == sorted(means)
-    assert means[-1] < found[0].present
-    assert found[0].mean < 0.1 * found[0].present
+    assert means[-1] < found[0].rms_without
+    assert found[0].rms_with < 0.1 * found[0].rms_without
 
 
 def test_mean_of_a_view_is_the_uncertainty_after_it() -> None:
     best = suggest_views(CENTRE.calibration(), distance=0.4)[0]
     taken = Bench(LENS, [*CENTRE.poses, best.transform])
     before = CENTRE.calibration().uncertainty(distance=0.4, shape=(9, 12))
-    assert best.present == pytest.approx(before.figures.mean, rel=1e-6)
+    assert best.rms_without == pytest.approx(before.figures.rms, rel=1e-6)
     # the gauge includes the new view, too, so both differ a little
     after = taken.calibration().uncertainty(distance=0.4, shape=(9, 12))
-    assert best.mean == pytest.approx(after.figures.mean, rel=0.3)
+    assert best.rms_with == pytest.approx(after.figures.rms, rel=0.3)
 
 
 def test_view_at_a_new_place_of_the_target_helps_more() -> None:
@@ -88,7 +88,7 @@ def test_fixed_values_stay_fixed() -> None:
     held = CENTRE.calibration()
     held.covariance[8] = held.covariance[:, 8] = 0.0  # k3
     found = suggest_views(held)
-    assert all(math.isfinite(one.mean) and one.mean < one.present for one in found)
+    assert all(math.isfinite(one.rms_with) and one.rms_with < one.rms_without for one in found)
 
 
 def test_invalid_distance_is_refused() -> None:
@@ -116,7 +116,7 @@ def test_ten_suggested_views_beat_ten_random_ones(camera: CameraModel) -> None:
             found = suggest_views(Bench(camera, guided).calibration(number))
             guided.append(held(found[0], random))
         means = [
-            Bench(camera, poses).calibration().uncertainty().figures.mean
+            Bench(camera, poses).calibration().uncertainty().figures.rms
             for poses in (guided, anyhow)
         ]
         ratios.append(means[1] / means[0])

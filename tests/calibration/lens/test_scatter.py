@@ -54,7 +54,7 @@ def test_predicted_uncertainty_is_right_for_views_with_common_errors(
     middle = Lens(with_lens(LEFT, lenses.mean(axis=0)), np.zeros((9, 9)), found[0].target_points)
     compared = [compare_lenses(Lens.of(one), middle, distance=0.5) for one in found]
     observed = np.mean([one.difference**2 for one in compared], axis=0).sum(axis=2)
-    predicted = np.mean([one.predicted.mean**2 for one in compared if one.predicted])
+    predicted = np.mean([one.predicted.rms**2 for one in compared if one.predicted])
     assert np.sqrt(2 * predicted / observed.mean()) == pytest.approx(1.0, abs=0.15)
 
 

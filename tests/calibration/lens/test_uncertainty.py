@@ -28,14 +28,14 @@ def test_map_reaches_from_corner_to_corner_and_has_its_figures() -> None:
     assert found.sigma.shape == found.across.shape == (5, 7)
     assert found.figures.centre == found.sigma[2, 3]
     assert found.figures.worst == found.sigma.max()
-    assert found.figures.mean == pytest.approx(math.sqrt((found.sigma**2).mean()))
+    assert found.figures.rms == pytest.approx(math.sqrt((found.sigma**2).mean()))
     assert 3 * found.figures.centre < found.figures.corners < found.figures.worst * 1.0001
 
 
 def test_uncertainty_is_least_at_the_target_and_ends_at_infinity() -> None:
-    means = [CALIBRATION.uncertainty(distance=one).figures.mean for one in (0.4, 1.0, 3.0, 1e6)]
+    means = [CALIBRATION.uncertainty(distance=one).figures.rms for one in (0.4, 1.0, 3.0, 1e6)]
     assert means == sorted(means)
-    assert CALIBRATION.uncertainty().figures.mean == pytest.approx(means[-1], rel=1e-4)
+    assert CALIBRATION.uncertainty().figures.rms == pytest.approx(means[-1], rel=1e-4)
 
 
 def test_across_converts_pixels_to_metres_at_the_distance() -> None:
@@ -68,7 +68,7 @@ def test_corner_that_the_model_does_not_reach_has_no_number() -> None:
     assert np.isnan(found.sigma[0, 0])
     assert np.isnan(found.figures.corners)  # the view reaches none of them
     assert np.isfinite(found.sigma[12, 16])
-    assert np.isfinite(found.figures.mean)
+    assert np.isfinite(found.figures.rms)
 
 
 def test_corners_that_are_reached_have_a_mean() -> None:
@@ -95,7 +95,7 @@ def test_map_of_a_calibration_is_that_of_its_bound() -> None:
     poses = spread_poses(lenskit.LEFT, 25)
     found = calibrate_intrinsics(lenskit.seen(lenskit.LEFT, poses)).uncertainty(distance=0.5)
     bound = Bench(lenskit.LEFT, poses).calibration().uncertainty(distance=0.5)
-    assert found.figures.mean == pytest.approx(bound.figures.mean, rel=0.3)
+    assert found.figures.rms == pytest.approx(bound.figures.rms, rel=0.3)
 
 
 @pytest.mark.long
@@ -120,4 +120,4 @@ def test_lens_model_that_ends_before_the_image_has_a_remark_and_figures() -> Non
     assert "the model plumb_bob ends before the image does" in remark.text
     known = found.uncertainty(distance=0.2).figures
     assert math.isfinite(known.worst)
-    assert math.isfinite(known.mean)
+    assert math.isfinite(known.rms)

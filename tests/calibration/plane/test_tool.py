@@ -35,14 +35,14 @@ def test_tool_tip_of_four_orientations_is_exact() -> None:
     np.testing.assert_allclose(found.tip, TIP, atol=1e-12)
     np.testing.assert_allclose(found.point, POINT, atol=1e-12)
     np.testing.assert_allclose(found.residuals, np.zeros((4, 3)), atol=1e-12)
-    assert found.blind is None
+    assert found.unknown_axis is None
 
 
 def test_tool_tip_of_two_yaws_is_exact_across_their_axis() -> None:
     found = fit_tool_tip([touching(DOWN), touching(DOWN @ yaw(np.pi))])
     np.testing.assert_allclose(found.tip, [*TIP[:2], 0], atol=1e-12)
-    assert found.blind is not None
-    np.testing.assert_allclose(np.abs(found.blind), [0, 0, 1], atol=1e-12)
+    assert found.unknown_axis is not None
+    np.testing.assert_allclose(np.abs(found.unknown_axis), [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(found.point[:2], POINT[:2], atol=1e-12)
 
 

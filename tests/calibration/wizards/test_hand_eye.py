@@ -27,7 +27,7 @@ TRUTH = scene("eye-in-hand", poses=8, seed=7)
 @functools.cache
 def picture(number: int) -> Any:
     """Return what the camera sees at a pose of the robot."""
-    return render(SHEET, CAMERA, TRUTH.seen(TRUTH.robot_poses[number]), blur=0.7)
+    return render(SHEET, CAMERA, TRUTH.target_in_camera(TRUTH.robot_poses[number]), blur=0.7)
 
 
 class Cell:

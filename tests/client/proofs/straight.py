@@ -1,11 +1,11 @@
 """The short way of a trigger's usual answers gives what the long one gives, event for event.
 
 Two clients get the same random triggers, questions, subscribers, ends and bytes. One takes what
-came before as a whole (:meth:`Machine.filled`, :meth:`Machine.send_all`) and the usual answers to a
-trigger in one step (``Dispatch._handle_usual_round``); the other one, which judges, reads each
-frame by itself and hands on one event after the other. After each step everything that either knows
-has to be the same: the bytes written, the events, what is owed, the camera's state, the evidence,
-every account, every outcome, every subscriber's items.
+came before as a whole (:meth:`Machine.buffer_updated`, :meth:`Machine.send_all`) and the usual
+answers to a trigger in one step (``Dispatch._handle_usual_round``); the other one, which judges,
+reads each frame by itself and hands on one event after the other. After each step everything that
+either knows has to be the same: the bytes written, the events, what is owed, the camera's state,
+the evidence, every account, every outcome, every subscriber's items.
 
 Long form: ``python -m tests.client.proofs.straight --events 1000000 --seed 1``. It prints how many
 deliveries took the short way, and ends with 1 at the first difference.
@@ -221,13 +221,13 @@ class Client:
 
     def hear(self, data: bytes, now: float) -> None:
         """Take bytes in one delivery."""
-        room = self.machine.room()
+        room = self.machine.get_buffer()
         while data:
             some, data = data[: len(room)], data[len(room) :]
             room[: len(some)] = some
-            if self.machine.filled(len(some), now):
+            if self.machine.buffer_updated(len(some), now):
                 self._hand_on(now)
-            room = self.machine.room()
+            room = self.machine.get_buffer()
 
     def _hand_on(self, now: float) -> None:
         self.events = self.machine.events()
@@ -247,7 +247,7 @@ class Client:
         machine, waits, results = self.machine, self.waits, self.results
         self.written = self.written[-128:]
         yield self.written
-        yield machine.counters, machine.state, machine.buffered, machine.room().nbytes
+        yield machine.counters, machine.state, machine.buffered, machine.get_buffer().nbytes
         yield machine._pending_ids, self.frames, self.deliveries
         yield _parts(self.state, "_listeners")
         yield (

@@ -85,7 +85,7 @@ class Conversation:
         Raises:
             ConfigurationError: the dialect has no such quirk, or cannot use a parameter.
         """
-        tries = protocol.tries(self.transport, self.dialect, self.quirks, self.parameters)
+        tries = protocol.dialect_groups(self.transport, self.dialect, self.quirks, self.parameters)
         return tries[0]
 
 
@@ -114,7 +114,7 @@ class Player:
             conversation.transport,
             max_length=MAX_LENGTH,
             trace=trace,
-            kin=self.group,
+            candidates=self.group,
         )
         self.step_index: int = 0
 
@@ -164,13 +164,13 @@ class Player:
             return flatten_events(self.machine.events())
         events: list[Any] = []
         while chunk:
-            buffer = self.machine.room()
+            buffer = self.machine.get_buffer()
             if not len(buffer):
                 raise AssertionError("room() gave no room for a single byte")
             count = min(len(buffer), len(chunk))
             buffer[:count] = chunk[:count]
             chunk = chunk[count:]
-            if self.machine.filled(count, 0.0):
+            if self.machine.buffer_updated(count, 0.0):
                 events += flatten_events(self.machine.events())
         return events + flatten_events(self.machine.events())
 

@@ -94,7 +94,7 @@ class DialectChecks(Parameters):
         surplus = set(protocol.detection) - used_transports
         assert not surplus, f"detection: no scheme has {surplus}"
         for transport in used_transports:
-            tries = protocol.tries(transport)
+            tries = protocol.dialect_groups(transport)
             tried = {dialect.name for group in tries for dialect in group}
             assert all(tries), f"detection over {transport.value}: a group is empty"
             missing = set(protocol.dialects) - tried
@@ -102,7 +102,7 @@ class DialectChecks(Parameters):
             unknown = tried - set(protocol.dialects)
             assert not unknown, f"detection over {transport.value}: {unknown} is not a dialect"
             for name in protocol.dialects:
-                (group,) = protocol.tries(transport, name)
+                (group,) = protocol.dialect_groups(transport, name)
                 others = {dialect.name for dialect in group} - {name}
                 assert not others, f"pinned {name!r} over {transport.value} tries {others}, too"
 
@@ -169,8 +169,8 @@ class DialectChecks(Parameters):
             message = make_example(kind, dialect)
             assert isinstance(dialect.message_id(kind), int), f"message_id({kind.__name__})"
             assert dialect.message_id(message) == dialect.message_id(kind), kind.__name__
-            called = dialect.called(message)
-            assert kind.__name__ in called, f"called({kind.__name__}) is {called!r}"
+            label = dialect.message_label(message)
+            assert kind.__name__ in label, f"message_label({kind.__name__}) is {label!r}"
             unknown = set(dialect.fields(kind)) - {name for name, _ in m.wire_fields(kind)}
             assert not unknown, f"fields({kind.__name__}) has {unknown}"
 

@@ -275,7 +275,7 @@ class MachineChecks(Parameters):
         machine, group = player.machine, player.group
         assert machine.state is State.IDLE, f"at first it is {machine.state}"
         assert machine.dialect in group, f"dialect: {machine.dialect} was not asked for"
-        assert machine.kin[0] in group, f"kin: {machine.kin} was not asked for"
+        assert machine.candidates[0] in group, f"candidates: {machine.candidates} was not asked for"
         assert machine.transport is conversation.transport, f"transport: {machine.transport}"
         assert isinstance(machine.replies, bool), f"replies: expected a bool, {machine.replies!r}"
         assert isinstance(machine.counters, Counters), f"counters: {machine.counters!r}"
@@ -287,8 +287,8 @@ class MachineChecks(Parameters):
             items.append(None)
             assert take() == [], f"{name}() gives what its caller did to an earlier list"
         player.play()
-        machine.adopt(machine.kin[0])
-        assert list(machine.kin) == [machine.dialect], f"adopt() left {machine.kin}"
+        machine.adopt(machine.candidates[0])
+        assert list(machine.candidates) == [machine.dialect], f"adopt() left {machine.candidates}"
 
     def test_state_follows_the_session(self, conversation: Conversation) -> None:
         """Check the states: connecting after Connect, connected after its answer, then failed."""
