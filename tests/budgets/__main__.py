@@ -27,7 +27,6 @@ from typing import Any
 
 from tests import ROOT
 from tests.budgets import counting
-from tests.budgets.counting import MAX_FACTOR
 from tests.budgets.table import EXAMPLE, FREE, PAGE, PARSERS, Budget, budgets, row
 
 NEGLIGIBLE = 200_000
@@ -90,7 +89,7 @@ def count_instructions(
 def wrong(name: str, kind: str, grown: counting.Growth, budget: Budget | None) -> list[str]:
     """Return what is wrong with the instructions of an input."""
     found = []
-    if grown.factor > MAX_FACTOR and grown.added > NEGLIGIBLE:
+    if grown.is_faster and grown.added > NEGLIGIBLE:
         found.append(
             f"{name}: {kind}: the second doubling adds {grown.factor:.2f} times as many "
             f"instructions as the first: {grown.counts} for {grown.sizes} bytes"

@@ -46,9 +46,28 @@ class Growth(NamedTuple):
         """The cost that the second doubling adds for each byte that it adds."""
         return self.added / max(1, self.sizes[2] - self.sizes[1])
 
+    @property
+    def is_faster(self) -> bool:
+        """True if the cost grows faster than the input.
+
+        A saving or a cost that appears at one size only, such as a buffer that got longer, moves
+        the factor, too; then the second doubling costs no more a byte than the whole input. Work
+        of n² costs 1.5 times as much there, and its factor is 4.
+        """
+        if self.factor <= MAX_FACTOR:
+            return False
+        average = self.counts[2] / self.sizes[2]
+        return self.factor > MAX_UNEVEN_FACTOR or self.per_byte > MAX_MARGIN * average
+
 
 MAX_FACTOR = 2.3
 """The most that the second doubling may add, as a multiple of the first: 2 and some for sorting."""
+
+MAX_UNEVEN_FACTOR = 3.0
+"""The most that it may add where the cost of a byte stays the same."""
+
+MAX_MARGIN = 1.1
+"""The cost of a byte in the second doubling, as a multiple of the average; n log n has 1.07."""
 
 STEADY_FACTOR = 2.1
 """The least that the doubling before that adds then: work of n + b n² with 2.3 has 2.16 there."""
@@ -63,7 +82,7 @@ def grow(parser: Parser, make: Make, count: Callable[[Parser, Any], int], size: 
     """
     parser.run(make(size))
     grown = _count(parser, make, count, size)
-    if grown.factor <= MAX_FACTOR:
+    if not grown.is_faster:
         return grown
     before = _count(parser, make, count, size // 2)
     again = _count(parser, make, count, size)
