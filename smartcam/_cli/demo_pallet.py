@@ -166,7 +166,7 @@ async def _teach_parts(demo: _Demo) -> PartModel:
             (
                 part.kind,
                 model.symmetry.text(),
-                str(len(model.segments.halves)),
+                str(len(model.segments.half_lengths)),
                 f"{1e3 * position_sigma * demo.table.pixel:.4f} mm",
                 "-" if math.isnan(angle_sigma) else f"{math.degrees(angle_sigma):.4f} deg",
             )

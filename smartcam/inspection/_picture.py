@@ -145,7 +145,7 @@ class Picture:
         return brightness
 
     @cached_property
-    def ends(self) -> tuple[int, int]:
+    def saturation_levels(self) -> tuple[int, int]:
         """Saturation levels of black and white in :attr:`levels`.
 
         These are the least and the largest level that ``depth`` allows. But if the picture's least
@@ -159,7 +159,7 @@ class Picture:
 
         A colour is saturated at the largest level, and at 0 if another colour is bright, since a
         camera's colour correction gives negative values there. Pixels that are black in all colours
-        show in :attr:`levels`.
+        are not marked here: a caller finds them in :attr:`levels`.
         """
         if not self.has_colours:
             return None

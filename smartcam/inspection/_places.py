@@ -83,8 +83,8 @@ def _parse_region(given: object) -> Region:
         x, y, width, height = map(float, items)
         if width <= 0 or height <= 0:
             raise ValueError(f"expected a width and a height above 0, got {width:g} x {height:g}")
-        right, below = x + width, y + height
-        return Region(((x, y), (right, y), (right, below), (x, below)))
+        right, bottom = x + width, y + height
+        return Region(((x, y), (right, y), (right, bottom), (x, bottom)))
     if 3 <= len(items) <= MAX_CORNERS and all(
         isinstance(item, (list, tuple)) and len(item) == 2 and all(map(_is_coordinate, item))
         for item in items
@@ -104,7 +104,7 @@ def _is_coordinate(value: object) -> bool:
     )
 
 
-_PLACE: Final = {"type": "array", "items": {"type": "number"}, "minItems": 2}
+_CORNER: Final = {"type": "array", "items": {"type": "number"}, "minItems": 2}
 RegionSetting = Annotated[
     Region,
     PlainValidator(_parse_region),
@@ -112,7 +112,7 @@ RegionSetting = Annotated[
         {
             "anyOf": [
                 {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},
-                {"type": "array", "items": _PLACE, "minItems": 3, "maxItems": MAX_CORNERS},
+                {"type": "array", "items": _CORNER, "minItems": 3, "maxItems": MAX_CORNERS},
             ]
         }
     ),
@@ -129,7 +129,7 @@ class PlacedRegion:
         left: first column that the region touches, within the picture.
         top: first row.
         right: column after the last.
-        below: row after the last.
+        bottom: row after the last.
         outside: largest distance by which the region reaches out of the picture, pixels.
     """
 
@@ -137,18 +137,18 @@ class PlacedRegion:
     left: int
     top: int
     right: int
-    below: int
+    bottom: int
     outside: float
 
     @property
     def is_empty(self) -> bool:
         """True if the region is outside of the picture."""
-        return self.right <= self.left or self.below <= self.top
+        return self.right <= self.left or self.bottom <= self.top
 
     @property
     def rows_columns(self) -> tuple[slice, slice]:
         """Slices of rows and columns that contain the region."""
-        return slice(self.top, self.below), slice(self.left, self.right)
+        return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def contains(self, point: tuple[float, float]) -> bool:
         """Return True if a point of the picture is in the region or on its border."""
@@ -158,7 +158,7 @@ class PlacedRegion:
 
     def mask(self) -> NDArray[np.uint8]:
         """Return a mask (H, W) of the region's rows and columns: 255 in the region, else 0."""
-        mask = np.zeros((self.below - self.top, self.right - self.left), np.uint8)
+        mask = np.zeros((self.bottom - self.top, self.right - self.left), np.uint8)
         corners = np.rint(self.corners - (self.left, self.top)).astype(np.int32)
         load("cv2", "inspection needs").fillPoly(mask, [corners], 255)
         return mask
@@ -171,8 +171,8 @@ def place_region(
 
     Args:
         region: the region; None: the whole picture.
-        pose: frame of reference of the corners. None: ``[0, 0, width, height]`` is the whole
-            picture, from half a pixel before the first centre.
+        pose: frame of reference of the corners; None: the picture itself, with (0, 0) at the upper
+            left corner of its first pixel.
         size: width and height of the picture, pixels.
     """
     if region is None or pose is None:
@@ -192,12 +192,12 @@ def _place_fixed(region: Region | None, size: tuple[int, int]) -> PlacedRegion:
 
 def _bound_region(corners: NDArray[np.float64], size: tuple[int, int]) -> PlacedRegion:
     width, height = size
-    (left, top), (right, below) = corners.min(axis=0) + 0.5, corners.max(axis=0) + 0.5
+    (left, top), (right, bottom) = corners.min(axis=0) + 0.5, corners.max(axis=0) + 0.5
     return PlacedRegion(
         corners,
         max(math.floor(left), 0),
         max(math.floor(top), 0),
         min(math.ceil(right), width),
-        min(math.ceil(below), height),
-        float(max(-left, -top, right - width, below - height, 0.0)),
+        min(math.ceil(bottom), height),
+        float(max(-left, -top, right - width, bottom - height, 0.0)),
     )

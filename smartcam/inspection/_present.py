@@ -1,4 +1,4 @@
-"""The tool `present`: count spots of a colour or a grey level, with their places."""
+"""The tool `present` (are they there?): count spots of a colour or a grey level."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Present(Tool[PresentSettings]):
     def __init__(self, settings: PresentSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
         count = settings.count
-        self._least, self._most = count if isinstance(count, tuple) else (count, count)
+        self._min_count, self._max_count = count if isinstance(count, tuple) else (count, count)
 
     @property
     def fields(self) -> str:
@@ -120,8 +120,9 @@ class Present(Tool[PresentSettings]):
         lacks_colours = self.settings.colour is not None and not view.picture.has_colours
         spots = [] if lacks_colours else self._find_spots(view)
         count = len(spots)
-        ok = not lacks_colours and self._least <= count <= self._most
-        wanted = f"{self._least}" if self._least == self._most else f"{self._least} to {self._most}"
+        least, most = self._min_count, self._max_count
+        ok = not lacks_colours and least <= count <= most
+        wanted = f"{least}" if least == most else f"{least} to {most}"
         reason = (
             "the picture has no colours" if lacks_colours else f"{count} spots, expected {wanted}"
         )
@@ -154,9 +155,9 @@ class Present(Tool[PresentSettings]):
             mask = cv2.inRange(view.grey, low, high)
         mask = cv2.bitwise_and(mask, view.region.mask())
         _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
-        least, most = self.settings.area
+        min_area, max_area = self.settings.area
         areas = stats[1:, cv2.CC_STAT_AREA]
-        labels_kept = 1 + np.flatnonzero((areas >= least) & (areas <= most))
+        labels_kept = 1 + np.flatnonzero((areas >= min_area) & (areas <= max_area))
         labels_kept = labels_kept[np.argsort(-stats[labels_kept, cv2.CC_STAT_AREA], kind="stable")]
         return [
             _make_spot(labels, int(label), stats[label], centres[label], view)
@@ -194,6 +195,6 @@ def _corners(corners: NDArray[Any]) -> tuple[tuple[float, float], ...]:
 
 def _draw_spot(spot: Spot, *, ok: bool) -> Drawing:
     left, top, width, height = spot.box
-    right, below = left + width - 0.5, top + height - 0.5
-    corners = ((left - 0.5, top - 0.5), (right, top - 0.5), (right, below), (left - 0.5, below))
+    right, bottom = left + width - 0.5, top + height - 0.5
+    corners = ((left - 0.5, top - 0.5), (right, top - 0.5), (right, bottom), (left - 0.5, bottom))
     return Drawing("polygon", corners, "found" if ok else "wrong", f"{spot.area}")

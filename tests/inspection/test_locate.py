@@ -103,7 +103,7 @@ def test_symmetric_part_turns_about_its_middle() -> None:
     [
         ("plain", None, TeachingTrouble.FEW_EDGES),
         ("plain", [500, 500, 20, 20], TeachingTrouble.EMPTY),
-        ("stripes", [8, 10, 130, 140], TeachingTrouble.OPEN),
+        ("stripes", [8, 10, 130, 140], TeachingTrouble.ONE_DIRECTION),
         ("part", [18, 45, 95, 40], TeachingTrouble.BORDER),
     ],
 )
@@ -305,7 +305,7 @@ def test_part_may_be_covered_in_part() -> None:
     part = PlacedPart(PARTS["bracket"], 98.37, 101.81, 0.6)
     picture = drawn(part)
     picture[:90, 110:] = 160
-    found = one_of(picture, "bracket", least_score=0.5)
+    found = one_of(picture, "bracket", min_score=0.5)
     assert 0.5 < found.score < 0.9
     assert len(found.missing)
     assert math.dist(found.pose[:2], truth("bracket", part)) < 0.1
@@ -324,7 +324,7 @@ def test_most_and_overlap_limit_what_is_found() -> None:
     parts = [PlacedPart(PARTS["bolt"], x, y, x) for x, y in ((80, 80), (220, 90), (150, 220))]
     picture = Picture(drawn(*parts, side=300))
     for most in (1, 2, 3, 5):
-        found = locate(picture, [model_of("bolt")], PartSearch(most=most, seconds=30.0)).parts
+        found = locate(picture, [model_of("bolt")], PartSearch(max_parts=most, seconds=30.0)).parts
         assert len(found) == min(most, 3)
     for one in found:
         assert min(math.dist(one.pose[:2], truth("bolt", part)) for part in parts) < 0.1

@@ -178,7 +178,7 @@ def test_empty_picture_has_a_reason(
 
 def test_two_edges_instead_of_one_have_a_reason(tmp_path: Path) -> None:
     found = inspected(tmp_path, f"{{edge: {ACROSS}}}")
-    assert found.findings["measure"].details.trouble is NoValueReason.TWO_EDGES
+    assert found.findings["measure"].details.trouble is NoValueReason.SEVERAL_EDGES
     assert math.isnan(found.value.place)
 
 
@@ -199,7 +199,7 @@ def test_saturated_colour_has_a_reason_unless_allowed(tmp_path: Path) -> None:
     colour[:, :, 0] = np.minimum(colour[:, :, 0].astype(int) * 2, 255)
     found = inspected(tmp_path, WIDTH, colour)
     assert found.findings["measure"].details.trouble is NoValueReason.SATURATED
-    allowed = f"{{width: {ACROSS[:-1]}, cut_off: true}}}}"
+    allowed = f"{{width: {ACROSS[:-1]}, allow_saturated: true}}}}"
     found = inspected(tmp_path, allowed, colour)
     assert found.findings["measure"].details.trouble is None
 
@@ -304,7 +304,7 @@ def test_drawings_show_edges_regions_and_the_value(tmp_path: Path) -> None:
         (f"{{width: {ACROSS}, tolerance: 5 +- 1 deg}}", "expected a unit of length"),
         ("{line: {along: [[0, 0], [9, 9]]}, tolerance: 5 +- 1 px}", "expected deg"),
         ("{line: {along: [[0, 0], [9, 9]]}, tolerance: at most 5 deg}", "expected both limits"),
-        (f"{{width: {ACROSS}, tolerance: 9 +- 1 mm}}", "does not say how long a pixel is"),
+        (f"{{width: {ACROSS}, tolerance: 9 +- 1 mm}}", "does not give the size of a pixel"),
         (f"{{width: {ACROSS}, unit: mm, tolerance: 9 +- 1 px}}", "expected mm"),
         ("{width: {across: [[1, 1], [1, 1]]}}", "a pixel or more apart"),
         ("{width: {across: [[1, 1], [.nan, 1]]}}", "across"),
@@ -466,7 +466,7 @@ def test_place_beyond_the_calibrated_plane_has_a_reason() -> None:
     calibration = calibrate_sheet(seen(), touched(), camera=CAMERA)
     with pytest.raises(NotMeasuredError) as caught:
         measuring_plane(calibration).map_points(np.array([[-50.0, 10.0]]))
-    assert caught.value.why is NoValueReason.OFF_CALIBRATION
+    assert caught.value.reason is NoValueReason.OFF_CALIBRATION
 
 
 def test_program_measures_in_millimetres_with_its_calibration(tmp_path: Path) -> None:

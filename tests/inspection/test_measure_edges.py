@@ -52,7 +52,7 @@ def refused(levels: Array, seed: int = 1, noise: float = 2.0) -> NoValueReason |
         measured(levels, seed, noise)
     except NotMeasuredError as trouble:
         assert trouble.text  # noqa: PT017 - one of two good outcomes
-        return trouble.why
+        return trouble.reason
     return None
 
 
@@ -67,7 +67,7 @@ def test_edge_beside_white_is_right_or_refused(white: float) -> None:
         try:
             found = measured(50 + (white - 50) * edge_at(1.3), seed)
         except NotMeasuredError as trouble:
-            assert trouble.why is NoValueReason.SATURATED  # noqa: PT017 - one of two good outcomes
+            assert trouble.reason is NoValueReason.SATURATED  # noqa: PT017 - one of two good outcomes
             assert white >= 250
         else:
             assert abs(found.place - 1.3) < 4 * found.sigma
@@ -77,7 +77,7 @@ def test_edge_beside_white_is_right_or_refused(white: float) -> None:
 def test_edge_beside_saturated_black_is_refused_unless_allowed() -> None:
     levels = -8 + 150 * edge_at(0.4)
     assert refused(levels) is NoValueReason.SATURATED
-    found = measured(levels, settings=EdgeSettings(cut_off=True))
+    found = measured(levels, settings=EdgeSettings(allow_saturated=True))
     assert abs(found.place - 0.4) < 0.1
 
 
@@ -90,8 +90,8 @@ def test_edge_beside_any_saturation_level_is_refused_unless_allowed(white: int, 
     settings = EdgeSettings(white=255.0 if white < 256 else 65535.0)
     with pytest.raises(NotMeasuredError, match="white to the limit") as caught:
         find_point(picture, STRIP, settings, "single")
-    assert caught.value.why is NoValueReason.SATURATED
-    find_point(picture, STRIP, replace(settings, cut_off=True), "single")
+    assert caught.value.reason is NoValueReason.SATURATED
+    find_point(picture, STRIP, replace(settings, allow_saturated=True), "single")
 
 
 @pytest.mark.sampled(every=3)
@@ -111,13 +111,15 @@ def test_edge_out_of_focus_is_refused(blur: float, why: NoValueReason | None) ->
 
 @pytest.mark.parametrize("wide", [0.7, 1.5, 3.0, 8.0, 14.0])
 def test_bar_is_no_single_edge(wide: float) -> None:
-    assert refused(50 + 150 * (edge_at(-wide / 2) - edge_at(wide / 2))) is NoValueReason.TWO_EDGES
+    assert (
+        refused(50 + 150 * (edge_at(-wide / 2) - edge_at(wide / 2))) is NoValueReason.SEVERAL_EDGES
+    )
 
 
 @pytest.mark.parametrize("apart", [3.0, 5.0, 12.0])
 def test_weak_edge_beside_the_expected_edge_is_reported(apart: float) -> None:
     levels = 50 + 150 * edge_at(-2) - 40 * edge_at(-2 + apart)
-    assert refused(levels) is NoValueReason.TWO_EDGES
+    assert refused(levels) is NoValueReason.SEVERAL_EDGES
 
 
 FEATURELESS: dict[str, tuple[Callable[[], Array], set[NoValueReason]]] = {
@@ -128,19 +130,22 @@ FEATURELESS: dict[str, tuple[Callable[[], Array], set[NoValueReason]]] = {
         {
             NoValueReason.NO_STEP,
             NoValueReason.AT_BORDER,
-            NoValueReason.TWO_EDGES,
+            NoValueReason.SEVERAL_EDGES,
             NoValueReason.BLURRED,
         },
     ),
     "corner": (lambda: np.where((U > 30) & (V > 30), 200.0, 50.0), {NoValueReason.NO_STEP}),
-    "dot": (lambda: np.where(np.hypot(U - 30, V - 30) < 4, 200.0, 50.0), {NoValueReason.TWO_EDGES}),
+    "dot": (
+        lambda: np.where(np.hypot(U - 30, V - 30) < 4, 200.0, 50.0),
+        {NoValueReason.SEVERAL_EDGES},
+    ),
     "stripes": (
         lambda: 128 + 60 * np.sin(0.6 * U),
-        {NoValueReason.NO_STEP, NoValueReason.TWO_EDGES},
+        {NoValueReason.NO_STEP, NoValueReason.SEVERAL_EDGES},
     ),
     "edge along the strip": (
         lambda: 50 + 150 * edge_at(0.0, turned=1.5),
-        {NoValueReason.NO_STEP, NoValueReason.TWO_EDGES, NoValueReason.AT_BORDER},
+        {NoValueReason.NO_STEP, NoValueReason.SEVERAL_EDGES, NoValueReason.AT_BORDER},
     ),
 }
 
@@ -162,7 +167,7 @@ def test_strip_outside_of_the_picture_is_refused() -> None:
     picture = np.full(SHAPE, 99, dtype=np.uint8)
     with pytest.raises(NotMeasuredError) as caught:
         find_point(picture, strip, EdgeSettings(), "single")
-    assert caught.value.why is NoValueReason.OUTSIDE
+    assert caught.value.reason is NoValueReason.OUTSIDE
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (1, 40)])
@@ -233,7 +238,7 @@ def test_too_many_edges_are_refused() -> None:
     for which in choices:
         with pytest.raises(NotMeasuredError, match="14 edges in one strip, 12 at most") as caught:
             find_pair(picture, strip(300), EdgeSettings(), which)
-        assert caught.value.why is NoValueReason.TWO_EDGES
+        assert caught.value.reason is NoValueReason.SEVERAL_EDGES
     with pytest.raises(NotMeasuredError, match="14 edges in one strip, 12 at most"):
         find_point(picture, strip(300), EdgeSettings(), "first")
     strongest = find_point(picture, strip(300), EdgeSettings(), "strongest")
@@ -291,4 +296,4 @@ def test_strips_with_too_many_pixels_are_refused_at_once() -> None:
     strip = strip_between(np.array([0.0, 300.0]), np.array([599.0, 300.0]), 400.0)
     with pytest.raises(NotMeasuredError) as caught:
         find_point(np.zeros((600, 600), dtype=np.uint8), strip, EdgeSettings(), "single")
-    assert caught.value.why is NoValueReason.TOO_LARGE
+    assert caught.value.reason is NoValueReason.TOO_LARGE

@@ -69,7 +69,7 @@ def test_edges_on_two_lines_agree_on_none() -> None:
         fit_line_in_plane(
             CurveEdges(on_line(offsets), (), 0.8, 0.0), np.array([[0, 50], [9, 50]]), PIXELS
         )
-    assert caught.value.why is NoValueReason.NO_AGREEMENT
+    assert caught.value.reason is NoValueReason.NO_AGREEMENT
 
 
 def test_part_that_is_rougher_than_the_noise_keeps_its_edges_and_has_a_larger_sigma() -> None:
@@ -116,7 +116,7 @@ def test_rotated_line_has_the_same_offset_variance() -> None:
 def test_too_few_edges_are_refused(count: int) -> None:
     with pytest.raises(NotMeasuredError) as caught:
         fit_circle(on_circle(np.zeros(count)))
-    assert caught.value.why is NoValueReason.FEW_EDGES
+    assert caught.value.reason is NoValueReason.FEW_EDGES
 
 
 def test_edges_at_one_place_are_refused() -> None:
@@ -130,14 +130,14 @@ def test_straight_edges_are_no_circle() -> None:
     edges = on_line(np.random.default_rng(1).normal(0, 0.01, 12))
     with pytest.raises(NotMeasuredError) as caught:
         fit_circle_in_plane(CurveEdges(edges, (), 0.8, 0.0), PIXELS)
-    assert caught.value.why is NoValueReason.UNCERTAIN
+    assert caught.value.reason is NoValueReason.UNCERTAIN
 
 
 def test_arc_that_is_too_short_for_its_radius_is_refused() -> None:
     edges = on_circle(np.random.default_rng(1).normal(0, 0.05, 12), arc=12.0, sigma=0.05)
     with pytest.raises(NotMeasuredError) as caught:
         fit_circle_in_plane(CurveEdges(edges, (), 0.8, 0.0), PIXELS)
-    assert caught.value.why is NoValueReason.UNCERTAIN
+    assert caught.value.reason is NoValueReason.UNCERTAIN
 
 
 def test_common_error_of_all_edges_is_not_averaged() -> None:

@@ -154,7 +154,7 @@ def test_a_value_far_from_the_others_is_left_out_and_named() -> None:
 def test_too_few_values_leave_the_tolerance_as_it_is(values: list[float]) -> None:
     found = lesson(values, "90 to 95 px")
     assert found.tools["measure"]["tolerance"] == "90 to 95 px"
-    assert "expected 5 good pictures with a value or more, got" in found.remarks[0]
+    assert "expected at least 5 good pictures with a value, got" in found.remarks[0]
 
 
 @pytest.mark.parametrize(

@@ -32,16 +32,16 @@ AGREEMENT: Final = (np.uint8(4), np.uint8(3), np.uint8(1))
 """Agreement of two directions that are 0, 1 or 2 steps apart; 0 for more steps."""
 
 MAX_TOP_POINTS: Final = 44
-"""Largest number of points of a part that are compared at all places. Each point adds 4 at most to
-the agreement, so that the sum fits into a byte."""
+"""Largest number of points of a part that are compared at all places. The time grows with it; each
+point adds up to 4 to the agreement, whose sum has to stay below 256."""
 
 MAX_POINTS: Final = 150
 """Largest number of points of a part that are compared at the places that are refined."""
 
 MIN_RADIUS_PX: Final = 8.0
-"""Least distance, pixels, from the reference to the farthest point at the smallest level."""
+"""Least distance, pixels, of the farthest point from the part's reference at the smallest level."""
 
-MAX_LEVELS: Final = 6
+MAX_PYRAMID_LEVELS: Final = 6
 """Largest number of levels of the pyramid."""
 
 MAX_STACK_BYTES: Final = 1 << 26
@@ -49,7 +49,8 @@ MAX_STACK_BYTES: Final = 1 << 26
 level) that are in memory at a time."""
 
 MAX_CANDIDATES: Final = 100
-"""Largest number of places of a part, for each scale, that are refined down the pyramid."""
+"""Largest number of places of a part that are kept at the smallest level; about a quarter as many
+are kept at each larger level."""
 
 TOP_STEP_PX: Final = 1.6
 """Motion of the farthest point, pixels, between two rotations at the smallest level."""
@@ -58,8 +59,8 @@ LOWER_STEP_PX: Final = 1.0
 """Motion of the farthest point, pixels, between two rotations at other levels."""
 
 TOP_SHARE, LOWER_SHARE = 0.8, 0.85
-"""Shares of the least score that a place must reach to be refined further: at the smallest level,
-and at the other levels."""
+"""Shares of the required score that a place must reach to be refined further: at the smallest
+level, and at the other levels."""
 
 EDGE_RESPONSE: Final = 2.2
 """Response of Sobel's operator to an edge of one grey level in a pyramid level."""
@@ -83,8 +84,8 @@ class CoarseModel:
     """The points of a part at the levels of a pyramid.
 
     Attributes:
-        points: places relative to the reference, (N, 2), pixels of the taught picture, by level
-            from 0.
+        points: places relative to the part's reference, (N, 2), pixels of the taught picture, by
+            level from 0.
         normals: directions to the brighter side, (N, 2), by level.
     """
 
@@ -106,12 +107,12 @@ class Ranges:
     """The poses that are searched.
 
     Attributes:
-        angles: first and last angle, radians; a range of the period includes all angles.
+        angles: first and last angle, radians; a range as long as the period includes all angles.
         scales: smallest and largest scale.
         period: angle after which the part looks like itself, radians.
         any_polarity: whether dark and bright may be exchanged.
         contrast: least difference of the grey levels, of 255, on both sides of an edge.
-        least_score: least score of a found place.
+        min_score: least score of a found place.
     """
 
     angles: tuple[float, float]
@@ -119,7 +120,7 @@ class Ranges:
     period: float
     any_polarity: bool
     contrast: float
-    least_score: float
+    min_score: float
 
     @property
     def covers_all_angles(self) -> bool:
@@ -154,7 +155,7 @@ class PyramidLevel:
         cv2 = load("cv2", "inspection needs")
         return cv2.Sobel(self.grey, cv2.CV_16S, 1, 0), cv2.Sobel(self.grey, cv2.CV_16S, 0, 1)
 
-    def least_response(self, contrast: float) -> float:
+    def min_response(self, contrast: float) -> float:
         """Return the least response at which a pixel has a direction."""
         return max(EDGE_RESPONSE * contrast, NOISE_RESPONSE * self._noise)
 
@@ -162,20 +163,19 @@ class PyramidLevel:
         """Return the gradient with a length of 1, or 0 where it has no direction, (H, W)."""
         cv2 = load("cv2", "inspection needs")
         across, down = (component.astype(np.float32) for component in self.gradient)
-        size = cv2.magnitude(across, down)
-        min_response = np.float32(self.least_response(contrast))
-        size[size < min_response] = np.inf
-        return cv2.divide(across, size), cv2.divide(down, size)
+        magnitude = cv2.magnitude(across, down)
+        magnitude[magnitude < np.float32(self.min_response(contrast))] = np.inf
+        return cv2.divide(across, magnitude), cv2.divide(down, magnitude)
 
     def agreement(self, contrast: float, *, any_polarity: bool) -> list[NDArray[np.uint8]]:
         """Return maps (H, W) of the agreement around each pixel with each direction, 0 to 4."""
         cv2 = load("cv2", "inspection needs")
         across, down = (component.astype(np.float32) for component in self.gradient)
-        size, angle = cv2.cartToPolar(across, down)
+        magnitude, angle = cv2.cartToPolar(across, down)
         direction_index = (angle * (DIRECTIONS / (2 * math.pi)) + 0.5).astype(np.uint8) % DIRECTIONS
         direction_count = DIRECTIONS // 2 if any_polarity else DIRECTIONS
         direction_index %= direction_count
-        direction_index[size < self.least_response(contrast)] = 255
+        direction_index[magnitude < self.min_response(contrast)] = 255
         neighbourhood = np.ones((3, 3), np.uint8)
         spread_directions = [
             cv2.dilate((direction_index == k).view(np.uint8), neighbourhood)
@@ -236,7 +236,7 @@ class PicturePyramid:
 
 
 def find_candidates(
-    pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges, most: int
+    pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges, max_parts: int
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the places where a part may be, the best first, and the best refused place.
 
@@ -246,15 +246,15 @@ def find_candidates(
     candidates = list(_search_top_level(pyramid, model, ranges))
     refused: RoughPlace | None = None
     candidates, refused = _keep_best(
-        candidates, TOP_SHARE * ranges.least_score, 2.0**top, MAX_CANDIDATES, None
+        candidates, TOP_SHARE * ranges.min_score, 2.0**top, MAX_CANDIDATES, None
     )
     for level in range(top - 1, 0, -1):
         if not candidates:
             break
         candidates = _refine_places(pyramid, model, ranges, level, candidates)
-        most_kept = max(2 * most + 8, MAX_CANDIDATES >> (2 * (top - level)))
-        min_score = LOWER_SHARE * ranges.least_score
-        candidates, refused = _keep_best(candidates, min_score, 2.0**level, most_kept, refused)
+        max_kept = max(2 * max_parts + 8, MAX_CANDIDATES >> (2 * (top - level)))
+        min_score = LOWER_SHARE * ranges.min_score
+        candidates, refused = _keep_best(candidates, min_score, 2.0**level, max_kept, refused)
     return candidates, refused
 
 
@@ -270,16 +270,16 @@ def _search_top_level(
     for scale in ranges.list_scales(TOP_STEP_PX / radius).tolist():
         angles, wraps = ranges.list_angles(TOP_STEP_PX / (radius * scale))
         table = _AgreementTable(maps, math.ceil(radius * scale) + 1)
-        for some_angles in np.array_split(
-            angles, max(1, -(-table.bytes * len(angles) // MAX_STACK_BYTES))
+        for chunk_angles in np.array_split(
+            angles, max(1, -(-table.bytes_per_angle * len(angles) // MAX_STACK_BYTES))
         ):
-            stack = table.sum_agreement(scale * points, normals, some_angles)
-            min_sum = max(1, math.floor(TOP_SHARE * ranges.least_score * 4 * len(points)))
-            part_wraps = wraps and len(some_angles) == len(angles)
-            for angle_index, y, x, total in table.find_peaks(stack, min_sum, wraps=part_wraps):
+            stack = table.sum_agreement(scale * points, normals, chunk_angles)
+            min_sum = max(1, math.floor(TOP_SHARE * ranges.min_score * 4 * len(points)))
+            chunk_wraps = wraps and len(chunk_angles) == len(angles)
+            for angle_index, y, x, total in table.find_peaks(stack, min_sum, wraps=chunk_wraps):
                 score = total / (4 * len(points))
                 yield RoughPlace(
-                    x * 2**top, y * 2**top, float(some_angles[angle_index]), scale, score
+                    x * 2**top, y * 2**top, float(chunk_angles[angle_index]), scale, score
                 )
 
 
@@ -294,12 +294,12 @@ class _AgreementTable:
         # one row more, since the last sums read beyond the end of their row
         padded = [np.pad(map_, ((border, border + 1), (border, border))) for map_ in maps]
         self._flat = [map_.ravel() for map_ in padded]
-        self.bytes = self._row_length * self._height
+        self.bytes_per_angle = self._row_length * self._height
 
     def sum_agreement(self, points: Array, normals: Array, angles: Array) -> NDArray[np.uint8]:
         """Return the summed agreement of all points, (A, H, W), for each angle and place."""
-        stack = np.zeros((len(angles), self.bytes), np.uint8)
-        count, size = len(self._flat), self.bytes
+        stack = np.zeros((len(angles), self.bytes_per_angle), np.uint8)
+        count, size = len(self._flat), self.bytes_per_angle
         directions = np.arctan2(normals[:, 1], normals[:, 0])
         cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
         x, y = points.T
@@ -342,11 +342,11 @@ class _AgreementTable:
         return sorted(peaks_found, key=lambda peak: -peak[3])[: 4 * MAX_CANDIDATES]
 
 
-def _thin_out(points: Array, normals: Array, most: int) -> tuple[Array, Array]:
-    """Return ``most`` of the points, evenly spread, or all points if there are fewer."""
-    if len(points) <= most:
+def _thin_out(points: Array, normals: Array, max_count: int) -> tuple[Array, Array]:
+    """Return ``max_count`` of the points, evenly spread, or all points if there are fewer."""
+    if len(points) <= max_count:
         return points, normals
-    chosen = np.linspace(0, len(points) - 1, most).round().astype(int)
+    chosen = np.linspace(0, len(points) - 1, max_count).round().astype(int)
     return points[chosen], normals[chosen]
 
 
@@ -364,8 +364,9 @@ def _refine_places(
     radius = model.radius(level)
     step = LOWER_STEP_PX / radius
     turns = np.array([-1.0, 0.0, 1.0]) * step
-    sizes = np.array([1 - step, 1.0, 1 + step]) if ranges.scales[1] > ranges.scales[0] else [1.0]
-    trials = np.array([(turn, size) for turn in turns for size in sizes])
+    searches_scale = ranges.scales[1] > ranges.scales[0]
+    factors = np.array([1 - step, 1.0, 1 + step]) if searches_scale else [1.0]
+    trials = np.array([(turn, factor) for turn in turns for factor in factors])
     start = np.array([(place.x, place.y, place.angle, place.scale) for place in places])
     angles = (start[:, 2, None] + trials[:, 0]).ravel()
     scales = (start[:, 3, None] * trials[:, 1]).ravel()
@@ -401,7 +402,7 @@ def _score_places(
     pixels: NDArray[Any],
     any_polarity: bool,
 ) -> Array:
-    """Return the mean agreement of the directions (M, 25) at poses (M,) around places (M, 2)."""
+    """Return (M, 25): the mean agreement for each of M poses, moved by each of the 25 offsets."""
     height, width = units[0].shape
     cos, sin = np.cos(poses[0])[:, None], np.sin(poses[0])[:, None]
     x, y = points.T
@@ -414,13 +415,13 @@ def _score_places(
     # a row of zeros follows the last row
     flat = [np.pad(unit, ((0, 1), (0, 0))).ravel() for unit in units]
     zero_index = height * width
-    for trial, (dx, dy) in enumerate(OFFSETS.tolist()):
+    for offset_index, (dx, dy) in enumerate(OFFSETS.tolist()):
         column, row = columns + dx, rows + dy
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         index = np.where(inside, row * width + column, zero_index)
         agreement = flat[0].take(index) * right + flat[1].take(index) * down
         agreement = np.abs(agreement) if any_polarity else np.maximum(agreement, 0)
-        scores[:, trial] = agreement.mean(axis=1)
+        scores[:, offset_index] = agreement.mean(axis=1)
     return scores.astype(np.float64)
 
 
@@ -428,7 +429,7 @@ def _keep_best(
     places: list[RoughPlace],
     min_score: float,
     pixel_size: float,
-    most: int,
+    max_count: int,
     refused: RoughPlace | None,
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the best places without duplicates, and the best place with too low a score."""
@@ -438,7 +439,7 @@ def _keep_best(
             if refused is None or place.score > refused.score:
                 refused = place
             break
-        if len(best) == most:
+        if len(best) == max_count:
             break
         if not any(_is_same_place(place, other, pixel_size) for other in best):
             best.append(place)

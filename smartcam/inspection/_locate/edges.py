@@ -34,7 +34,7 @@ HALF_LENGTH_PX: Final = 4.0
 MAX_LINE_DISTANCE_PX: Final = 1.0
 """Largest distance of a segment's points from a straight line through its middle, pixels."""
 
-MAX_TURN: Final = math.radians(20.0)
+MAX_DIRECTION_CHANGE: Final = math.radians(20.0)
 """Largest angle, radians, between the direction of a segment's point and the direction of its
 middle."""
 
@@ -57,7 +57,7 @@ one."""
 MAX_BLUR_PX: Final = 3.0
 """Largest blur of an edge whose place is measured, in pixels."""
 
-MISFIT_NOISES, MAX_MISFIT = 2.0, 0.08
+NOISE_RATIO, HEIGHT_RATIO = 2.0, 0.08
 """Largest RMS residual of the step that is fitted to an edge: as a multiple of the noise, and as a
 share of the edge's height. With a larger one, the place is not known to a fraction of a pixel."""
 
@@ -92,16 +92,16 @@ def find_edge_points(grey: NDArray[np.uint8], contrast: float) -> EdgePoints:
     cv2 = load("cv2", "inspection needs")
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTH_PX)
     across, down = (cv2.Sobel(smooth, cv2.CV_32F, *direction) for direction in ((1, 0), (0, 1)))
-    quarters = (np.rint(4 * gradient).astype(np.int16) for gradient in (across, down))
-    most = 4 * STEP_SLOPE * contrast
-    edges = cv2.Canny(*quarters, 0.5 * most, most, L2gradient=True)
+    gradients_in_quarters = (np.rint(4 * gradient).astype(np.int16) for gradient in (across, down))
+    high = 4 * STEP_SLOPE * contrast
+    edges = cv2.Canny(*gradients_in_quarters, 0.5 * high, high, L2gradient=True)
     edges[:2], edges[-2:], edges[:, :2], edges[:, -2:] = 0, 0, 0, 0
     rows, columns = np.nonzero(edges)
     slope = np.hypot(across[rows, columns], down[rows, columns]).astype(np.float64)
     normals = np.column_stack([across[rows, columns], down[rows, columns]]) / slope[:, None]
     pixels = np.column_stack([columns, rows]).astype(np.float64)
-    size = cv2.magnitude(across, down)
-    before, after = (_interpolate(size, pixels + side * normals) for side in (-1.0, 1.0))
+    magnitude = cv2.magnitude(across, down)
+    before, after = (_interpolate(magnitude, pixels + side * normals) for side in (-1.0, 1.0))
     bend = before - 2 * slope + after
     shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
     return EdgePoints(pixels + shift.clip(-1, 1)[:, None] * normals, normals, slope)
@@ -134,7 +134,7 @@ def divide_into_segments(edges: EdgePoints) -> Segments:
         neighbours = np.array(index.query_ball_point(points[start], HALF_LENGTH_PX + 0.5))
         normal = normals[start]
         offsets = points[neighbours] - points[start]
-        has_direction = normals[neighbours] @ normal >= math.cos(MAX_TURN)
+        has_direction = normals[neighbours] @ normal >= math.cos(MAX_DIRECTION_CHANGE)
         members = neighbours[
             is_free[neighbours] & has_direction & (np.abs(offsets @ normal) <= MAX_LINE_DISTANCE_PX)
         ]
@@ -180,9 +180,9 @@ def _fit_segment(points: Array, normals: Array) -> tuple[Array, Array, float, fl
 def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: float) -> TaughtEdges:
     """Fit segments to the pixels of their picture.
 
-    ``top`` is the largest grey level of the picture; heights are returned in levels of 255.
+    ``top`` is the largest possible grey level; heights are returned in levels of 255.
     """
-    count = len(rough.halves)
+    count = len(rough.half_lengths)
     fitted, is_usable = rough, np.ones(count, dtype=np.bool_)
     noise, sigmas = np.full(count, ROUNDING), np.full(count, np.inf)
     identity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -193,7 +193,7 @@ def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: floa
     typical_noise = (
         max(float(np.median(noise[is_usable])), ROUNDING) if is_usable.any() else ROUNDING
     )
-    is_step = noise <= np.maximum(MISFIT_NOISES * typical_noise, MAX_MISFIT * fitted.heights)
+    is_step = noise <= np.maximum(NOISE_RATIO * typical_noise, HEIGHT_RATIO * fitted.heights)
     fitted = fitted._replace(sigmas=sigmas * np.maximum(noise, typical_noise))
     exact = (
         is_usable
@@ -222,7 +222,7 @@ def measure_blur_shifts(levels: NDArray[Any], segments: Segments, points: Array)
         )
         pixels = find_band_pixels(bands, identity, blurred)
         blurs = np.sqrt(segments.blurs**2 + variance)[pixels.owners]
-        shifts = np.zeros(len(segments.halves))
+        shifts = np.zeros(len(segments.half_lengths))
         for _ in range(BLURRED_FITS):
             across, _ = segments.coordinates_of(pixels.points, pixels.owners)
             fit = fit_bands(across - shifts[pixels.owners], blurs, pixels, len(shifts))
@@ -239,7 +239,7 @@ def _fit_once(
     Also return the RMS residuals of the pixels, a mask of the segments that could be fitted, and
     the standard deviations of the places for noise of one grey level.
     """
-    count = len(segments.halves)
+    count = len(segments.half_lengths)
     across, along = segments.coordinates_of(pixels.points, pixels.owners)
     blurs = segments.blurs[pixels.owners]
     scaled = across / blurs
@@ -261,8 +261,8 @@ def _fit_once(
     is_usable &= height > 1e-3
     safe_heights = np.where(is_usable, height, 1.0)
     shift, tilt, widening = (
-        np.where(is_usable, -values[:, k] / safe_heights, 0.0).clip(-most, most)
-        for k, most in ((2, 0.5), (3, 0.1), (4, 0.3))
+        np.where(is_usable, -values[:, k] / safe_heights, 0.0).clip(-limit, limit)
+        for k, limit in ((2, 0.5), (3, 0.1), (4, 0.3))
     )
     normals = segments.normals - tilt[:, None] * segments.tangents
     fitted_segments = segments._replace(

@@ -61,8 +61,8 @@ class PartSearch:
     Attributes:
         angles: smallest and largest rotation since the taught picture, radians.
         scales: smallest and largest scale.
-        most: largest number of found parts of each model.
-        least_score: least share of the edges that must be visible.
+        max_parts: largest number of found parts of each model.
+        min_score: least share of the edges that must be visible.
         overlap: largest share of a part's area that another part may cover.
         any_polarity: whether dark and bright may be exchanged.
         contrast: least contrast of an edge, grey levels of 255; None: a share of the taught one.
@@ -71,8 +71,8 @@ class PartSearch:
 
     angles: tuple[float, float] = (-math.pi, math.pi)
     scales: tuple[float, float] = (1.0, 1.0)
-    most: int = 1
-    least_score: float = 0.7
+    max_parts: int = 1
+    min_score: float = 0.7
     overlap: float = 0.5
     any_polarity: bool = False
     contrast: float | None = None
@@ -128,7 +128,7 @@ class Located:
 
     Attributes:
         parts: found parts, the best first.
-        best_refused: best refused part; None: there was no candidate.
+        best_refused: best refused part; None: no candidate was refused.
     """
 
     parts: tuple[LocatedPart, ...]
@@ -145,7 +145,7 @@ def locate(
 ) -> Located:
     """Return the parts in a picture.
 
-    ``box`` (left, top, right, below): area in which the references of the parts may be;
+    ``box`` (left, top, right, bottom): area in which the references of the parts may be;
     ``allowed``: function that returns whether a reference may be at a place in this area.
     """
     deadline = time.monotonic() + search.seconds
@@ -172,12 +172,12 @@ def _search_area(
     if box is None:
         return 0, 0, width, height
     reach = math.ceil(radius) + 2
-    left, top, right, below = box
+    left, top, right, bottom = box
     return (
         max(left - reach, 0),
         max(top - reach, 0),
         min(right + reach, width),
-        min(below + reach, height),
+        min(bottom + reach, height),
     )
 
 
@@ -185,11 +185,11 @@ class _SearchedPicture:
     """An area of a picture with its pyramid, in which any number of models is searched."""
 
     def __init__(self, picture: Picture, area: tuple[int, int, int, int]) -> None:
-        left, top, right, below = area
+        left, top, right, bottom = area
         self._corner = left, top
-        self._levels = picture.levels
-        self._level_scale = float(2**picture.depth - 1) / 255
-        grey = np.ascontiguousarray(picture.grey[top:below, left:right])
+        self._grey_values = picture.levels
+        self._grey_scale = float(2**picture.depth - 1) / 255  # grey values per level of 255
+        grey = np.ascontiguousarray(picture.grey[top:bottom, left:right])
         self._noise = noise_of(grey)
         self._pyramid = PicturePyramid(grey, self._noise)
 
@@ -203,7 +203,7 @@ class _SearchedPicture:
         """Return the found parts of one model, and the refused ones."""
         ranges = search_ranges(model, search)
         candidates, refused_place = find_candidates(
-            self._pyramid, model.coarse, ranges, search.most
+            self._pyramid, model.coarse, ranges, search.max_parts
         )
         refused_parts = (
             []
@@ -211,7 +211,7 @@ class _SearchedPicture:
             else [_make_refused_part(model, self._in_picture(refused_place), search, "")]
         )
         parts: list[LocatedPart] = []
-        for index, candidate in enumerate(candidates[: MAX_FITS + 4 * search.most]):
+        for index, candidate in enumerate(candidates[: MAX_FITS + 4 * search.max_parts]):
             place = self._in_picture(candidate)
             if time.monotonic() > deadline and index:
                 refused_parts.append(
@@ -227,7 +227,7 @@ class _SearchedPicture:
                 refused_parts.append(part)
             else:
                 parts.append(part)
-        best = _drop_overlapping(parts, search.overlap)[: search.most]
+        best = _drop_overlapping(parts, search.overlap)[: search.max_parts]
         return [self._add_doubt(model, part, search) for part in best], refused_parts
 
     def _in_picture(self, place: RoughPlace) -> RoughPlace:
@@ -236,14 +236,16 @@ class _SearchedPicture:
 
     def _fit(self, model: PartModel, start: PixelPose, search: PartSearch) -> FinePose | None:
         settings = FineSettings(
-            least_contrasts(model, search) * self._level_scale,
-            self._noise * self._level_scale,
+            min_contrasts(model, search) * self._grey_scale,
+            self._noise * self._grey_scale,
             search.any_polarity,
             search.scales[1] > search.scales[0],
-            search.least_score,
+            search.min_score,
             model.symmetry.fold != 0,
         )
-        return fit_pose(self._levels, model.segments, model.bands_at(start.scale), start, settings)
+        return fit_pose(
+            self._grey_values, model.segments, model.bands_at(start.scale), start, settings
+        )
 
     def _judge_candidate(
         self,
@@ -260,7 +262,7 @@ class _SearchedPicture:
         part = _make_located_part(model, fine)
         pose = part.pose
         refusal = ""
-        if part.score < search.least_score:
+        if part.score < search.min_score:
             refusal = _low_score_text(part.score, fine, search)
         elif not _is_in_angles(pose, model, search):
             low, high = np.degrees(search.angles).tolist()
@@ -278,10 +280,10 @@ class _SearchedPicture:
 
     def _add_doubt(self, model: PartModel, part: LocatedPart, search: PartSearch) -> LocatedPart:
         """Return a part, to which a doubt is added if another rotation fits as well."""
-        for angle, share in model.symmetry.alike:
-            if part.score >= share + EQUAL_SCORE_DIFFERENCE:
-                continue
-            start = _rotate_pose(part.pose, model.symmetry.about, angle)
+        for angle, coinciding_share in model.symmetry.alike:
+            if part.score >= coinciding_share + EQUAL_SCORE_DIFFERENCE:
+                continue  # edges were seen that the other rotation does not have
+            start = _rotate_pose(part.pose, model.symmetry.centre, angle)
             other = self._fit(model, start, search)
             if other is not None and other.score >= part.score - EQUAL_SCORE_DIFFERENCE:
                 doubt = (
@@ -293,23 +295,23 @@ class _SearchedPicture:
 
 def search_ranges(model: PartModel, search: PartSearch) -> Ranges:
     """Return the ranges of the coarse search for a model."""
-    contrast = float(np.median(least_contrasts(model, search)))
+    contrast = float(np.median(min_contrasts(model, search)))
     return Ranges(
         angles=(0.0, 0.0) if model.symmetry.fold == 0 else search.angles,
         scales=search.scales,
         period=model.symmetry.period,
         any_polarity=search.any_polarity,
         contrast=contrast,
-        least_score=search.least_score,
+        min_score=search.min_score,
     )
 
 
-def least_contrasts(model: PartModel, search: PartSearch) -> Array:
+def min_contrasts(model: PartModel, search: PartSearch) -> Array:
     """Return the least contrast of each edge of a part, (N,), grey levels of 255."""
-    heights = model.segments.heights
+    taught_contrasts = model.segments.heights
     if search.contrast is not None:
-        return np.full(len(heights), search.contrast)
-    return np.maximum(MIN_CONTRAST, CONTRAST_SHARE * heights)
+        return np.full(len(taught_contrasts), search.contrast)
+    return np.maximum(MIN_CONTRAST, CONTRAST_SHARE * taught_contrasts)
 
 
 def _make_located_part(model: PartModel, fine: FinePose) -> LocatedPart:
@@ -343,7 +345,7 @@ def _rotate_pose(pose: PixelPose, centre: tuple[float, float], angle: float) -> 
 
 
 def _low_score_text(score: float, fine: FinePose, search: PartSearch) -> str:
-    text = f"{100 * score:.0f} % of its edges are seen, expected {100 * search.least_score:.0f} %"
+    text = f"{100 * score:.0f} % of its edges are seen, expected {100 * search.min_score:.0f} %"
     if fine.reversed_share > 0.1:
         text += f"; {100 * fine.reversed_share:.0f} % are there with dark and bright exchanged"
     return text
@@ -362,7 +364,7 @@ def _make_refused_part(
         score=place.score,
         refusal=reason
         or f"about {100 * place.score:.0f} % of its edges agree, expected "
-        f"{100 * search.least_score:.0f} %",
+        f"{100 * search.min_score:.0f} %",
         hull=pose.to_picture(model.hull),
     )
 
@@ -378,15 +380,15 @@ def _is_in_angles(pose: PixelPose, model: PartModel, search: PartSearch) -> bool
 
 def _is_in_scales(pose: PixelPose, search: PartSearch) -> bool:
     """Return True if a pose's scale is in the searched range, with a margin."""
-    least, most = search.scales
-    margin = SIZE_MARGIN if least == most else RANGE_MARGIN
-    return least * (1 - margin) <= pose.scale <= most * (1 + margin)
+    low, high = search.scales
+    margin = SIZE_MARGIN if low == high else RANGE_MARGIN
+    return low * (1 - margin) <= pose.scale <= high * (1 + margin)
 
 
 def _cannot_improve(parts: Sequence[LocatedPart], place: RoughPlace, search: PartSearch) -> bool:
     """Return True if enough parts were found, and a place cannot be better than they are."""
-    best = sorted(part.score for part in parts)[-search.most :]
-    return len(best) == search.most and place.score < best[0] - SCORE_MARGIN
+    best = sorted(part.score for part in parts)[-search.max_parts :]
+    return len(best) == search.max_parts and place.score < best[0] - SCORE_MARGIN
 
 
 def _is_near(place: RoughPlace, other: LocatedPart) -> bool:

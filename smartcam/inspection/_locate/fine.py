@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.inspection._locate.ground import (
-    Ground,
+from smartcam.inspection._locate.background import (
+    BackgroundSlopes,
     common_error_factor,
-    fit_on_ground,
-    measure_ground,
+    fit_on_background,
+    measure_background,
 )
 from smartcam.inspection._locate.segments import (
     MIN_BLUR_PX,
@@ -37,7 +37,7 @@ farther away."""
 MAX_ITERATIONS: Final = 12
 """Largest number of iterations of a fit."""
 
-GROUND_ITERATIONS: Final = 2
+BACKGROUND_ITERATIONS: Final = 2
 """Number of further iterations of a fit if the brightness beside the edges varies."""
 
 CONVERGENCE_PX: Final = 2e-4
@@ -100,7 +100,7 @@ class FineSettings(NamedTuple):
     noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
     fits_any_scale: bool = False  # whether any scale is allowed; else a scale near the start's
-    least_score: float = 0.0  # least score of a pose for which uneven ground is fitted, too
+    min_score: float = 0.0  # least score of a pose for which an uneven background is fitted, too
     fits_angle: bool = True  # whether the angle is fitted; not for a round part
 
 
@@ -212,17 +212,17 @@ def _fit_bands(
     shape: PartShape,
     extra_variance: float,
     first_blur: float | None,
-    ground: Ground | None = None,
+    background: BackgroundSlopes | None = None,
     noise: float = 0.0,
 ) -> tuple[StepFit, Array]:
     """Fit a step of brightness in each band of a part; return the fits, and the blurs used."""
     places, blurs = _pixel_coordinates(pixels, segments, shape, extra_variance)
     if first_blur is not None:
         blurs = np.full_like(blurs, first_blur)
-    count, blurs_of_pixels = len(segments.halves), blurs[pixels.owners]
-    if ground is None:
+    count, blurs_of_pixels = len(segments.half_lengths), blurs[pixels.owners]
+    if background is None:
         return fit_bands(places[0], blurs_of_pixels, pixels, count), blurs
-    return fit_on_ground(places, blurs_of_pixels, pixels, ground, noise), blurs
+    return fit_on_background(places, blurs_of_pixels, pixels, background, noise), blurs
 
 
 def _pixel_coordinates(
@@ -385,17 +385,17 @@ def _judge_pose(
         SCORED_DISTANCE_PX + MAX_DEVIATION_SIGMAS * np.minimum(_sigmas_of(weights), 1.0)
     )
     visible = is_edge & (distances <= 1)
-    lengths = segments.halves / segments.halves.sum()
+    lengths = segments.half_lengths / segments.half_lengths.sum()
     score = float(
         (lengths * (1 - distances**2) * (1 - _relative_misfits(fit, settings) ** 2))[visible].sum()
     )
     is_reversed = (fit.heights < -settings.contrast) & (not settings.any_polarity)
-    ground = None
-    if score >= settings.least_score:
+    background = None
+    if score >= settings.min_score:
         places, _ = _pixel_coordinates(pixels, segments, shape, extra_variance)
-        ground = measure_ground(places, blurs[pixels.owners], pixels, segments, visible)
-        for _ in range(GROUND_ITERATIONS if ground is not None else 0):
-            fit, _ = _fit_bands(pixels, segments, shape, extra_variance, None, ground, noise)
+        background = measure_background(places, blurs[pixels.owners], pixels, segments, visible)
+        for _ in range(BACKGROUND_ITERATIONS if background is not None else 0):
+            fit, _ = _fit_bands(pixels, segments, shape, extra_variance, None, background, noise)
             rows, weights, noise, _ = _linearize(
                 (fit, blurs), segments, shape.pose, settings, MAX_ITERATIONS
             )
@@ -412,7 +412,7 @@ def _judge_pose(
     move, covariance, inliers, chi_square = final
     residuals = (fit.shifts - rows @ move) * np.sqrt(weights)
     covariance = covariance * common_error_factor(
-        segments, residuals, inliers, is_expected=ground is not None
+        segments, residuals, inliers, background_varies=background is not None
     )
     pose = shape.add_move(move).pose
     if covariance[3, 3] == 0:
@@ -444,7 +444,8 @@ def _solve_final(
     rows, shifts, weights = equations
     sigmas_off = np.abs(shifts) * np.sqrt(weights)
     inliers, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
-    if inliers.any():  # if the whole part differs from the taught one, as in too much light
+    if inliers.any():
+        # wide, since the whole part may differ from the taught one, as in too much light
         spread = max(1.4826 * float(np.median(sigmas_off[inliers])), 1.0)
     for _ in range(3):
         inliers = (weights > 0) & (sigmas_off <= MAX_DEVIATION_SIGMAS * spread)
@@ -472,7 +473,8 @@ def _solve_with_changes(
 ) -> tuple[Array, Array] | None:
     """Return the solution in which only significant changes of the part's shape are fitted.
 
-    In the second fit, the size of a change in the first fit is its standard deviation.
+    The second fit expects each change to be as large as the first fit found it: this size, less
+    noise, is the standard deviation of the change before the fit.
     """
     rows, shifts, weights = equations
     solved = _least_squares(equations, free, deviations, sigmas)
@@ -483,12 +485,12 @@ def _solve_with_changes(
     min_squares = CHANGE_SIGNIFICANCE**2 * chi_square * edge_variances
     excess_squares = (deviations + move[3:]) ** 2 - min_squares
     keeps_shape = (excess_squares <= 0) & np.isfinite(sigmas)
-    size_sigmas = np.minimum(np.sqrt(np.maximum(excess_squares, 1e-12)), sigmas)
-    size_sigmas = np.where(np.isfinite(sigmas), size_sigmas, sigmas)
+    change_sigmas = np.minimum(np.sqrt(np.maximum(excess_squares, 1e-12)), sigmas)
+    change_sigmas = np.where(np.isfinite(sigmas), change_sigmas, sigmas)
     shifts = shifts + rows[:, 3:] @ np.where(keeps_shape, deviations, 0.0)
     still_free = free.copy()
     still_free[3:] &= ~keeps_shape
-    solved = _least_squares((rows, shifts, weights), still_free, deviations, size_sigmas)
+    solved = _least_squares((rows, shifts, weights), still_free, deviations, change_sigmas)
     if solved is not None:
         solved[0][3:][keeps_shape] = -deviations[keeps_shape]
     return solved

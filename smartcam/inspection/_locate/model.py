@@ -23,7 +23,7 @@ from smartcam._extras import load
 from smartcam._forks import cached_property
 from smartcam._whole_files import replace_file
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection._locate.coarse import MAX_LEVELS, MIN_RADIUS_PX, CoarseModel
+from smartcam.inspection._locate.coarse import MAX_PYRAMID_LEVELS, MIN_RADIUS_PX, CoarseModel
 from smartcam.inspection._locate.edges import (
     divide_into_segments,
     find_edge_points,
@@ -61,8 +61,8 @@ MAX_FILE_BYTES: Final = 1 << 21
 """Largest number of bytes of a model's file."""
 
 MAX_SEGMENTS: Final = 400
-"""Largest number of segments of a model; of more, some are chosen evenly. More segments would take
-more time, and hardly improve poses."""
+"""Largest number of segments of a model; if there are more, they are thinned evenly. More segments
+would take more time, and hardly improve poses."""
 
 MAX_REGION_PX: Final = 25_000_000
 """Largest number of pixels of a taught region."""
@@ -83,7 +83,7 @@ MIN_ACROSS: Final = 0.02
 """Least share of the edges that must run across the main direction, since only such edges determine
 the part's place along the main direction."""
 
-LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
+MIN_DIRECTION_COSINE: Final = math.cos(math.radians(35.0))
 """Cosine of the largest angle between a level's gradient and a visible segment's normal."""
 
 ROUND_TURNS: Final = 8
@@ -92,10 +92,10 @@ ROUND_TURNS: Final = 8
 MIN_SELF_CONTRAST: Final = 1.0
 """Least contrast, grey levels, of an edge of a part that is located in its own picture."""
 
-LEVEL_RESPONSE: Final = 0.8
-"""Least response of Sobel's operator, at a level, to a part's edge of one grey level."""
+MIN_PYRAMID_RESPONSE: Final = 0.8
+"""Least response of Sobel's operator, in a picture of the pyramid, to an edge of one grey level."""
 
-MIN_CONTRAST_NOISES: Final = 6.0
+MIN_CONTRAST_SIGMAS: Final = 6.0
 """Least contrast of a taught edge, in standard deviations of the noise."""
 
 MAX_BAND_STEP: Final = 4
@@ -106,7 +106,7 @@ MAX_CONTOURS, MAX_CONTOUR_CORNERS, MIN_CONTOUR_PX = 12, 150, 8
 """Largest number of drawn contours of a part, largest number of a contour's corners, and least
 length of a contour in pixels."""
 
-MAX_LEVEL: Final = 255.0
+MAX_GREY_LEVEL: Final = 255.0
 """Largest contrast or noise that a caller may give, grey levels of 255."""
 
 DEFAULT_CONTRAST: Final = 12.0
@@ -163,13 +163,13 @@ class PartModel:
                 the noise.
 
         Raises:
-            TeachingError: the part cannot be taught; its ``why`` is the reason.
+            TeachingError: the part cannot be taught; see its ``reason``.
             FrameFormatError: the image is no picture.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
         name = check_text(name, "name", "PartModel.teach", least=1)
         if contrast is not None:
-            contrast = check_number(contrast, "contrast", 0, MAX_LEVEL, "PartModel.teach")
+            contrast = check_number(contrast, "contrast", 0, MAX_GREY_LEVEL, "PartModel.teach")
         return _teach(Picture.of(picture), region, name, contrast)
 
     @classmethod
@@ -199,7 +199,7 @@ class PartModel:
                 layers.
 
         Raises:
-            TeachingError: the part cannot be taught; its ``why`` is the reason.
+            TeachingError: the part cannot be taught; see its ``reason``.
             ConfigurationError: an argument is wrong.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
@@ -240,7 +240,7 @@ class PartModel:
             text = first["msg"].removeprefix("Value error, ")
             raise ConfigurationError(
                 f"model {path}: {place}: {text}; expected a file that "
-                "PartModel.write made of this version"
+                "PartModel.write of this version made"
             ) from exc
 
     def write(self, path: str | Path) -> None:
@@ -272,7 +272,7 @@ class PartModel:
             angle, radians.
         """
         if noise is not None:
-            noise = check_number(noise, "noise", 0, MAX_LEVEL, "PartModel.predicted_sigma")
+            noise = check_number(noise, "noise", 0, MAX_GREY_LEVEL, "PartModel.predicted_sigma")
         noise_factor = 1.0 if noise is None else math.hypot(1.0, noise / max(self.noise, 0.01))
         sigmas = self.segments.sigmas * (math.sqrt(2) if noise is None else noise_factor)
         arms, normals = self.segments.middles, self.segments.normals
@@ -288,7 +288,7 @@ class PartModel:
         """The points for the coarse search."""
         chosen = [self.segments.selected(level) for level in self.levels]
         return CoarseModel(
-            tuple(part.middles for part in chosen), tuple(part.normals for part in chosen)
+            tuple(level.middles for level in chosen), tuple(level.normals for level in chosen)
         )
 
     def bands_at(self, scale: float) -> Bands:
@@ -354,11 +354,12 @@ def _teach(
     rows, columns = (
         slice(at, at + size) for at, size in zip(corner[::-1], mask.shape, strict=True)
     )
-    grey, levels = picture.grey[rows, columns], picture.levels[rows, columns]
+    grey, grey_values = picture.grey[rows, columns], picture.levels[rows, columns]
     top = float(2**picture.depth - 1)
-    noise = noise_of(levels) * 255 / top
-    least = max(DEFAULT_CONTRAST, MIN_CONTRAST_NOISES * noise) if contrast is None else contrast
-    image_edges = find_edge_points(grey, least)
+    noise = noise_of(grey_values) * 255 / top
+    if contrast is None:
+        contrast = max(DEFAULT_CONTRAST, MIN_CONTRAST_SIGMAS * noise)
+    image_edges = find_edge_points(grey, contrast)
     inside_mask, border = _select_inside(image_edges.points, mask)
     image_edges = type(image_edges)(*(array[inside_mask] for array in image_edges))
     if border > MAX_BORDER_SHARE:
@@ -368,16 +369,17 @@ def _teach(
             "that goes around the part, some pixels away from it",
         )
     rough = divide_into_segments(image_edges)
-    edges = fit_segments(levels, rough, image_edges.points, top) if len(rough.halves) else None
+    has_segments = len(rough.half_lengths) > 0
+    edges = fit_segments(grey_values, rough, image_edges.points, top) if has_segments else None
     exact = np.zeros(0, int) if edges is None else np.flatnonzero(edges.exact)
     if edges is None or len(exact) < MIN_SEGMENTS:
         raise TeachingError(
             TeachingTrouble.FEW_EDGES,
             f"{len(exact)} pieces of edges whose place can be measured, expected {MIN_SEGMENTS} or "
-            f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
+            f"more, of {contrast:.0f} grey levels at least: is the part sharp and in the region?",
         )
     segments = edges.segments.selected(exact)
-    blur_shifts = measure_blur_shifts(levels, segments, image_edges.points)
+    blur_shifts = measure_blur_shifts(grey_values, segments, image_edges.points)
     segments = segments._replace(blur_shifts=blur_shifts)
     _check_directions(segments)
     centre = image_edges.points.mean(axis=0)
@@ -385,7 +387,7 @@ def _teach(
     symmetry, shift = find_symmetry(segments, image_edges.points - centre, image_edges.normals)
     segments, centre = segments._replace(middles=segments.middles - shift), centre + shift
     shift = _find_centre_shift(
-        segments, image_edges.points - centre, symmetry.fold, (levels, centre, noise)
+        segments, image_edges.points - centre, symmetry.fold, (grey_values, centre, noise)
     )
     segments, centre = segments._replace(middles=segments.middles - shift), centre + shift
     return PartModel(
@@ -408,15 +410,15 @@ def _find_centre_shift(
     ``own_picture``: the taught picture, the reference in it, and the picture's noise. The part is
     located in this picture at each of the rotations; the mean of the found places is the centre.
     """
-    levels, (x, y), noise = own_picture
+    grey_values, (x, y), noise = own_picture
     turn_count, bands = fold or ROUND_TURNS, make_bands(segments, outline)
     settings = FineSettings(
-        np.full(len(segments.halves), MIN_SELF_CONTRAST), noise, fits_angle=fold != 0
+        np.full(len(segments.half_lengths), MIN_SELF_CONTRAST), noise, fits_angle=fold != 0
     )
     offsets = []
     for turn_index in range(turn_count if fold != 1 else 0):
         start = PixelPose(float(x), float(y), 2 * math.pi * turn_index / turn_count)
-        fine = fit_pose(levels, segments, bands, start, settings)
+        fine = fit_pose(grey_values, segments, bands, start, settings)
         if fine is None:
             return np.zeros(2)
         offsets.append((fine.pose.x - x, fine.pose.y - y))
@@ -476,11 +478,11 @@ def _order_segments(segments: Segments) -> Segments:
 
 def _check_directions(segments: Segments) -> None:
     """Raise if the edges' directions do not determine a place."""
-    weights = segments.halves / segments.halves.sum()
+    weights = segments.half_lengths / segments.half_lengths.sum()
     square = (segments.normals * weights[:, None]).T @ segments.normals
     if float(np.linalg.eigvalsh(square)[0]) < MIN_ACROSS:
         raise TeachingError(
-            TeachingTrouble.OPEN,
+            TeachingTrouble.ONE_DIRECTION,
             "all edges run in one direction, and do not determine the place along it: expected a "
             "region with edges of other directions, too",
         )
@@ -491,9 +493,9 @@ def _visible_by_level(
 ) -> tuple[NDArray[np.intp], ...]:
     """Return the segments that are visible at each level of the pyramid, from level 0."""
     cv2 = load("cv2", "inspection needs")
-    levels = [np.arange(len(segments.halves))]
+    levels = [np.arange(len(segments.half_lengths))]
     radius = float(np.linalg.norm(segments.middles, axis=1).max())
-    for level in range(1, MAX_LEVELS):
+    for level in range(1, MAX_PYRAMID_LEVELS):
         grey = cv2.pyrDown(grey)
         visible = _visible_at(segments, grey, centre, level)
         if len(visible) < MIN_TOP_POINTS or radius / 2**level < MIN_RADIUS_PX:
@@ -508,17 +510,18 @@ def _visible_at(
     """Return the segments whose direction is visible at a level, at most one for each pixel."""
     cv2 = load("cv2", "inspection needs")
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *direction) for direction in ((1, 0), (0, 1)))
-    exact = (segments.middles + centre) / 2**level
+    level_places = (segments.middles + centre) / 2**level
     limit = np.array(grey.shape[::-1]) - 1
-    is_visible = np.zeros(len(exact), dtype=np.bool_)
+    is_visible = np.zeros(len(level_places), dtype=np.bool_)
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):  # the search reads neighbouring pixels, too
-        x, y = (np.floor(exact).astype(int) + corner).clip(0, limit).T
+        x, y = (np.floor(level_places).astype(int) + corner).clip(0, limit).T
         gradient = np.column_stack([across[y, x], down[y, x]])
-        size = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
-        alike = (gradient * segments.normals).sum(axis=1) / size >= LEVEL_AGREEMENT
-        is_visible |= alike & (size >= LEVEL_RESPONSE * segments.heights)
-    _, first = np.unique(np.rint(exact).astype(int) @ [1, 1 << 20], return_index=True)
-    is_first = np.zeros(len(exact), dtype=np.bool_)
+        magnitude = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
+        alike = (gradient * segments.normals).sum(axis=1) / magnitude >= MIN_DIRECTION_COSINE
+        is_visible |= alike & (magnitude >= MIN_PYRAMID_RESPONSE * segments.heights)
+    pixels = np.rint(level_places).astype(int)
+    _, first = np.unique(pixels @ [1, 1 << 20], return_index=True)
+    is_first = np.zeros(len(level_places), dtype=np.bool_)
     is_first[first] = True
     return np.flatnonzero(is_visible & is_first)
 
@@ -527,12 +530,12 @@ def _visible_at(
 
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 Place = Annotated[float, Field(allow_inf_nan=False, ge=-20_000, le=20_000)]
-Part = Annotated[float, Field(allow_inf_nan=False, ge=-1.001, le=1.001)]
+Component = Annotated[float, Field(allow_inf_nan=False, ge=-1.001, le=1.001)]
 Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=20)]
 Height = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
-Row = tuple[Place, Place, Part, Part, Part, Length, Height, Length, Length]
-Move = Annotated[float, Field(allow_inf_nan=False, ge=-2, le=2)]
-Moves = Annotated[list[Move], Field(min_length=len(BLURS_PX2), max_length=len(BLURS_PX2))]
+Row = tuple[Place, Place, Component, Component, Component, Length, Height, Length, Length]
+BlurShift = Annotated[float, Field(allow_inf_nan=False, ge=-2, le=2)]
+BlurShifts = Annotated[list[BlurShift], Field(min_length=len(BLURS_PX2), max_length=len(BLURS_PX2))]
 
 
 class _ModelFile(BaseModel):
@@ -550,9 +553,11 @@ class _ModelFile(BaseModel):
     noise: Annotated[float, Field(ge=0, le=1000)]
     fold: Annotated[int, Field(ge=0, le=1000)]
     alike: Annotated[list[tuple[Number, Number]], Field(max_length=100)]
-    about: tuple[Number, Number]
+    symmetry_centre: tuple[Number, Number]
     segments: Annotated[list[Row], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
-    moves: Annotated[list[Moves], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
+    blur_shifts: Annotated[
+        list[BlurShifts], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)
+    ]
     levels: Annotated[list[list[Annotated[int, Field(ge=0)]]], Field(min_length=1, max_length=20)]
     outline: Annotated[list[tuple[Place, Place]], Field(min_length=3, max_length=1_000_000)]
 
@@ -561,8 +566,8 @@ class _ModelFile(BaseModel):
         for number, level in enumerate(self.levels):
             if not level or max(level) >= len(self.segments):
                 raise ValueError(f"levels.{number}: expected indices of segments")
-        if len(self.moves) != len(self.segments):
-            raise ValueError("moves: expected as many as segments")
+        if len(self.blur_shifts) != len(self.segments):
+            raise ValueError("blur_shifts: expected as many as segments")
         places = np.array([row[:2] for row in self.segments] + self.outline)
         if float(np.prod(np.ptp(places, axis=0))) > MAX_REGION_PX:
             raise ValueError(f"expected a part of {MAX_REGION_PX} pixels at most")
@@ -572,14 +577,14 @@ class _ModelFile(BaseModel):
 
     @classmethod
     def of(cls, model: PartModel) -> _ModelFile:
-        """Return the file of a model; places are rounded to a ten-thousandth of a pixel."""
+        """Return the file of a model, with rounded numbers."""
         segments = model.segments
         rows = np.column_stack(
             [
                 segments.middles,
                 segments.normals,
                 segments.bends,
-                segments.halves,
+                segments.half_lengths,
                 segments.heights,
                 segments.blurs,
                 segments.sigmas,
@@ -592,9 +597,9 @@ class _ModelFile(BaseModel):
             noise=model.noise,
             fold=model.symmetry.fold,
             alike=list(model.symmetry.alike),
-            about=model.symmetry.about,
+            symmetry_centre=model.symmetry.centre,
             segments=[tuple(row) for row in rows.round(6).tolist()],
-            moves=segments.blur_shifts.round(5).tolist(),
+            blur_shifts=segments.blur_shifts.round(5).tolist(),
             levels=[level.tolist() for level in model.levels],
             outline=[tuple(row) for row in model.outline.round(2).tolist()],
         )
@@ -606,10 +611,10 @@ class _ModelFile(BaseModel):
         normals = rows[:, 2:4] / np.maximum(np.linalg.norm(rows[:, 2:4], axis=1), 1e-9)[:, None]
         return PartModel(
             name=self.name,
-            segments=Segments(rows[:, :2], normals, *numbers, np.array(self.moves)),
+            segments=Segments(rows[:, :2], normals, *numbers, np.array(self.blur_shifts)),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
             levels=tuple(np.array(level, np.intp) for level in self.levels),
-            symmetry=Symmetry(self.fold, tuple(self.alike), self.about),
+            symmetry=Symmetry(self.fold, tuple(self.alike), self.symmetry_centre),
             reference=self.reference,
             border=self.border,
             noise=self.noise,

@@ -347,12 +347,12 @@ def _round_box(sides: Array, radii: Array, flatness: float) -> Array:
     """Return the outline of a box at the origin with round corners; radii of 0: sharp corners."""
     turns = np.linspace(0, math.pi / 2, 1 + _corner_count(float(radii.max()), flatness))
     quarter = np.column_stack([np.cos(turns), np.sin(turns)]) if radii.all() else np.zeros((1, 2))
-    rounds = []
+    corner_arcs = []
     for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1)):  # each corner begins where the last one ended
         corner = quarter if x * y > 0 else quarter[::-1]
         middle = sides / 2 + [x, y] * (sides / 2 - (radii if radii.all() else 0))
-        rounds.append(middle + corner * radii * [x, y])
-    return _loop(np.concatenate(rounds))
+        corner_arcs.append(middle + corner * radii * [x, y])
+    return _loop(np.concatenate(corner_arcs))
 
 
 def _loop(corners: Array) -> Array:

@@ -39,12 +39,12 @@ MIN_BAND_PIXELS: Final = 12
 
 
 class Segments(NamedTuple):
-    """N segments; lengths in pixels of the taught picture, places relative to the reference."""
+    """N segments; lengths in pixels of the taught picture, places from the part's reference."""
 
     middles: Array  # (N, 2)
     normals: Array  # (N, 2), of length 1, to the brighter side
     bends: Array  # (N,), 1 over the radius; positive: the edge bends towards its brighter side
-    halves: Array  # (N,), half of the length
+    half_lengths: Array  # (N,)
     heights: Array  # (N,), grey levels of 255 from the darker to the brighter side
     blurs: Array  # (N,), standard deviation of the step's blur
     sigmas: Array  # (N,), standard deviation of the place across the edge
@@ -61,11 +61,11 @@ class Segments(NamedTuple):
 
     def sample_points(self, step: float = 0.5) -> tuple[Array, NDArray[np.intp]]:
         """Return points (M, 2) along all segments, and the segment of each."""
-        counts = np.maximum(np.ceil(2 * self.halves / step).astype(int), 1) + 1
+        counts = np.maximum(np.ceil(2 * self.half_lengths / step).astype(int), 1) + 1
         owners = np.repeat(np.arange(len(counts)), counts)
         first = np.cumsum(counts) - counts
         number = np.arange(len(owners)) - first[owners]
-        t = (2 * number / (counts[owners] - 1) - 1) * self.halves[owners]
+        t = (2 * number / (counts[owners] - 1) - 1) * self.half_lengths[owners]
         bend = 0.5 * self.bends[owners] * t * t
         points = self.middles[owners] + t[:, None] * self.tangents[owners]
         return points + bend[:, None] * self.normals[owners], owners
@@ -103,7 +103,7 @@ class Bands(NamedTuple):
     """The bands of segments as a map of labels."""
 
     labels: NDArray[np.int16]  # (H, W), index of the segment; -1: in no band
-    corner: tuple[int, int]  # place of the first label, pixels relative to the reference
+    corner: tuple[int, int]  # place of the first label, pixels from the part's reference
 
 
 def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Bands:
@@ -134,7 +134,7 @@ def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Ban
     owners_in_band = labels[rows, columns].astype(np.intp)
     across, along = segments.coordinates_of(np.column_stack([columns, rows]) + low, owners_in_band)
     is_in_band = (np.abs(across) <= reach) & (
-        np.abs(along) <= segments.halves[owners_in_band] + 0.5
+        np.abs(along) <= segments.half_lengths[owners_in_band] + 0.5
     )
     band_labels = np.full(labels.shape, -1, np.int16)
     band_labels[rows[is_in_band], columns[is_in_band]] = owners_in_band[is_in_band]

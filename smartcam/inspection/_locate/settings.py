@@ -37,11 +37,11 @@ class LocateSettings(ToolSettings):
 
     model: File | Annotated[list[File], Field(min_length=1, max_length=MAX_MODELS)] | None = Field(
         None,
-        description="file with a model of the part, beside this one, as PartModel.write makes it; "
+        description="file with a model of the part, beside this file, as PartModel.write makes it; "
         "or a list of them",
     )
     taught: File | None = Field(
-        None, description="instead of a model: file with a picture of the part, beside this one"
+        None, description="instead of a model: file with a picture of the part, beside this file"
     )
     part: RegionSetting | None = Field(
         None,
@@ -50,7 +50,7 @@ class LocateSettings(ToolSettings):
     )
     outline: File | None = Field(
         None,
-        description="instead of a model: file with the part's outline, DXF or SVG, beside this one",
+        description="instead of a model: file with the part's outline (DXF, SVG), beside this file",
     )
     pixels_per_mm: float | None = Field(
         None,

@@ -26,14 +26,14 @@ MAX_FOLD: Final = 24
 OUTLINE_DISTANCE_PX: Final = 1.5
 """Largest distance of a turned point from the outline, pixels."""
 
-MAX_TURN: Final = math.radians(20.0)
+MAX_EDGE_ANGLE: Final = math.radians(20.0)
 """Largest angle between the direction of a turned edge and the direction of the edge at its
 place."""
 
 CENTRE_STEPS: Final = 6
 """Number of iterations that find the centre of a part's turns."""
 
-CENTRE_PX: Final = 8.0
+PAIRING_DISTANCE_PX: Final = 8.0
 """Largest distance, pixels, between a turned segment and its partner, in the first iteration."""
 
 MIN_PAIRED_SEGMENTS: Final = 8
@@ -59,12 +59,12 @@ class Symmetry:
             4 for a square, 0 for a round part, which has no angle.
         alike: other turns after which the part may be mistaken for the unturned part: radians, and
             the share of the outline that is the same; the largest share first.
-        about: centre of these turns, pixels from the reference.
+        centre: centre of these turns, pixels from the part's reference.
     """
 
     fold: int = 1
     alike: tuple[tuple[float, float], ...] = ()
-    about: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)
 
     @property
     def period(self) -> float:
@@ -82,7 +82,7 @@ class Symmetry:
             angle, share = self.alike[0]
             sentence += (
                 f"; turned by {math.degrees(angle):.0f} degrees, {100 * share:.0f} % of it are "
-                "the same: the rest must be visible"
+                "the same: the rest, which tells the angles apart, must be visible"
             )
         return sentence
 
@@ -126,7 +126,7 @@ def _find_centre(segments: Segments, count: int) -> Array:
     centre = np.zeros(2)
     tree = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
     for step in range(CENTRE_STEPS):
-        reach = max(CENTRE_PX * (1 - step / 4), OUTLINE_DISTANCE_PX)
+        reach = max(PAIRING_DISTANCE_PX * (1 - step / 4), OUTLINE_DISTANCE_PX)
         rows, values = [], []
         for number in range(1, count):
             angle = 2 * math.pi * number / count
@@ -136,8 +136,8 @@ def _find_centre(segments: Segments, count: int) -> Array:
             nearest_segments = tree.query(turned_middles)[1]
             across, along = segments.coordinates_of(turned_middles, nearest_segments)
             cosines = (segments.normals @ turn.T * segments.normals[nearest_segments]).sum(axis=1)
-            used = (cosines >= math.cos(MAX_TURN)) & (np.abs(across) <= reach)
-            used &= np.abs(along) <= segments.halves[nearest_segments] + 1
+            used = (cosines >= math.cos(MAX_EDGE_ANGLE)) & (np.abs(across) <= reach)
+            used &= np.abs(along) <= segments.half_lengths[nearest_segments] + 1
             rows.append((segments.normals[nearest_segments] @ (np.eye(2) - turn))[used])
             values.append(-across[used])
         if sum(map(len, values)) < MIN_PAIRED_SEGMENTS:
@@ -166,7 +166,7 @@ def _matching_shares(points: Array, normals: Array) -> Array:
         columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
         nearest_points = point_of[nearest[rows, columns]]
         is_aligned = (normals[nearest_points] * (normals[::step] @ turn)).sum(axis=1) >= math.cos(
-            MAX_TURN
+            MAX_EDGE_ANGLE
         )
         shares[index] = (is_aligned & (distance[rows, columns] <= OUTLINE_DISTANCE_PX)).mean()
     return shares

@@ -84,7 +84,7 @@ class Locate(Tool[LocateSettings]):
                     unit=settings.unit,
                 )
             )
-        for model in self.models:  # computed here, so that the first picture takes no longer
+        for model in self.models:  # computed here, so that the first picture is as fast as others
             _ = model.bands_at(settings.scale[0]), model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
         has_plane = kind in {"plane", "sheet"}
@@ -92,8 +92,8 @@ class Locate(Tool[LocateSettings]):
         self._search = PartSearch(
             angles=settings.angles,
             scales=settings.scale,
-            most=settings.most,
-            least_score=settings.least_score,
+            max_parts=settings.most,
+            min_score=settings.least_score,
             overlap=settings.overlap,
             any_polarity=settings.polarity == "any",
             contrast=settings.contrast,
@@ -127,8 +127,9 @@ class Locate(Tool[LocateSettings]):
 
     def _remark(self, model: PartModel) -> str:
         sigma, angle = model.predicted_sigma()
+        count = len(model.segments.half_lengths)
         text = (
-            f"{model.name}: {model.symmetry.text()}; {len(model.segments.halves)} pieces of edges; "
+            f"{model.name}: {model.symmetry.text()}; {count} pieces of edges; "
             f"a pose is good to {sigma:.2g} px"
         )
         try:
@@ -145,7 +146,7 @@ class Locate(Tool[LocateSettings]):
     def inspect(self, view: View) -> Finding:
         """Return the parts, the best first."""
         region = view.region
-        box = (region.left, region.top, region.right, region.below)
+        box = (region.left, region.top, region.right, region.bottom)
         whole_picture = self.settings.region is None
         located = locate(
             view.picture,
@@ -159,7 +160,7 @@ class Locate(Tool[LocateSettings]):
         except NotMeasuredError as trouble:
             return Finding(
                 ok=False,
-                reason=f"{trouble.why.value}: {trouble.text}",
+                reason=f"{trouble.reason.value}: {trouble.text}",
                 values=_result_values(located),
                 drawings=self._drawings(view, located, wrong=True),
                 details=located,

@@ -16,7 +16,7 @@ class TeachingTrouble(enum.Enum):
     """Too few edges whose place can be measured to a fraction of a pixel."""
     BORDER = "border"
     """Too many of the edges lie at the border of the region: it cuts the part."""
-    OPEN = "open"
+    ONE_DIRECTION = "one direction"
     """All edges run in one direction, and do not determine the place along it."""
     TOO_LARGE = "too large"
     """The region or the outline has more pixels, corners or bytes than the limit."""

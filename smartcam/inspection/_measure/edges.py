@@ -88,19 +88,20 @@ MAX_SIGMA_PX = 0.5
 MAX_RELATIVE_MISFIT = 0.15
 """Largest RMS residual of a step, as a share of the edge's height."""
 
-ALLOWED_MISFIT_NOISES = 3.0
-"""RMS residual up to which a step is always accepted, as a multiple of the picture's noise."""
+ACCEPTED_NOISE_RATIO = 3.0
+"""Ratio of a step's RMS residual to the picture's noise up to which the step is always accepted."""
 
-MIN_MISFIT_NOISES = 1.3
-"""RMS residual, as a multiple of the picture's noise, above which the edge is not exactly a blurred
-step, because of lens, sharpening or compression."""
+MODEL_ERROR_RATIO = 1.3
+"""Ratio of a step's RMS residual to the picture's noise above which the edge is not exactly a
+blurred step, because of lens, sharpening or compression."""
 
 MAX_SATURATED_SHARE = 0.03
 """Largest share of saturated pixels of an edge: in simulations, more pixels move the edge by more
 than a tenth of its standard deviation."""
 
 MIN_UNSATURATED_NOISE = 0.5
-"""Noise, in steps of grey levels, from which pixels of a uniform area differ unless saturated."""
+"""Noise, in steps of grey levels, below which all pixels of a uniform area may be equal although
+they are not saturated."""
 
 MIN_BRIGHT_NOISE_SHARE = 0.5
 """Least ratio of the bright side's noise to the dark side's: a tone curve reduces it."""
@@ -124,20 +125,20 @@ class EdgeSettings:
         polarity: direction of the step.
         smoothing: standard deviation of the Gaussian whose derivative finds edges, pixels.
         contrast: least height of an edge, grey levels.
-        most_blur: largest blur of an edge, pixels.
+        max_blur: largest blur of an edge, pixels.
         black: least possible grey level of the picture.
         white: largest possible grey level of the picture.
-        cut_off: whether edges next to saturated pixels are measured.
+        allow_saturated: whether edges next to saturated pixels are measured.
         clipped: mask (H, W) of other saturated pixels, such as those of one colour; None: no pixel.
     """
 
     polarity: Polarity = "any"
     smoothing: float = 1.2
     contrast: float = 10.0
-    most_blur: float = 5.0
+    max_blur: float = 5.0
     black: float = 0.0
     white: float = 255.0
-    cut_off: bool = False
+    allow_saturated: bool = False
     clipped: NDArray[np.bool_] | None = field(default=None, repr=False, compare=False)
 
 
@@ -145,8 +146,8 @@ class Edge(NamedTuple):
     """One edge in a strip."""
 
     place: float  # place along the strip, from its middle, pixels
-    # (K + 1, K + 1), covariance for noise of one grey level of the places of K edges, which were
-    # fitted together, and of their tilt; the K edges share this array
+    # (K + 1, K + 1), covariance of the places of K edges that were fitted together, and of their
+    # tilt, if the noise is one grey level; the K edges share this array
     unit_covariance: Array
     row: int  # row of the edge in the covariance
     noise: float  # standard deviation of the pixels about the fit, grey levels
@@ -218,8 +219,8 @@ def find_edges(
 ) -> list[StripEdges]:
     """Return all edges of each strip with the wanted contrast and polarity.
 
-    ``image`` (H, W), grey levels. ``tilted``: whether edges may cross their strips at other than
-    right angles, which edges of lines and circles do not.
+    ``image`` (H, W), grey levels. ``tilted``: whether edges may be oblique in their strips;
+    edges of lines and circles are always at right angles to them.
     """
     strip_count = len(strips.middles)
     lies_inside = find_strips_inside(image, strips)
@@ -248,10 +249,10 @@ def find_edges(
         mean_profiles(image, strips_inside), strips_inside, settings, noise
     )
     steps = _fit_twice(image, strips_inside, candidates, settings, noise, tilted=tilted)
-    for index, owner in enumerate(inside_indices.tolist()):
-        own_steps = [step for step in steps if step.owner == index]
+    for index, strip_number in enumerate(inside_indices.tolist()):
+        own_steps = [step for step in steps if step.strip_index == index]
         has_unfitted = sum(map(len, candidates[index : index + 1])) > len(own_steps)
-        edges_of_strips[owner] = _judge_steps(
+        edges_of_strips[strip_number] = _judge_steps(
             own_steps,
             settings,
             noise,
@@ -284,7 +285,7 @@ def _judge_steps(
         abs(step.edge.height) >= settings.contrast for step in steps
     ):
         text = f"{candidate_count} edges in one strip, {MAX_EDGES} at most can be separated"
-        too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
+        too_many = NotMeasuredError(NoValueReason.SEVERAL_EDGES, text)
     if not judged and too_many is not None:
         return StripEdges((), too_many)
     if not judged:
@@ -373,7 +374,7 @@ def _refine_peak(slopes: Array, peak: int) -> float:
 class _EdgeGroup(NamedTuple):
     """Edges of one strip that are fitted together."""
 
-    owner: int  # index of the strip
+    strip_index: int  # index among the strips inside the picture
     places: tuple[float, ...]
     low: float  # first place of the fitted pixels along the strip
     high: float  # last place
@@ -382,7 +383,7 @@ class _EdgeGroup(NamedTuple):
 class _FittedStep(NamedTuple):
     """A fitted step that was not judged yet."""
 
-    owner: int  # index of the strip
+    strip_index: int  # index among the strips inside the picture
     edge: Edge
     side_length: float  # distance from the edge to the nearer end of its strip, pixels
     rms_residual: float  # grey levels
@@ -395,15 +396,15 @@ def _group_candidates(
 ) -> list[_EdgeGroup]:
     """Return the groups of edges; ``gaps`` and ``reach`` (N,), pixels, of each strip."""
     groups = []
-    for owner, places in enumerate(candidates):
+    for strip_index, places in enumerate(candidates):
         if not len(places):
             continue
-        parts = np.split(places, np.flatnonzero(np.diff(places) >= gaps[owner]) + 1)
-        between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(parts)]
-        for part, before, after in zip(parts, [-half, *between], [*between, half], strict=True):
-            low = max(float(part[0] - reach[owner]), before)
-            high = min(float(part[-1] + reach[owner]), after)
-            groups.append(_EdgeGroup(owner, tuple(part.tolist()), low, high))
+        chunks = np.split(places, np.flatnonzero(np.diff(places) >= gaps[strip_index]) + 1)
+        between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(chunks)]
+        for chunk, before, after in zip(chunks, [-half, *between], [*between, half], strict=True):
+            low = max(float(chunk[0] - reach[strip_index]), before)
+            high = min(float(chunk[-1] + reach[strip_index]), after)
+            groups.append(_EdgeGroup(strip_index, tuple(chunk.tolist()), low, high))
     return groups
 
 
@@ -423,10 +424,10 @@ def _fit_twice(
     groups = _group_candidates(candidates, half, gaps, reach)
     for step in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
         if step.converged:
-            visible_blur = _visible_blur(min(step.edge.blur, settings.most_blur))
-            gaps[step.owner] = max(gaps[step.owner], MAX_GROUP_GAP_BLURS * visible_blur)
-            reach[step.owner] = FIT_REACH_BLURS * visible_blur + FIT_REACH_PX
-            blurs[step.owner] = step.edge.blur
+            visible_blur = _visible_blur(min(step.edge.blur, settings.max_blur))
+            gaps[step.strip_index] = max(gaps[step.strip_index], MAX_GROUP_GAP_BLURS * visible_blur)
+            reach[step.strip_index] = FIT_REACH_BLURS * visible_blur + FIT_REACH_PX
+            blurs[step.strip_index] = step.edge.blur
     groups = _group_candidates(candidates, half, gaps, reach)
     return _fit_groups(image, strips, groups, settings, noise, tilted=tilted, blurs=blurs)
 
@@ -450,25 +451,25 @@ def _fit_groups(
     steps = []
     for count in sorted({len(group.places) for group in groups}):
         groups_of_count = [group for group in groups if len(group.places) == count]
-        owners = np.array([group.owner for group in groups_of_count])
+        strip_indices = np.array([group.strip_index for group in groups_of_count])
         low, high = (np.array([group[end] for group in groups_of_count]) for end in (2, 3))
-        pixels = cut_pixels(image, strips.selected(owners), low, high)
+        pixels = cut_pixels(image, strips.selected(strip_indices), low, high)
         if count > MAX_GROUP_EDGES:
             continue
         places = np.array([group.places for group in groups_of_count])
-        known_blurs = None if blurs is None else blurs[owners]
+        known_blurs = None if blurs is None else blurs[strip_indices]
         fits = fit_steps(pixels, places, tilted=tilted, blurs=known_blurs)
         saturated = np.zeros((len(groups_of_count), 2))
-        if blurs is not None and not settings.cut_off:
+        if blurs is not None and not settings.allow_saturated:
             saturated = _saturated_shares(pixels, settings)
             if settings.clipped is not None:
-                masks = cut_pixels(settings.clipped, strips.selected(owners), low, high)
+                masks = cut_pixels(settings.clipped, strips.selected(strip_indices), low, high)
                 saturated[:, 1] = np.maximum(
                     saturated[:, 1], _pixel_shares(masks.levels > 0, pixels)
                 )
             saturated[:, 1] = np.maximum(saturated[:, 1], _plateau_shares(pixels, fits))
         steps += _as_steps(groups_of_count, fits, pixels, saturated, strips.length / 2, noise)
-    return sorted(steps, key=lambda step: (step.owner, step.edge.place))
+    return sorted(steps, key=lambda step: (step.strip_index, step.edge.place))
 
 
 def _as_steps(
@@ -499,7 +500,7 @@ def _as_steps(
             edge = edge._replace(model_error=_model_error(edge, noise))
             steps.append(
                 _FittedStep(
-                    group.owner,
+                    group.strip_index,
                     edge,
                     half - abs(place),
                     math.sqrt(float(fits.cost[i] / counts[i])),
@@ -587,7 +588,7 @@ def _model_error(edge: Edge, noise: float) -> float:
     """Return the place error, pixels, that explains the residuals that exceed the noise."""
     excess_variance = edge.noise**2 - noise**2
     steepest = abs(edge.height) / (math.sqrt(2 * math.pi) * _visible_blur(edge.blur))
-    if edge.noise < MIN_MISFIT_NOISES * noise or steepest == 0.0:
+    if edge.noise < MODEL_ERROR_RATIO * noise or steepest == 0.0:
         return 0.0
     return math.sqrt(excess_variance) / steepest
 
@@ -598,28 +599,28 @@ def _find_trouble(
     """Return the reason why a step is not a usable edge; None if it is usable."""
     edge, (black, white) = step.edge, step.saturated
     height = abs(edge.height)
-    if step.converged and edge.blur > settings.most_blur:
-        text = f"the edge is blurred by {edge.blur:.1f} px, {settings.most_blur:g} px are allowed"
+    if step.converged and edge.blur > settings.max_blur:
+        text = f"the edge is blurred by {edge.blur:.1f} px, {settings.max_blur:g} px are allowed"
         return NotMeasuredError(NoValueReason.BLURRED, text)
-    if step.side_length < MIN_SIDE_BLURS * _visible_blur(min(edge.blur, settings.most_blur)) + 0.5:
+    if step.side_length < MIN_SIDE_BLURS * _visible_blur(min(edge.blur, settings.max_blur)) + 0.5:
         text = f"the edge is {max(step.side_length, 0.0):.1f} px from the end of its region"
         return NotMeasuredError(NoValueReason.AT_BORDER, text)
     if not step.converged:
         return NotMeasuredError(
             NoValueReason.NO_STEP, "the grey levels are not those of a blurred step"
         )
-    if max(black, white) > MAX_SATURATED_SHARE and not settings.cut_off:
+    if max(black, white) > MAX_SATURATED_SHARE and not settings.allow_saturated:
         limit, share = ("black", black) if black > white else ("white", white)
         text = f"{100 * share:.0f} % of the pixels beside the edge are {limit} to the limit"
         return NotMeasuredError(NoValueReason.SATURATED, text)
     if (
-        step.rms_residual > ALLOWED_MISFIT_NOISES * noise
+        step.rms_residual > ACCEPTED_NOISE_RATIO * noise
         and step.rms_residual > MAX_RELATIVE_MISFIT * height
     ):
         text = f"the grey levels are {step.rms_residual:.1f} from a step of {height:.0f}"
         return NotMeasuredError(NoValueReason.NO_STEP, text)
     if edge.sigma > min(MAX_SIGMA_PX, 0.5 * _visible_blur(edge.blur)):
-        text = f"noise leaves the edge open by {edge.sigma:.2f} px (one standard deviation)"
+        text = f"noise makes the edge uncertain by {edge.sigma:.2f} px (one standard deviation)"
         return NotMeasuredError(NoValueReason.NOISY, text)
     return None
 
@@ -689,4 +690,4 @@ def require_usable(judged_edge: JudgedEdge) -> Edge:
 def _several_edges_error(edges: tuple[JudgedEdge, ...], expected: str) -> NotMeasuredError:
     places = ", ".join(f"{edge.edge.place:.1f}" for edge in edges[:4])
     text = f"{len(edges)} edges where {expected} expected, {places} px from the region's middle"
-    return NotMeasuredError(NoValueReason.TWO_EDGES, text)
+    return NotMeasuredError(NoValueReason.SEVERAL_EDGES, text)

@@ -61,7 +61,7 @@ class CurveEdges(NamedTuple):
 
     edges: Edges
     troubles: tuple[NotMeasuredError, ...]  # errors of the strips without an edge
-    blur: float  # median standard deviation of the edges' slopes, pixels
+    blur: float  # median standard deviation of the edges' blur, pixels
     model_error: float  # possible common error of all edges from a wrong model, pixels
     inliers: NDArray[np.bool_] | None = None  # (N,), mask of the edges; None: not known yet
 
@@ -94,7 +94,7 @@ def find_line(
     start: Array,
     end: Array,
     *,
-    search: float,
+    strip_length: float,
     width: float,
     count: int,
     settings: EdgeSettings,
@@ -102,10 +102,10 @@ def find_line(
 ) -> CurveEdges:
     """Return the edges of a line near the line from ``start`` to ``end``.
 
-    Strips of ``search`` pixels cross the line from its left to its right side.
+    Strips of ``strip_length`` pixels cross the line from its left to its right side.
     """
     fractions = (np.arange(count) + 0.5) / count
-    strips = _strips_across(start, end - start, fractions, search, width)
+    strips = _strips_across(start, end - start, fractions, strip_length, width)
     first = _collect_edges(image, strips, settings, which)
     direction = end - start
     line = fit_line(first.edges, direction).curve
@@ -115,17 +115,17 @@ def find_line(
         for end_point in (start, end)
     )
     strips = _strips_across(
-        begin, stop - begin, fractions, min(search, _fit_strip_length(first)), width
+        begin, stop - begin, fractions, min(strip_length, _fit_strip_length(first)), width
     )
     return _collect_edges(image, strips, settings, "nearest")
 
 
 def _strips_across(
-    start: Array, vector: Array, fractions: Array, search: float, width: float
+    start: Array, vector: Array, fractions: Array, strip_length: float, width: float
 ) -> Strips:
     direction = np.array([-vector[1], vector[0]]) / np.hypot(*vector)
     middles = start + fractions[:, None] * vector
-    return Strips(middles, np.tile(direction, (len(fractions), 1)), search, width)
+    return Strips(middles, np.tile(direction, (len(fractions), 1)), strip_length, width)
 
 
 def find_circle(
@@ -134,7 +134,7 @@ def find_circle(
     radius: float,
     *,
     arc: tuple[float, float],
-    search: float,
+    strip_length: float,
     width: float,
     count: int,
     settings: EdgeSettings,
@@ -142,18 +142,18 @@ def find_circle(
 ) -> CurveEdges:
     """Return the edges of a circle near the given circle.
 
-    Strips of ``search`` pixels cross the circle from inside to outside; ``arc``: angles that limit
-    the strips, radians from u to v.
+    Strips of ``strip_length`` pixels cross the circle from inside to outside; ``arc``: angles that
+    limit the strips, radians from the picture's x axis towards its y axis.
     """
     angles = arc[0] + (np.arange(count) + 0.5) / count * (arc[1] - arc[0])
-    strips = Sectors(centre, radius, angles, search, width)
+    strips = Sectors(centre, radius, angles, strip_length, width)
     first = _collect_edges(image, strips, settings, which)
     circle = fit_circle(first.edges).curve
     radial = strips.middles - circle.centre  # places relative to the better centre
     angles = np.arctan2(radial[:, 1], radial[:, 0])
     width *= min(circle.radius / radius, 1.0)
     strips = Sectors(
-        circle.centre, circle.radius, angles, min(search, _fit_strip_length(first)), width
+        circle.centre, circle.radius, angles, min(strip_length, _fit_strip_length(first)), width
     )
     return _collect_edges(image, strips, settings, "nearest")
 
@@ -194,9 +194,9 @@ def _collect_edges(
 
 def _too_few_error(troubles: list[NotMeasuredError], strip_count: int) -> NotMeasuredError:
     """Return the error for a line or a circle of which too few strips have an edge."""
-    reasons = [trouble.why for trouble in troubles]
+    reasons = [trouble.reason for trouble in troubles]
     commonest = max(reasons, key=reasons.count)
-    example = next(trouble for trouble in troubles if trouble.why is commonest)
+    example = next(trouble for trouble in troubles if trouble.reason is commonest)
     text = f"{len(troubles)} of {strip_count} strips have no edge: {example.text}"
     return NotMeasuredError(commonest, text)
 

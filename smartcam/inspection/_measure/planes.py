@@ -119,9 +119,9 @@ def measuring_plane(calibration: Any, *, in_robot_axes: bool = False) -> Plane:
         ]
         return _with_variants(calibration, calibration.plane, variants, in_robot_axes=in_robot_axes)
     raise ConfigurationError(
-        "measure: calibration: expected one of a plane, with or without a lens, as fit_plane and "
-        f"calibrate_sheet make it, got {kind or type(calibration).__name__}: it does not say how "
-        "long a pixel is"
+        "measure: calibration: expected the calibration of a plane, from fit_plane or "
+        f"calibrate_sheet, got {kind or type(calibration).__name__}, which does not give the size "
+        "of a pixel"
     )
 
 

@@ -31,8 +31,8 @@ def _apart(given: tuple[Place, Place]) -> tuple[Place, Place]:
     return given
 
 
-Way = Annotated[tuple[Place, Place], AfterValidator(_apart)]
-"""Start and end point of a path."""
+PointPair = Annotated[tuple[Place, Place], AfterValidator(_apart)]
+"""Two points that are a pixel or more apart."""
 
 
 class EdgeSearch(BaseModel):
@@ -58,7 +58,7 @@ class EdgeSearch(BaseModel):
     blur: float = Field(
         5.0, gt=0, le=10, description="largest blur of an edge, pixels; more is an error"
     )
-    cut_off: bool = Field(
+    allow_saturated: bool = Field(
         False,
         description="measure edges beside saturated levels, too, whose error may exceed sigma",
     )
@@ -67,7 +67,7 @@ class EdgeSearch(BaseModel):
 class Across(EdgeSearch):
     """A search for one edge that crosses a strip."""
 
-    across: Way = Field(description="start and end of the strip, [[x, y], [x, y]]")
+    across: PointPair = Field(description="start and end of the strip, [[x, y], [x, y]]")
     strip: float = Field(10.0, ge=1, le=MAX_WIDTH_PX, description="width of the strip, pixels")
     which: Choice = Field(
         "single",
@@ -79,7 +79,7 @@ class Across(EdgeSearch):
 class AcrossPair(EdgeSearch):
     """A search for the two edges of a bar that crosses a strip."""
 
-    across: Way = Field(description="start and end of the strip, [[x, y], [x, y]]")
+    across: PointPair = Field(description="start and end of the strip, [[x, y], [x, y]]")
     strip: float = Field(10.0, ge=1, le=MAX_WIDTH_PX, description="width of the strip, pixels")
     which: PairChoice = Field(
         "single",
@@ -107,7 +107,7 @@ class StripSearch(EdgeSearch):
 class LineSearch(StripSearch):
     """A search for a straight line."""
 
-    along: Way = Field(description="two points near the line, [[x, y], [x, y]]")
+    along: PointPair = Field(description="two points near the line, [[x, y], [x, y]]")
 
 
 class CircleSearch(StripSearch):
@@ -120,7 +120,7 @@ class CircleSearch(StripSearch):
     )
 
     @model_validator(mode="after")
-    def _arc_is_one(self) -> CircleSearch:
+    def _check_arc(self) -> CircleSearch:
         begin, end = self.arc
         if not (-360 <= begin < end <= 720 and end - begin <= 360):
             raise ValueError(f"expected an arc [from, to] of 360 degrees at most, got {self.arc}")

@@ -41,7 +41,7 @@ MAX_ITERATIONS = 25
 """Largest number of iterations of a fit; most fits take four to eight."""
 
 CONVERGED_PX = 1e-4
-"""Largest change of places, pixels, in the last iteration of a fit."""
+"""Largest change of places and blur, pixels, and of the tilt, in the last iteration of a fit."""
 
 MIN_SIDE_PX = 1e-3
 """Least width of a projected pixel, pixels; 0 would be a divisor."""
@@ -61,7 +61,7 @@ class StepFits(NamedTuple):
     cost: Array  # (N,), sum of the squared residuals
     hessian: Array  # (N, M, M)
     counts: Array  # (N,), number of pixels
-    converged: NDArray[np.bool_]  # (N,), whether the fit converged
+    converged: NDArray[np.bool_]  # (N,), whether the fit ended within MAX_ITERATIONS
 
     @property
     def step_count(self) -> int:

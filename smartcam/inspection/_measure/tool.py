@@ -135,9 +135,9 @@ class Measure(Tool[MeasureSettings]):
         except NotMeasuredError as trouble:
             return Finding(
                 ok=False,
-                reason=f"{trouble.why.value}: {trouble.text}",
+                reason=f"{trouble.reason.value}: {trouble.text}",
                 drawings=finder.drawings("", wrong=True),
-                details=finder.details(None, self._unit, trouble.why),
+                details=finder.details(None, self._unit, trouble.reason),
             )
         return self._judge(finder, measured)
 
@@ -156,7 +156,7 @@ class Measure(Tool[MeasureSettings]):
         return Finding(
             ok=not reason,
             reason=reason,
-            values={name: value.value * si, "sigma": value.sigma * si, **measured.values},
+            values={name: value.value * si, "sigma": value.sigma * si, **measured.other_fields},
             drawings=finder.drawings(text, wrong=bool(reason)),
             reference=measured.reference,
             details=finder.details(value, self._unit, None),
@@ -167,7 +167,7 @@ class _MeasuredValue(NamedTuple):
     """A value, other fields of the result, and a frame of reference."""
 
     value: Value
-    values: Mapping[str, Any]
+    other_fields: Mapping[str, Any]
     reference: PixelPose | None
 
 
@@ -179,7 +179,7 @@ class _EdgeFinder:
         self.reference = view.reference
         self._image = view.picture.levels
         self._top = 2**view.picture.depth - 1
-        self._saturation_levels = view.picture.ends
+        self._saturation_levels = view.picture.saturation_levels
         self._clipped = view.picture.clipped
         self._regions: list[Array] = []  # corners of each region
         self._edges: list[Array] = []
@@ -196,10 +196,10 @@ class _EdgeFinder:
             polarity=search.polarity,
             smoothing=search.smoothing,
             contrast=search.contrast * self._top / 255,
-            most_blur=search.blur,
+            max_blur=search.blur,
             black=float(self._saturation_levels[0]),
             white=float(self._saturation_levels[1]),
-            cut_off=search.cut_off,
+            allow_saturated=search.allow_saturated,
             clipped=self._clipped,
         )
 
@@ -234,7 +234,7 @@ class _EdgeFinder:
         found_line = find_line(
             self._image,
             *ends,
-            search=search.search * scale,
+            strip_length=search.search * scale,
             width=_width_of(search, length, scale),
             count=search.strips,
             settings=self._settings(search),
@@ -262,7 +262,7 @@ class _EdgeFinder:
             centre,
             radius,
             arc=(begin, end),
-            search=search.search * scale,
+            strip_length=search.search * scale,
             width=_width_of(search, (end - begin) * radius, scale),
             count=search.strips,
             settings=self._settings(search),
@@ -299,14 +299,14 @@ class _EdgeFinder:
     def drawings(self, text: str, *, wrong: bool) -> list[Drawing]:
         """Return the marks to draw."""
         role: Role = "wrong" if wrong else "found"
-        marks = [Drawing("polygon", _corners(region), "region") for region in self._regions]
-        marks += [Drawing("points", _corners(edge), role) for edge in self._edges]
+        marks = [Drawing("polygon", _points(region), "region") for region in self._regions]
+        marks += [Drawing("points", _points(edge), role) for edge in self._edges]
         marks += [
-            Drawing("points", _corners(edges), "hint") for edges in self._left_out if len(edges)
+            Drawing("points", _points(edges), "hint") for edges in self._left_out if len(edges)
         ]
-        marks += [Drawing("line", _corners(curve), role) for curve in self._curves]
+        marks += [Drawing("line", _points(curve), role) for curve in self._curves]
         if text and self._edges:
-            marks.append(Drawing("text", _corners(self._edges[0][:1]), role, text))
+            marks.append(Drawing("text", _points(self._edges[0][:1]), role, text))
         return marks
 
 
@@ -317,7 +317,7 @@ def _width_of(search: StripSearch, length: float, scale: float) -> float:
     return max(min(max_width, spacing), 1.0)
 
 
-def _corners(points: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+def _points(points: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
     return tuple((float(x), float(y)) for x, y in points)
 
 

@@ -14,7 +14,7 @@ class NoValueReason(enum.Enum):
     """The region has more pixels than the limit."""
     NO_EDGE = "no edge"
     """The grey levels show no edge of the wanted kind."""
-    TWO_EDGES = "two edges"
+    SEVERAL_EDGES = "several edges"
     """There are several edges, or pairs of edges, where one was expected."""
     AT_BORDER = "at border"
     """The edge lies at the end of its region: one side is not visible."""
@@ -40,13 +40,13 @@ class NotMeasuredError(Exception):
     """Error for a missing value.
 
     Args:
-        why: reason as an enum.
+        reason: reason as an enum.
         text: reason as a text.
     """
 
-    def __init__(self, why: NoValueReason, text: str) -> None:
-        super().__init__(why, text)
-        self.why: NoValueReason = why
+    def __init__(self, reason: NoValueReason, text: str) -> None:
+        super().__init__(reason, text)
+        self.reason: NoValueReason = reason
         self.text: str = text
 
     def __str__(self) -> str:

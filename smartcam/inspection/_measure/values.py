@@ -35,7 +35,7 @@ MAX_RMS_PX = 1.5
 """Largest RMS distance of edges from their line or circle, in pixels."""
 
 MAX_PARALLEL_ANGLE = math.radians(10.0)
-"""Largest angle, radians, between two lines that have a distance."""
+"""Largest angle, radians, between two lines whose distance is measured."""
 
 
 class Point(NamedTuple):
@@ -170,7 +170,7 @@ def distance(first: Feature, second: Feature) -> Value:
     perpendicular to the mean of their directions.
 
     Raises:
-        NotMeasuredError: UNCERTAIN: lines that are not parallel.
+        NotMeasuredError: UNCERTAIN: the lines are not parallel, so they have no single distance.
     """
     if isinstance(first, Line) and isinstance(second, Line):
         return _distance_between_lines(first, second)

@@ -126,7 +126,7 @@ class Kind:
         least = 0.7 - self.covered
         return PartSearch(
             scales=(1.0, 1.0) if self.one_size else self.scales,
-            least_score=least,
+            min_score=least,
             any_polarity=self.any_polarity,
             seconds=30.0,
         )

@@ -246,7 +246,7 @@ def compare(count: int, seed: int) -> list[str]:
     from smartcam.inspection import PartModel
 
     model = PartModel.teach(taught_picture(), name="bracket")
-    search = dataclasses.replace(judge.KINDS[0].search, least_score=0.55)
+    search = dataclasses.replace(judge.KINDS[0].search, min_score=0.55)
     ways: dict[str, Way] = {
         "smartcam locate": functools.partial(smartcam, model, search),
         "OpenCV matchTemplate over angles": match_template,

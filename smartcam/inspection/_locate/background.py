@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.inspection._locate.segments import BandPixels, Segments
 
-GROUND_SQUARE: Final = 4.0
-"""Squared slope along an edge, as a multiple of its variance from noise. If a quarter of the edges
-has more than this, the background is not constant. From noise alone, that quarter has 1.3."""
+UNEVEN_SLOPE_SQUARE: Final = 4.0
+"""Upper quartile of the squared slopes along edges, as multiples of their variances from noise,
+above which the background is not constant. With noise alone it is 1.3."""
 
 MIN_BANDS: Final = 12
 """Least number of bands from which the background's slopes are computed."""
 
-GROUND_DISTANCE_PX: Final = 10.0
+NEIGHBOUR_DISTANCE_PX: Final = 10.0
 """Standard deviation, pixels of the taught picture, of the Gaussian by which the slopes of other
 bands are weighted by their distance from a band."""
 
@@ -50,28 +50,28 @@ MIN_SLOPE_SHARE: Final = 1e-4
 """Least standard deviation of a slope, as a share of the noise."""
 
 
-class Ground(NamedTuple):
+class BackgroundSlopes(NamedTuple):
     """Slopes of the grey level beside N edges, (N,), grey levels per half width of a band."""
 
     dark: Array  # standard deviation of the slope on the darker side
     bright: Array
 
 
-def measure_ground(
+def measure_background(
     coordinates: tuple[Array, Array],
     blurs: Array,
     pixels: BandPixels,
     segments: Segments,
     used: NDArray[np.bool_],
-) -> Ground | None:
+) -> BackgroundSlopes | None:
     """Return the slopes of the grey level beside edges; None: each side has a constant level.
 
     ``coordinates``: of the pixels across and along their edges, (P,) each. ``used`` (N,): mask of
     the bands that have an edge.
     """
-    rise, slope = _step_model(coordinates[0], blurs)
+    rise, step_derivative = _step_model(coordinates[0], blurs)
     along, ones = coordinates[1] / BAND_PX, np.ones_like(rise)
-    columns = np.stack([ones, rise, slope, (1 - rise) * along, rise * along])
+    columns = np.stack([ones, rise, step_derivative, (1 - rise) * along, rise * along])
     values, inverse, variances, _ = _solve_bands(columns, pixels, np.zeros((len(used), 5)))
     is_measured = used & (variances > 0)
     if np.count_nonzero(is_measured) < MIN_BANDS:
@@ -79,30 +79,35 @@ def measure_ground(
     noise_variances = float(np.median(variances[is_measured])) * np.diagonal(
         inverse, axis1=1, axis2=2
     )
-    grounds = []
+    slope_sigmas = []
     for side, shift in ((3, -0.5), (4, 0.5)):
         squares, noise = values[is_measured, side] ** 2, noise_variances[is_measured, side]
-        if float(np.percentile(squares / noise, 75)) < GROUND_SQUARE:
-            grounds.append(np.zeros(len(used)))
+        if float(np.percentile(squares / noise, 75)) < UNEVEN_SLOPE_SQUARE:
+            slope_sigmas.append(np.zeros(len(used)))
             continue
         side_points = segments.middles + shift * BAND_PX * segments.normals
         distances = np.linalg.norm(side_points[:, None] - side_points[is_measured], axis=2)
-        closeness = np.exp(-0.5 * (distances / GROUND_DISTANCE_PX) ** 2) / noise
+        closeness = np.exp(-0.5 * (distances / NEIGHBOUR_DISTANCE_PX) ** 2) / noise
         slope_variances = (closeness @ (squares - noise)) / np.maximum(closeness.sum(axis=1), 1e-9)
-        grounds.append(np.sqrt(np.maximum(slope_variances, 0.0)))
-    return Ground(*grounds) if any(ground.any() for ground in grounds) else None
+        slope_sigmas.append(np.sqrt(np.maximum(slope_variances, 0.0)))
+    return BackgroundSlopes(*slope_sigmas) if any(map(np.any, slope_sigmas)) else None
 
 
-def fit_on_ground(
-    coordinates: tuple[Array, Array], blurs: Array, pixels: BandPixels, ground: Ground, noise: float
+def fit_on_background(
+    coordinates: tuple[Array, Array],
+    blurs: Array,
+    pixels: BandPixels,
+    background: BackgroundSlopes,
+    noise: float,
 ) -> StepFit:
     """Return the steps of all bands if their sides have slopes; ``noise``: grey levels."""
-    rise, slope = _step_model(coordinates[0], blurs)
-    columns, priors = [np.ones_like(rise), rise, slope], [np.zeros_like(ground.dark)] * 3
-    for side, slope_sigmas in ((1 - rise, ground.dark), (rise, ground.bright)):
-        if slope_sigmas.any():
+    rise, step_derivative = _step_model(coordinates[0], blurs)
+    columns = [np.ones_like(rise), rise, step_derivative]
+    priors = [np.zeros_like(background.dark)] * 3
+    for side, sigmas in ((1 - rise, background.dark), (rise, background.bright)):
+        if sigmas.any():
             columns += [side * coordinate / BAND_PX for coordinate in coordinates]
-            priors += [1 / np.maximum(slope_sigmas / noise, MIN_SLOPE_SHARE) ** 2] * 2
+            priors += [1 / np.maximum(sigmas / noise, MIN_SLOPE_SHARE) ** 2] * 2
     values, inverse, variances, freedoms = _solve_bands(
         np.stack(columns), pixels, np.column_stack(priors)
     )
@@ -122,12 +127,12 @@ def fit_on_ground(
 
 
 def common_error_factor(
-    segments: Segments, shifts: Array, used: NDArray[np.bool_], *, is_expected: bool
+    segments: Segments, shifts: Array, used: NDArray[np.bool_], *, background_varies: bool
 ) -> float:
     """Return the factor of a pose's variance for errors that neighbours have in common.
 
-    ``shifts`` (N,): as multiples of their standard deviations. ``is_expected``: whether common
-    errors are expected; else they count only if they exceed chance.
+    ``shifts`` (N,): as multiples of their standard deviations. ``background_varies``: so
+    that common errors are expected; else they count only if they exceed chance.
     """
     middles, normals, z = segments.middles[used], segments.normals[used], shifts[used]
     is_near = np.linalg.norm(middles[:, None] - middles, axis=2) <= COMMON_PX
@@ -135,9 +140,8 @@ def common_error_factor(
     np.fill_diagonal(is_near, val=False)
     common = float(z @ is_near @ z) / max(float(z @ z), 1e-9)
     chance_sigma = math.sqrt(2 * int(is_near.sum())) / max(len(z), 1)
-    return (
-        1 + max(common, 0.0) if is_expected or common > COMMON_ERROR_SIGMAS * chance_sigma else 1.0
-    )
+    counts = background_varies or common > COMMON_ERROR_SIGMAS * chance_sigma
+    return 1 + max(common, 0.0) if counts else 1.0
 
 
 def _step_model(across: Array, blurs: Array) -> tuple[Array, Array]:
