@@ -38,7 +38,7 @@ from smartcam.emulator._inside import load_scenarios
 from smartcam.fleet._inside import RecordSection
 from smartcam.frames import Codecs, FrameGroup, FrameSource, RateControl, RtpSender, RtspServer
 from smartcam.inspection import PartModel, Picture, SoftwareDevice, Tool, load_cell, register_tool
-from smartcam.inspection._inside import Software, Teaching, make_camera, software_mistakes
+from smartcam.inspection._inside import SoftwareEntry, Teaching, make_camera, software_mistakes
 from smartcam.models import Result
 from smartcam.outlets import Outlets
 from smartcam.recording import (
@@ -251,7 +251,7 @@ def inspecting(folder: Path, frame: Any) -> dict[str, tuple[Callable[..., Any], 
     outline.write_text(
         '<svg width="20mm" height="20mm" viewBox="0 0 20 20"><path d="M1 1h9v7h-9z"/></svg>'
     )
-    software = {"software": Software.model_validate(CELL_OF_ONE)}
+    software = {"software": SoftwareEntry.model_validate(CELL_OF_ONE)}
 
     def mistakes(name: Any = "cam", folder: Any = folder, **more: Any) -> Any:
         return [*software_mistakes(name, **{**software, **more}, folder=folder)]

@@ -66,7 +66,7 @@ class ApplicationEntry(BaseModel):
 
 def _check_folder(folder: str) -> str:
     if "\0" in folder:
-        raise ValueError("expected the path of a folder, which has no zero in it")
+        raise ValueError("expected the path of a folder, without a NUL character")
     return folder
 
 
@@ -89,7 +89,7 @@ class Keep(BaseModel):
     )
 
 
-class Software(BaseModel):
+class SoftwareEntry(BaseModel):
     """A software camera as described by ``software:`` in a file."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
@@ -168,7 +168,7 @@ class CellCamera:
 class _CellEntry(BaseModel):
     """The part of a camera's entry that describes a software camera; other keys are ignored."""
 
-    software: Software | None = None
+    software: SoftwareEntry | None = None
 
 
 class _CellFile(BaseModel):
@@ -188,31 +188,32 @@ def load_cell(path: str | Path) -> dict[str, CellCamera]:
     path = check_path(path, "path", "load_cell")
     cameras: dict[str, CellCamera] = {}
 
-    def mistake(file: _CellFile) -> tuple[tuple[int | str, ...], str] | None:
+    def make_cameras(file: _CellFile) -> tuple[tuple[int | str, ...], str] | None:
+        """Fill ``cameras``; return the keys and the text of the first mistake."""
         for name, entry in file.cameras.items():
             if entry.software is None:
                 continue
             try:
                 cameras[name] = make_camera(name, entry.software, path.parent)
             except ProgramError as exc:
-                return ("cameras", name, "software", *exc.place), str(exc)
+                return ("cameras", name, "software", *exc.keys), str(exc)
         return None if cameras else (("cameras",), "expected a camera with software:, got none")
 
-    read_model(path, "cell", _CellFile, "cameras", mistake)
+    read_model(path, "cell", _CellFile, "cameras", make_cameras)
     return cameras
 
 
 def software_mistakes(
-    name: str, software: Software, folder: Path
+    name: str, software: SoftwareEntry, folder: Path
 ) -> Iterator[tuple[tuple[int | str, ...], str]]:
-    """Yield the place and text of each mistake in ``software:`` of a fleet file."""
+    """Yield the keys and text of each mistake in ``software:`` of a fleet file."""
     try:
         make_camera(name, software, folder)
     except ProgramError as exc:
-        yield exc.place, str(exc)
+        yield exc.keys, str(exc)
 
 
-def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
+def make_camera(name: str, software: SoftwareEntry, folder: Path) -> CellCamera:
     """Return the camera that ``software:`` describes.
 
     Args:
@@ -222,10 +223,10 @@ def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
 
     Raises:
         ConfigurationError: the entry has a mistake. If the mistake has a place in the file, the
-            error's ``place`` has the keys that lead to it.
+            error's ``keys`` lead to it.
         MissingExtraError: an extra is not installed.
     """
-    check_kind(software, Software, "software", "a Software", "make_camera")
+    check_kind(software, SoftwareEntry, "software", "a SoftwareEntry", "make_camera")
     folder = check_path(folder, "folder", "make_camera")
     name = check_text(name, "name", "make_camera")
     setup = ToolSetup(folder=folder, calibration=_calibration(software, folder))
@@ -255,7 +256,7 @@ def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
     )
 
 
-def _calibration(software: Software, folder: Path) -> AnyCalibration | None:
+def _calibration(software: SoftwareEntry, folder: Path) -> AnyCalibration | None:
     if software.calibration is None:
         return None
     from smartcam.calibration import load_calibration
@@ -266,7 +267,7 @@ def _calibration(software: Software, folder: Path) -> AnyCalibration | None:
         raise ProgramError(str(exc), ("calibration",)) from exc
 
 
-def _numbers_by_name(software: Software) -> dict[str, int]:
+def _numbers_by_name(software: SoftwareEntry) -> dict[str, int]:
     """Return the numbers of the applications that have a name, by this name."""
     names: dict[str, int] = {}
     for number, entry in software.applications.items():
@@ -282,7 +283,7 @@ def _numbers_by_name(software: Software) -> dict[str, int]:
 
 def _make_steps(
     number: int,
-    software: Software,
+    software: SoftwareEntry,
     names: Mapping[str, int],
     setup: ToolSetup,
     steps_by_number: dict[int, list[ProgramStep]],
@@ -295,31 +296,31 @@ def _make_steps(
     """
     if number in steps_by_number:
         return steps_by_number[number]
-    place = ("applications", number)
+    keys = ("applications", number)
     entry = software.applications[number]
     if not 1 <= len(entry.tools) <= MAX_TOOLS:
         raise ProgramError(
-            f"expected 1 to {MAX_TOOLS} tools, such as 'read:', got {len(entry.tools)}", place
+            f"expected 1 to {MAX_TOOLS} tools, such as 'read:', got {len(entry.tools)}", keys
         )
     steps: dict[str, ProgramStep] = {}
     for key, given in entry.tools.items():
         try:
             step = make_step(key, given, setup, ApplicationEntry.model_fields)
         except ProgramError as exc:
-            raise ProgramError(str(exc), (*place, *exc.place)) from exc
+            raise ProgramError(str(exc), (*keys, *exc.keys)) from exc
         follow = step.tool.settings.follow
         if follow is not None and follow not in steps:
-            follow_place = (*place, key, "follow")
+            follow_keys = (*keys, key, "follow")
             other = names.get(follow)
             if other is None:
                 known = [*steps, *names]
                 raise ProgramError(
                     f"no tool before this one and no application is called {follow!r:.60}"
                     f"{did_you_mean(follow, known)}",
-                    follow_place,
+                    follow_keys,
                 )
             if other == number or other in followers:
-                raise ProgramError("the applications follow each other in a circle", follow_place)
+                raise ProgramError("the applications follow each other in a circle", follow_keys)
             followed = _make_steps(
                 other, software, names, setup, steps_by_number, (*followers, number)
             )
@@ -328,9 +329,9 @@ def _make_steps(
             )
         if step.name in steps:
             raise ProgramError(
-                f"there is a tool {step.name!r} already: expected a name after the tool's, such "
-                f"as '{key.split()[0]} left:'",
-                (*place, key),
+                f"there is a tool {step.name!r} already: expected another name after the kind of "
+                f"tool, such as '{key.split()[0]} left:'",
+                (*keys, key),
             )
         steps[step.name] = step
     steps_by_number[number] = [*steps.values()]

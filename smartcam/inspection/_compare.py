@@ -41,8 +41,8 @@ EDGE_TOLERANCE_PX: Final = 0.75
 MAX_ITERATIONS: Final = 30
 """Largest number of iterations of the alignment."""
 
-MIN_LIGHT_CORRELATION: Final = 0.5
-"""Least correlation of taught and current grey levels for which different light is assumed."""
+MIN_CORRELATION: Final = 0.5
+"""Least correlation of taught and current grey levels at which they are taken for the same part."""
 
 LIGHT_FIT_ROUNDS: Final = 4
 """Number of fits of the light; each fit leaves out the outliers of the fit before."""
@@ -91,7 +91,9 @@ class Compare(Tool[CompareSettings]):
         self._taught = Picture.read(setup.folder / settings.taught).grey
         height, width = self._taught.shape
         if region is None and settings.follow is not None:
-            raise ConfigurationError("expected a region [x, y, width, height] of what it follows")
+            raise ConfigurationError(
+                "expected a region [x, y, width, height], relative to the part that it follows"
+            )
         if region is not None:
             (x1, y1), (x2, y2) = np.min(region, axis=0), np.max(region, axis=0)
             if len(region) != 4 or {*region} != {(x1, y1), (x2, y1), (x2, y2), (x1, y2)}:
@@ -216,7 +218,7 @@ class Compare(Tool[CompareSettings]):
             return motion
         score = np.nan_to_num(cv2.matchTemplate(patch, inner, cv2.TM_CCOEFF_NORMED), nan=-1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
-        if score[row, column] < MIN_LIGHT_CORRELATION:
+        if score[row, column] < MIN_CORRELATION:
             return motion
         motion[:, 2] = column - shift, row - shift
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, MAX_ITERATIONS, 1e-4)
@@ -301,7 +303,7 @@ def _fit_light(taught: NDArray[np.uint8], current: NDArray[np.uint8]) -> tuple[f
         a, b = x[is_inlier], y[is_inlier]
         da, db = a - a.mean(), b - b.mean()
         sum_xy, sum_xx, sum_yy = float(da @ db), float(da @ da), float(db @ db)
-        correlates = sum_xy > MIN_LIGHT_CORRELATION * math.sqrt(sum_xx * sum_yy) and sum_xx > len(a)
+        correlates = sum_xy > MIN_CORRELATION * math.sqrt(sum_xx * sum_yy) and sum_xx > len(a)
         if not correlates:
             return 1.0, 0.0
         gain = min(max(sum_xy / sum_xx, 1 / MAX_GAIN), MAX_GAIN)

@@ -8,15 +8,15 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.inspection._camera.judged_frames import judged_source
-    from smartcam.inspection._camera.pairing import JudgedResults
-    from smartcam.inspection._cell import CellCamera, Software, make_camera, software_mistakes
+    from smartcam.inspection._camera.pairing import ResultPictures
+    from smartcam.inspection._cell import CellCamera, SoftwareEntry, make_camera, software_mistakes
     from smartcam.inspection._learning import learn_tolerances
     from smartcam.inspection._teaching import Teaching, read_settings, setting_text, tool_settings
 
 __all__ = [
     "CellCamera",
-    "JudgedResults",
-    "Software",
+    "ResultPictures",
+    "SoftwareEntry",
     "Teaching",
     "judged_source",
     "learn_tolerances",
@@ -31,9 +31,9 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_cell": "software_mistakes make_camera Software CellCamera",
+            "_cell": "software_mistakes make_camera SoftwareEntry CellCamera",
             "_camera.judged_frames": "judged_source",
-            "_camera.pairing": "JudgedResults",
+            "_camera.pairing": "ResultPictures",
             "_learning": "learn_tolerances",
             "_teaching": "Teaching read_settings setting_text tool_settings",
         },

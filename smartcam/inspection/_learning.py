@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -40,10 +41,10 @@ OUTLIER_SPREADS: Final = 5.0
 """Distance from the median, in standard deviations, beyond which a value of a large sample is an
 outlier."""
 
-SMALL_SAMPLE: Final = 8.0
-"""Number of values at which this distance is twice ``OUTLIER_SPREADS``, since the spread of few
-values is uncertain. In simulations with 5 to 200 good parts, at most 2 % of the samples lose a good
-value."""
+DOUBLE_LIMIT_VALUES: Final = 8.0
+"""Number of values at which the limit for outliers is twice ``OUTLIER_SPREADS``, since the spread
+of few values is uncertain. In simulations with 5 to 200 good parts, at most 2 % of the samples lose
+a good value."""
 
 MAX_PICTURES_IN_REMARK: Final = 5
 """Largest number of pictures that a remark names; further pictures are only counted."""
@@ -121,11 +122,11 @@ def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
     remark = (
         f"{counts_text} spots in {'each of ' if len(seen) > 1 else ''}{_pictures_text(len(seen))}"
     )
-    each = [finding.records or (finding.values,) for finding in findings]
-    areas = [float(record["area"]) for records in each for record in records if record.get("area")]
-    if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
-        least, most = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)
-        tolerances["area"] = [max(1, math.floor(least)), math.ceil(most)]
+    spots = [finding.records or (finding.values,) for finding in findings]  # of each picture
+    areas = [float(spot["area"]) for spot in itertools.chain(*spots) if spot.get("area")]
+    if areas and all(len(found) >= count for found, count in zip(spots, counts, strict=True)):
+        min_area, max_area = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)
+        tolerances["area"] = [max(1, math.floor(min_area)), math.ceil(max_area)]
         remark += (
             f", of {min(areas):.0f} to {max(areas):.0f} pixels; area allows {AREA_MARGIN:.0%} less "
             "and more"
@@ -139,9 +140,10 @@ def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
 
 
 def _learn_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
-    most = max(int(finding.values.get("differing", 0)) for finding in seen.values())
-    allowed = math.ceil(DIFFERENCE_MARGIN * most)
-    remark = f"at most {most} pixels differ in {_pictures_text(len(seen))}; {allowed} are allowed."
+    max_differing = max(int(finding.values.get("differing", 0)) for finding in seen.values())
+    allowed = math.ceil(DIFFERENCE_MARGIN * max_differing)
+    pictures = _pictures_text(len(seen))
+    remark = f"at most {max_differing} pixels differ in {pictures}; {allowed} are allowed."
     return _Learned({"allowed": allowed}, remark)
 
 
@@ -168,7 +170,7 @@ def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
 def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Learned:
     """Return the tolerance of measured values, in the form and unit of the old tolerance."""
     measured = {
-        name: finding.details for name, finding in seen.items() if _is_number(finding.details)
+        name: finding.details for name, finding in seen.items() if _is_finite(finding.details)
     }
     left_out = {
         name: finding.reason.partition(":")[0]
@@ -194,7 +196,7 @@ def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> 
     if len(values) < MIN_VALUES:
         return _Learned(
             {},
-            f"expected {MIN_VALUES} good pictures with a value or more, got {len(values)}: the "
+            f"expected at least {MIN_VALUES} good pictures with a value, got {len(values)}: the "
             f"setting `tolerance` stays as it is.{_left_out_text(left_out)}",
         )
     guard = float(settings.get("guard", 2.0)) * float(sigmas.max())
@@ -210,7 +212,7 @@ def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> 
     return _Learned({"tolerance": text}, remark)
 
 
-def _is_number(details: Any) -> bool:
+def _is_finite(details: Any) -> bool:
     return math.isfinite(details.value) and math.isfinite(details.sigma) if details else False
 
 
@@ -239,7 +241,7 @@ def _find_outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.
     # for normal values the median distance is 0.6745 standard deviations
     spread = max(float(np.median(distances)) / 0.6745, float(np.median(sigmas)))
     is_outlier: np.ndarray[Any, np.dtype[np.bool_]] = (
-        distances > OUTLIER_SPREADS * (1 + SMALL_SAMPLE / len(values)) * spread
+        distances > OUTLIER_SPREADS * (1 + DOUBLE_LIMIT_VALUES / len(values)) * spread
     )
     return is_outlier
 
@@ -288,13 +290,13 @@ def _left_out_text(left_out: Mapping[str, str]) -> str:
     """Return the sentence about pictures that were left out; "" if there are none."""
     if not left_out:
         return ""
-    named_pictures = [f"{name} ({why})" for name, why in left_out.items()][:MAX_PICTURES_IN_REMARK]
+    named_pictures = [f"{name} ({reason})" for name, reason in left_out.items()]
     more_text = (
         f" and {len(left_out) - MAX_PICTURES_IN_REMARK} more"
         if len(left_out) > MAX_PICTURES_IN_REMARK
         else ""
     )
-    return f" Not learned from: {', '.join(named_pictures)}{more_text}."
+    return f" Not learned from: {', '.join(named_pictures[:MAX_PICTURES_IN_REMARK])}{more_text}."
 
 
 def _pictures_text(count: int) -> str:

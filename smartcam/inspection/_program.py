@@ -39,19 +39,19 @@ PROGRAM_FIELDS: Final = ("ok", "reason")
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,29}")
 
-Place = tuple[int | str, ...]
+KeyPath = tuple[int | str, ...]
 
 
 class ProgramError(ConfigurationError):
     """A mistake in a program's settings.
 
     Attributes:
-        place: keys that lead to the mistake, from the application's mapping.
+        keys: keys that lead to the mistake, from the application's mapping.
     """
 
-    def __init__(self, message: str, place: Place = ()) -> None:
+    def __init__(self, message: str, keys: KeyPath = ()) -> None:
         super().__init__(message)
-        self.place = place
+        self.keys = keys
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,8 @@ class ProgramStep:
     Attributes:
         name: name of the tool in its program, unique there.
         tool: the tool.
-        in_result: whether the tool's values are in the result; False for the tools of a followed
-            application.
+        in_result: whether the tool's values are in the result; False for the tools of another
+            application, whose frame of reference this one follows.
         fields: fields of the values, with their names in the result.
         records: fields of each record.
     """
@@ -108,15 +108,15 @@ class Program:
         fields += [Field("ok", "bool"), Field("reason", "string", MAX_REASON_BYTES)]
         fields += (field for step in self.steps for field in step.fields)
         text = ", ".join(map(str, fields))
-        listing = [step for step in self.steps if step.records]
-        if len(listing) > 1:
+        list_steps = [step for step in self.steps if step.records]
+        if len(list_steps) > 1:
             raise ConfigurationError(
-                f"{listing[0].name} and {listing[1].name} each find several things, and a "
-                "result has room for one list: expected one of them, and the other one in another "
-                "application"
+                f"{list_steps[0].name} and {list_steps[1].name} each find several "
+                "things, and a result has room for one list: expected one of them, and the other "
+                "one in another application"
             )
-        if listing:
-            text += f", {listing[0].name}: ({', '.join(map(str, listing[0].records))})*"
+        if list_steps:
+            text += f", {list_steps[0].name}: ({', '.join(map(str, list_steps[0].records))})*"
         self.layout: Layout = Layout(text)
         self._several = several
 
@@ -183,7 +183,7 @@ class Program:
 
 
 class FollowedApplication(Tool[ToolSettings]):
-    """The tools of a followed application as one tool.
+    """The tools of an application whose frame of reference another one follows, as one tool.
 
     The frame of reference is the last one that one of these tools found.
     """
@@ -214,8 +214,8 @@ def _first_reason(findings: Mapping[str, Finding]) -> str:
     """Return the first reason among findings; "" if all are ok."""
     for name, finding in findings.items():
         if not finding.ok:
-            why = finding.reason or "not ok"
-            return f"{name}: {why}" if len(findings) > 1 else why
+            reason = finding.reason or "not ok"
+            return f"{name}: {reason}" if len(findings) > 1 else reason
     return ""
 
 
@@ -228,7 +228,9 @@ def _run_tool(
     if settings.follow is not None:
         reference = earlier[settings.follow].reference
         if reference is None:
-            return Finding(ok=False, reason=f"{settings.follow} was not found, which it follows")
+            return Finding(
+                ok=False, reason=f"the tool follows {settings.follow}, which was not found"
+            )
     region = place_region(settings.region, reference, picture.size)
     is_outside = region.outside > 0.5 and tool.needs_whole_region
     if region.is_empty or is_outside:
@@ -357,14 +359,14 @@ def make_step(
     try:
         return ProgramStep(name, tool_class(settings, setup), in_result=True)
     except ProgramError as exc:
-        raise ProgramError(str(exc), (key, *exc.place)) from exc
+        raise ProgramError(str(exc), (key, *exc.keys)) from exc
     except (SmartCamError, OSError) as exc:
         raise ProgramError(str(exc), (key,)) from exc
 
 
-def _known_settings(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
-    """Return the names of the settings at an error's place."""
-    for key in place[:-1]:
+def _known_settings(model: Any, keys: KeyPath) -> Iterable[str]:
+    """Return the names of the settings beside an error's last key."""
+    for key in keys[:-1]:
         field = getattr(model, "model_fields", {}).get(key)
         types = () if field is None else (field.annotation, *get_args(field.annotation))
         model = next((model for model in types if hasattr(model, "model_fields")), None)

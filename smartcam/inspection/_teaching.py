@@ -24,7 +24,7 @@ from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
 from smartcam._whole_files import replace_file
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection._cell import Software, make_camera
+from smartcam.inspection._cell import SoftwareEntry, make_camera
 from smartcam.inspection._program import ProgramError
 from smartcam.layout._inside import BadYamlError
 from smartcam.layout._inside import load as load_yaml
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._program import Program
 
 MAX_FILE_BYTES: Final = 1 << 22
-"""Largest size of a cell file, bytes."""
+"""Largest size of a cell file (software cameras and their programs, in YAML), bytes."""
 
 LINE_WIDTH: Final = 4096
 """Width, in characters, at which written lines are wrapped; large enough that no line is."""
@@ -51,7 +51,7 @@ class Teaching:
     Args:
         path: the cell file, or a fleet file.
         camera: name of the software camera in the file.
-        application: number or name of the application; saving adds a new number.
+        application: number or name of the application; saving adds one with a new number.
 
     Raises:
         ConfigurationError: the file cannot be read, or has no such software camera; the camera has
@@ -71,7 +71,7 @@ class Teaching:
         application = check_application_or_name(application, owner="Teaching")
         software = self._find_software(self._read_document())
         self.application: int = self._find_number(software["applications"], application)
-        self.frames: str = Software.model_validate(software).frames_address(self.path.parent)
+        self.frames: str = SoftwareEntry.model_validate(software).frames_address(self.path.parent)
         stored = software["applications"].get(self.application, {})
         self._entry: dict[str, Any] = stored if isinstance(stored, dict) else {}
 
@@ -88,7 +88,7 @@ class Teaching:
         }
 
     def program(self, tools: Mapping[str, Mapping[str, Any]]) -> Program:
-        """Return the program of these tools, which may follow the file's other applications.
+        """Return the program of these tools; a tool may follow another application of the file.
 
         Raises:
             ConfigurationError: a tool or a setting is wrong; the text names it.
@@ -98,15 +98,15 @@ class Teaching:
         software = self._find_software(self._read_document())
         software["applications"][self.application] = self._entry_with(tools)
         try:
-            checked = Software.model_validate(software)
+            checked = SoftwareEntry.model_validate(software)
         except ValidationError as exc:
             first = exc.errors(include_url=False)[0]
             raise ConfigurationError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from exc
         try:
             camera = make_camera(self.camera, checked, self.path.parent)
         except ProgramError as exc:
-            place = [str(key) for key in exc.place if key not in {"applications", self.application}]
-            text = f"{'.'.join(place)}: {exc}" if place else str(exc)
+            keys = [str(key) for key in exc.keys if key not in {"applications", self.application}]
+            text = f"{'.'.join(keys)}: {exc}" if keys else str(exc)
             raise ConfigurationError(text) from exc
         return camera.programs[self.application]
 
@@ -187,7 +187,7 @@ class Teaching:
             raise ConfigurationError(
                 f"{self.path}: {self.camera} has no application {application!r:.60}; there are "
                 f"{', '.join(known) or 'none with a name'}{did_you_mean(application, names)}; a "
-                "number adds one"
+                "new number adds an application"
             )
         return names[application]
 

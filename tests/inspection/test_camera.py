@@ -498,7 +498,7 @@ async def test_a_camera_deletes_no_picture_but_its_own(tmp_path: Path, desk: Des
 
 
 def test_a_folder_for_pictures_with_a_zero_is_refused(tmp_path: Path, desk: Desk) -> None:
-    with pytest.raises(ConfigurationError, match=r"keep.folder: .*no zero"):
+    with pytest.raises(ConfigurationError, match=r"keep.folder: .*without a NUL"):
         load_cell(cell_of(tmp_path, desk, r'keep: {folder: "a\0b"}'))
 
 

@@ -68,8 +68,8 @@ async def test_each_of_equal_results_has_its_own_picture_in_a_recording(
             for level in (10, 10, 10, 220, 10):
                 desk.level = level
                 await camera.trigger(timeout=PATIENCE)
-                assert camera.judged is not None
-                judged.append(camera.judged.frame)
+                assert camera.last_picture is not None
+                judged.append(camera.last_picture.frame)
     assert (recorder.counts.results, recorder.counts.pictures) == (5, 5)
     found = [*load_recording(file).judged()]
     assert [one.result.value["level"] for one in found] == [10, 10, 10, 220, 10]
@@ -120,7 +120,7 @@ async def test_results_of_a_free_run_keep_their_pictures_after_earlier_sessions(
         await until(lambda: len(seen.results) >= done + 3)
         results.close()
         for result in seen.results[-3:]:
-            judged = camera._pairs.find_judged(result)
+            judged = camera._pairs.find_picture(result)
             assert judged is not None
             assert judged.number == result.sequence
 

@@ -126,7 +126,7 @@ def test_tool_follows_an_earlier_tool(tmp_path: Path) -> None:
 def test_tool_that_follows_nothing_found_is_not_ok_and_not_asked(tmp_path: Path) -> None:
     application = f"{{{SPOT}, brightness: {{follow: present, region: [0, 0, 4, 4]}}}}"
     found = inspected(tmp_path, application, board())
-    assert found.findings["brightness"].reason == "present was not found, which it follows"
+    assert found.findings["brightness"].reason == "the tool follows present, which was not found"
     assert math.isnan(found.value.brightness_mean)
 
 
@@ -190,7 +190,7 @@ def test_two_lists_in_one_program_are_refused(tmp_path: Path) -> None:
         ("-1: {present: {grey: [0, 9]}}", "expected a number from 0"),
         ("7: {read: {codes: [DataMatrx]}}", "did you mean 'DataMatrix'"),
         ("7: {read: {expect: '('}}", "expected a regular expression"),
-        ("7: {read: {least: 3}}", "expected least up to most"),
+        ("7: {read: {least: 3}}", r"expected up to 1 \(most\), got 3"),
         ("7: {compare: {taught: nowhere.png}}", "No such file"),
     ],
 )

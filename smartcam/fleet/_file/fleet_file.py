@@ -644,15 +644,15 @@ def software_camera(name: str, fields: dict[str, Any], folder: Path) -> CellCame
         MissingExtraError: a package that it needs is not installed.
     """
     with from_part("inspection", '"software:" in a fleet file needs'):
-        from smartcam.inspection._inside import Software, make_camera
-    return make_camera(name, validated(Software, fields, f"{name}: software"), folder)
+        from smartcam.inspection._inside import SoftwareEntry, make_camera
+    return make_camera(name, validated(SoftwareEntry, fields, f"{name}: software"), folder)
 
 
 def _software_mistakes(name: str, fields: dict[str, Any], folder: Path) -> Iterator[Mistake]:
     with from_part("inspection", '"software:" in a fleet file needs'):
-        from smartcam.inspection._inside import Software, software_mistakes
+        from smartcam.inspection._inside import SoftwareEntry, software_mistakes
     try:
-        software = Software.model_validate(fields)
+        software = SoftwareEntry.model_validate(fields)
     except ValidationError as exc:
         first = exc.errors(include_url=False)[0]
         yield ("software", *first["loc"]), first["msg"].removeprefix("Value error, ")

@@ -17,7 +17,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.inspection._camera.device import SoftwareDevice
-from smartcam.inspection._camera.pairing import MAX_PICTURES_KEPT, JudgedResults
+from smartcam.inspection._camera.pairing import MAX_PICTURES_KEPT, ResultPictures
 from smartcam.inspection._camera.pictures import png_of
 from smartcam.inspection._cell import load_cell
 from smartcam.models import Capabilities, Result, ValueT
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam._client._inside import TriggerRequest
-    from smartcam.inspection._camera.frame_inspector import Judged
+    from smartcam.inspection._camera.frame_inspector import InspectedPicture
     from smartcam.inspection._cell import CellCamera
     from smartcam.observers import Observer
 
@@ -68,7 +68,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         }
         emulator = self._device.emulator
         address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)
-        self._pairs = JudgedResults(
+        self._pairs = ResultPictures(
             self._device.last_sent, lambda: self.statistics().received, self._report_picture
         )
         self._device.inspector.viewers.add(self._pairs.record_picture)
@@ -80,9 +80,9 @@ class SoftwareCamera(SmartCamera[ValueT]):
         return dataclasses.replace(super().capabilities, read_image=True)
 
     @property
-    def judged(self) -> Judged | None:
+    def last_picture(self) -> InspectedPicture | None:
         """The last inspected picture with its findings; None before the first."""
-        return self._device.inspector.judged
+        return self._device.inspector.last_picture
 
     @property
     def frame_trouble(self) -> str:
@@ -115,7 +115,8 @@ class SoftwareCamera(SmartCamera[ValueT]):
         try:
             return await super()._trigger(application, request, timeout)
         except CameraFaultError as exc:
-            raise CameraFaultError(f"{exc}: {self.frame_trouble or 'it is closed'}") from exc
+            trouble = self.frame_trouble or "the camera is closed"
+            raise CameraFaultError(f"{exc}: {trouble}") from exc
 
     async def _read_image(self, timeout: float) -> bytes:
         return await self._read_last_picture(timeout, drawn=False)
@@ -155,29 +156,31 @@ class SoftwareCamera(SmartCamera[ValueT]):
         check_kind(result, Result, "result", "a Result", "read_judged_image")
         drawn = check_flag(drawn, "drawn", "read_judged_image")
         limit = self._limit(timeout, self.settings.request_timeout)
-        judged = self._pairs.find_judged(result)
-        if judged is None:
+        inspected = self._pairs.find_picture(result)
+        if inspected is None:
             raise UnsupportedError(
                 f"{self.name}: the picture of result {result.number} is not here: expected one of "
                 f"the last {MAX_PICTURES_KEPT} results of this camera"
             )
-        return await self._encode_png(judged, limit, drawn=drawn)
+        return await self._encode_png(inspected, limit, drawn=drawn)
 
-    def _report_picture(self, result: Result[Any], judged: Judged) -> None:
+    def _report_picture(self, result: Result[Any], inspected: InspectedPicture) -> None:
         if self._observers.handles_pictures:
-            self._observers.picture(result, judged.marked_frame)
+            self._observers.picture(result, inspected.frame_with_drawings)
 
     async def _read_last_picture(self, timeout: float, *, drawn: bool) -> bytes:
         self._require_session()
-        judged = self.judged
-        if judged is None:
+        inspected = self.last_picture
+        if inspected is None:
             raise UnsupportedError(f"{self.name}: no picture was judged yet: trigger first")
-        return await self._encode_png(judged, timeout, drawn=drawn)
+        return await self._encode_png(inspected, timeout, drawn=drawn)
 
-    async def _encode_png(self, judged: Judged, timeout: float, *, drawn: bool) -> bytes:
+    async def _encode_png(
+        self, inspected: InspectedPicture, timeout: float, *, drawn: bool
+    ) -> bytes:
         try:
             async with asyncio.timeout(timeout):
-                return await asyncio.to_thread(png_of, judged, drawn=drawn)
+                return await asyncio.to_thread(png_of, inspected, drawn=drawn)
         except TimeoutError:
             raise ResponseTimeoutError(
                 f"{self.name}: the picture was not made within {timeout:g} s", waited=timeout

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("smartcam.inspection")
 
 MAX_RECORDS: Final = 32
-"""Largest number of a list's records for which an In-Sight camera has cells."""
+"""Largest number of records of a list that the cells of an In-Sight camera hold."""
 
 NO_VALUE: Final = "#ERR"
 """Text of a cell without a value."""
@@ -227,10 +227,10 @@ class SoftwareDevice(Server):
         """Return the grey levels of the last inspected picture; a black pixel before the first."""
         import numpy as np
 
-        judged = self.inspector.judged
-        if judged is None or judged.inspection is None:
+        inspected = self.inspector.last_picture
+        if inspected is None or inspected.inspection is None:
             return np.zeros((1, 1), np.uint8)
-        return judged.inspection.picture.grey
+        return inspected.inspection.picture.grey
 
 
 class _CellInspector(Inspector):

@@ -49,7 +49,7 @@ RETRY: Final = Backoff(initial=0.1, maximum=5.0)
 """Delays before a lost source of frames is opened again."""
 
 
-class Judged(NamedTuple):
+class InspectedPicture(NamedTuple):
     """An inspected picture with its findings.
 
     Attributes:
@@ -65,8 +65,8 @@ class Judged(NamedTuple):
     application: int
 
     @property
-    def marked_frame(self) -> Frame:
-        """The frame, with the marks of the tools as its drawings."""
+    def frame_with_drawings(self) -> Frame:
+        """The frame, with the marks of the tools beside its unchanged pixels."""
         if self.inspection is None:
             return self.frame
         return copy_with(self.frame, drawings=self.inspection.drawings)
@@ -77,8 +77,8 @@ class _OrderedRun:
     """A run that waits for its frame or its tools."""
 
     order: InspectionOrder
-    seen: Callable[[], None]
-    done: Callable[[Values | None], None]
+    on_exposed: Callable[[], None]
+    on_done: Callable[[Values | None], None]
     earliest_exposure: float  # earliest start of the frame's exposure, time.monotonic()
     deadline: asyncio.TimerHandle
     frame: Frame | None = None
@@ -95,15 +95,15 @@ class FrameInspector(Inspector):
         name: name of the camera, for logs.
         make: function that returns the source of frames, not open.
         programs: programs by the ids of their applications.
-        recorded: whether the source is a recording. Each run gets the next picture of a recording;
-            the first picture follows the last one.
+        recorded: whether the source is a recording. Each run gets the next picture of a recording,
+            which starts again after its last picture.
         grey: whether the thread computes the grey levels of each picture for later use.
         on_trouble: function that is called with the reason when no frames come, and with "" when
             frames come again.
 
     Attributes:
         name: name of the camera.
-        judged: the last inspected picture, with its findings; None before the first.
+        last_picture: the last inspected picture, with its findings; None before the first.
         viewers: functions that are called with each inspected picture.
         format: format of the source's frames; None before it was opened.
         trouble: reason why there are no frames; "" if they come.
@@ -119,11 +119,11 @@ class FrameInspector(Inspector):
         grey: bool = False,
         on_trouble: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self.judged: Judged | None = None
+        self.last_picture: InspectedPicture | None = None
         self.trouble: str = "the source was not opened yet"
         self.on_trouble = on_trouble
         self.format: StreamFormat | None = None
-        self.viewers: set[Callable[[Judged], None]] = set()
+        self.viewers: set[Callable[[InspectedPicture], None]] = set()
         self.name = name
         self._make_source, self._programs = make, programs
         self._recorded, self._grey = recorded, grey
@@ -189,7 +189,7 @@ class FrameInspector(Inspector):
         deadline = loop.call_later(FRAME_WAIT, self._end_without_frame)
         self._run = _OrderedRun(order, on_exposed, on_done, time.monotonic(), deadline)
         self._frame_wanted.set()
-        if self.trouble:  # report it again, since a restart of the device has cleared the condition
+        if self.trouble:  # in each run, since a restart of the device clears the device's condition
             loop.call_soon(self._set_trouble, self.trouble)
 
     def cancel(self) -> None:
@@ -241,8 +241,8 @@ class FrameInspector(Inspector):
                 has_frames, kept_frame = True, None
                 if self._recorded and frame.lost:  # a damaged picture gives its run no result
                     kept_frame = dataclasses.replace(frame, lost=0)
-                    why = f"{frame.lost} damaged pictures before picture {frame.sequence}"
-                    self._report_frames_lost(why)
+                    reason = f"{frame.lost} damaged pictures before picture {frame.sequence}"
+                    self._report_frames_lost(reason)
                     await asyncio.sleep(RETRY.initial)
                     self._report_frames_back()
                     continue
@@ -260,11 +260,11 @@ class FrameInspector(Inspector):
             self._set_trouble("")
         self._first_frame_done.set()
 
-    def _report_frames_lost(self, why: str) -> None:
-        """Report that no frames come, which cancels the run."""
-        if why != self.trouble:
-            _log.warning("%s ! no frames: %s", self.name, why)
-        self._set_trouble(why)
+    def _report_frames_lost(self, reason: str) -> None:
+        """Report the reason why no frames come."""
+        if reason != self.trouble:
+            _log.warning("%s ! no frames: %s", self.name, reason)
+        self._set_trouble(reason)
         self._first_frame_done.set()
 
     def _set_trouble(self, trouble: str) -> None:
@@ -281,7 +281,7 @@ class FrameInspector(Inspector):
                 self.name,
                 FRAME_WAIT,
             )
-            run.done(None)
+            run.on_done(None)
 
     # ------------------------------------------------------------------ tools
 
@@ -304,7 +304,7 @@ class FrameInspector(Inspector):
                 loop.call_soon_threadsafe(self._report_findings, run, frame, future)
 
         future.add_done_callback(hand_over)
-        run.seen()
+        run.on_exposed()
 
     def _free_thread(self) -> ToolThread | None:
         """Return the thread for tools; a new thread if the old one is busy with a cancelled run."""
@@ -352,10 +352,10 @@ class FrameInspector(Inspector):
                 values = failed_values(self._programs[application], str(error))
         except Exception:  # noqa: BLE001 - the run has to end
             _log.exception("%s ! application %d has no result", self.name, application)
-        self.judged = Judged(number, frame, inspection, application)
-        run.done(values)
+        self.last_picture = InspectedPicture(number, frame, inspection, application)
+        run.on_done(values)
         for viewer in self.viewers:
-            viewer(self.judged)
+            viewer(self.last_picture)
 
 
 def _inspect_frame(program: Program, frame: Frame, data: bytes, grey: bool) -> Inspection:

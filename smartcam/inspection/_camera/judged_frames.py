@@ -12,7 +12,7 @@ from smartcam.frames import FrameAddress, FrameDriver, FrameSource, StreamFormat
 
 if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSink
-    from smartcam.inspection._camera.frame_inspector import FrameInspector, Judged
+    from smartcam.inspection._camera.frame_inspector import FrameInspector, InspectedPicture
 
 _log: Final = logging.getLogger("smartcam.inspection")
 
@@ -28,7 +28,7 @@ class JudgedDriver(FrameDriver):
     def __init__(self, inspector: FrameInspector, *, drawn: bool) -> None:
         super().__init__(FrameAddress.parse("judged://"))
         self._inspector, self._drawn = inspector, drawn
-        self._newest: asyncio.Queue[Judged] = asyncio.Queue(1)
+        self._newest: asyncio.Queue[InspectedPicture] = asyncio.Queue(1)
         self._task: asyncio.Task[None] | None = None
         self._sink: FrameSink | None = None
 
@@ -55,8 +55,8 @@ class JudgedDriver(FrameDriver):
         """Deliver the last inspected picture, then all later ones."""
         self._sink = sink
         self._inspector.viewers.add(self._queue_picture)
-        if self._inspector.judged is not None:
-            self._queue_picture(self._inspector.judged)
+        if self._inspector.last_picture is not None:
+            self._queue_picture(self._inspector.last_picture)
         self._task = asyncio.create_task(self._deliver(sink), name=f"judged frames of {self.name}")
 
     async def stop(self) -> None:
@@ -71,19 +71,19 @@ class JudgedDriver(FrameDriver):
         """Release everything."""
         await self.stop()
 
-    def _queue_picture(self, judged: Judged) -> None:
+    def _queue_picture(self, inspected: InspectedPicture) -> None:
         if self._newest.full():
             self._newest.get_nowait()
             if self._sink is not None:
                 self._sink.skipped(1)
-        self._newest.put_nowait(judged)
+        self._newest.put_nowait(inspected)
 
     async def _deliver(self, sink: FrameSink) -> None:
         try:
             while True:
-                judged = await self._newest.get()
+                inspected = await self._newest.get()
                 try:
-                    frame = await self._make_frame(judged)
+                    frame = await self._make_frame(inspected)
                 except SmartCamError as exc:  # a damaged picture
                     _log.debug("%s ! a picture is not shown: %s", self.name, exc)
                     sink.lost(1)
@@ -93,8 +93,10 @@ class JudgedDriver(FrameDriver):
             _log.exception("%s ! its pictures are not shown any more", self.name)
             sink.ended(FrameSourceError(f"{self.name}: {exc!r}", source=self.name))
 
-    async def _make_frame(self, judged: Judged) -> Frame:
-        return await asyncio.to_thread(_draw_marks, judged) if self._drawn else judged.marked_frame
+    async def _make_frame(self, inspected: InspectedPicture) -> Frame:
+        if self._drawn:
+            return await asyncio.to_thread(_draw_marks, inspected)
+        return inspected.frame_with_drawings
 
 
 def judged_source(inspector: FrameInspector, *, drawn: bool) -> FrameSource:
@@ -102,10 +104,10 @@ def judged_source(inspector: FrameInspector, *, drawn: bool) -> FrameSource:
     return FrameSource(JudgedDriver(inspector, drawn=drawn), timeout=None, stall=None, linger=2.0)
 
 
-def _draw_marks(judged: Judged) -> Frame:
-    """Return the frame with the marks of the tools."""
-    frame = judged.frame
-    pixels = frame.rgb() if judged.inspection is None else judged.inspection.drawn()
+def _draw_marks(inspected: InspectedPicture) -> Frame:
+    """Return the frame with the marks of the tools in its pixels."""
+    frame = inspected.frame
+    pixels = frame.rgb() if inspected.inspection is None else inspected.inspection.drawn()
     height, width = pixels.shape[:2]
     return dataclasses.replace(
         frame,

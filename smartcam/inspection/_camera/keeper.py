@@ -17,7 +17,7 @@ from smartcam.models import jsonable
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.inspection._camera.frame_inspector import Judged
+    from smartcam.inspection._camera.frame_inspector import InspectedPicture
     from smartcam.inspection._cell import Keep
 
 _log: Final = logging.getLogger("smartcam.inspection")
@@ -51,7 +51,7 @@ class PictureKeeper:
             rf"\d{{8}}-\d{{6}}-\d{{6}}-{re.escape(self._file_prefix)}-\d+-(ok|bad)\.png"
         )
         self.dropped_count: int = 0
-        self._waiting: collections.deque[Judged] = collections.deque()
+        self._waiting: collections.deque[InspectedPicture] = collections.deque()
         self._wake = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self._has_failed = False
@@ -71,15 +71,15 @@ class PictureKeeper:
         while self._waiting:
             await asyncio.to_thread(self._write, self._waiting.popleft())
 
-    def add_picture(self, judged: Judged) -> None:
+    def add_picture(self, inspected: InspectedPicture) -> None:
         """Queue a picture, unless it is ok and only bad pictures are kept."""
-        ok = judged.inspection is not None and judged.inspection.ok
+        ok = inspected.inspection is not None and inspected.inspection.ok
         if ok and self._keep.which == "bad":
             return
         if len(self._waiting) >= MAX_WAITING_PICTURES:
             self.dropped_count += 1
             return
-        self._waiting.append(judged)
+        self._waiting.append(inspected)
         self._wake.set()
 
     async def _write_all(self) -> None:
@@ -90,24 +90,25 @@ class PictureKeeper:
                 self._waiting.popleft()
             await self._wake.wait()
 
-    def _write(self, judged: Judged) -> None:
+    def _write(self, inspected: InspectedPicture) -> None:
         """Write a picture, and delete the oldest beyond the limit."""
-        inspection = judged.inspection
+        inspection = inspected.inspection
         ok = inspection is not None and inspection.ok
-        captured_at = datetime.fromtimestamp(judged.frame.utc, UTC)
+        captured_at = datetime.fromtimestamp(inspected.frame.utc, UTC)
         verdict = "ok" if ok else "bad"
-        stem = f"{captured_at:%Y%m%d-%H%M%S-%f}-{self._file_prefix}-{judged.application}-{verdict}"
+        name = f"{self._file_prefix}-{inspected.application}-{verdict}"
+        stem = f"{captured_at:%Y%m%d-%H%M%S-%f}-{name}"
         record: dict[str, Any] = {
             "camera": self._name,
-            "application": judged.application,
-            "number": judged.number,
+            "application": inspected.application,
+            "number": inspected.number,
             "captured": captured_at.isoformat(),
             "ok": ok,
             "value": None if inspection is None else jsonable(inspection.value),
         }
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            (self._folder / f"{stem}.png").write_bytes(png_of(judged, drawn=False))
+            (self._folder / f"{stem}.png").write_bytes(png_of(inspected, drawn=False))
             text = json.dumps(record, indent=1)
             (self._folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
             pictures = sorted(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from smartcam.emulator._inside import LastReport
-    from smartcam.inspection._camera.frame_inspector import Judged
+    from smartcam.inspection._camera.frame_inspector import InspectedPicture
     from smartcam.models import CameraEvent, Result
 
 MAX_PICTURES_KEPT: Final = 8
@@ -27,10 +27,10 @@ class _SentContainer(NamedTuple):
     """A container that the device has sent, with its picture."""
 
     data: bytes
-    judged: Judged
+    picture: InspectedPicture
 
 
-class JudgedResults(Observer):
+class ResultPictures(Observer):
     """Find the picture of each result that a client gets from a device in this process.
 
     All containers of a session arrive, in order. So device and client both count them, and a result
@@ -39,18 +39,18 @@ class JudgedResults(Observer):
 
     Args:
         session: function that returns the number of the device's session (0: no session), and the
-            last report of a run.
+            device's last report, one for each run.
         received: function that returns the number of containers that the client has received.
         on_found: function that is called with each result and its picture, before other observers
             get the result.
-        max_kept: number of latest results whose pictures are kept for :meth:`find_judged`.
+        max_kept: number of latest results whose pictures are kept for :meth:`find_picture`.
     """
 
     def __init__(
         self,
         session: Callable[[], tuple[int, LastReport | None]],
         received: Callable[[], int],
-        on_found: Callable[[Result, Judged], None],
+        on_found: Callable[[Result, InspectedPicture], None],
         *,
         max_kept: int = MAX_PICTURES_KEPT,
     ) -> None:
@@ -62,11 +62,11 @@ class JudgedResults(Observer):
         # number of containers that the client received before the session
         self._received_before = 0
         self._pending: dict[int, _SentContainer] = {}  # containers by their count in the session
-        self._judged: collections.OrderedDict[tuple[int, datetime], Judged] = (
+        self._pictures: collections.OrderedDict[tuple[int, datetime], InspectedPicture] = (
             collections.OrderedDict()
         )
 
-    def record_picture(self, judged: Judged) -> None:
+    def record_picture(self, picture: InspectedPicture) -> None:
         """Record the picture of the container that the device has just sent."""
         session_number, report = self._get_session()
         if session_number != self._session_number:
@@ -75,7 +75,7 @@ class JudgedResults(Observer):
         is_new, self._report = report is not self._report, report
         if session_number and is_new and report is not None:
             self._sent_count += 1
-            self._pending[self._sent_count] = _SentContainer(report.result.data, judged)
+            self._pending[self._sent_count] = _SentContainer(report.result.data, picture)
             self._pending.pop(self._sent_count - MAX_PENDING, None)
 
     def on_state(self, event: CameraEvent) -> None:
@@ -90,14 +90,16 @@ class JudgedResults(Observer):
         count = result.number - self._received_before
         sent = self._pending.pop(count, None)
         for unmatched in [key for key in self._pending if key < count]:
-            del self._pending[unmatched]  # their results never arrived
-        if sent is None or (sent.data, sent.judged.application) != (result.raw, result.application):
+            del self._pending[unmatched]  # containers that could not be interpreted
+        if sent is None or sent.data != result.raw:
             return
-        self._judged[result.number, result.received_at] = sent.judged
-        if len(self._judged) > self._max_kept:
-            self._judged.popitem(last=False)
-        self._on_found(result, sent.judged)
+        if sent.picture.application != result.application:
+            return
+        self._pictures[result.number, result.received_at] = sent.picture
+        if len(self._pictures) > self._max_kept:
+            self._pictures.popitem(last=False)
+        self._on_found(result, sent.picture)
 
-    def find_judged(self, result: Result) -> Judged | None:
+    def find_picture(self, result: Result) -> InspectedPicture | None:
         """Return the picture of a recent result; None if it is no longer kept."""
-        return self._judged.get((result.number, result.received_at))
+        return self._pictures.get((result.number, result.received_at))

@@ -11,10 +11,10 @@ from smartcam._extras import load
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.inspection._camera.frame_inspector import Judged
+    from smartcam.inspection._camera.frame_inspector import InspectedPicture
 
 
-def png_of(judged: Judged, *, drawn: bool) -> bytes:
+def png_of(inspected: InspectedPicture, *, drawn: bool) -> bytes:
     """Return an inspected picture as a PNG's bytes; ``drawn``: with the marks of the tools.
 
     Levels of 9 to 15 bits are scaled to 16 bits, so that white is white in every viewer.
@@ -24,14 +24,14 @@ def png_of(judged: Judged, *, drawn: bool) -> bytes:
         MissingExtraError: OpenCV is not installed.
     """
     pixels: NDArray[Any]
-    inspection = judged.inspection
+    inspection = inspected.inspection
     if inspection is not None and drawn:
         pixels = inspection.drawn()
     elif inspection is not None:
         picture = inspection.picture
         pixels = picture.rgb if picture.has_colours else _full_range(picture.levels, picture.depth)
     else:
-        pixels = _full_range(judged.frame.rgb(), judged.frame.format.depth)
+        pixels = _full_range(inspected.frame.rgb(), inspected.frame.format.depth)
     cv2 = load("cv2", "inspection needs")
     if pixels.ndim == 3:
         pixels = pixels[:, :, ::-1]

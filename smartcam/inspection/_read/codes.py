@@ -37,7 +37,7 @@ class ReadCode:
             pixels of the picture.
         angle: direction of the upper edge, radians from x towards y.
         unused_correction: share of the code's error correction that reading did not need, 0 to 1;
-            None: none.
+            None: zxing-cpp does not report it for this kind.
         level: error correction level, such as ``H``; "" if the kind has none.
         version: size of the symbol, such as ``12x26``; "" if the kind has none.
         prepared: name of the preparation of the picture in which the code was read; "": none.

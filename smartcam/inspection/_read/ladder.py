@@ -84,26 +84,31 @@ class CodeSearch(NamedTuple):
 
 
 def read_again(
-    search: CodeSearch, codes_read: Sequence[ReadCode], least: int, deadline: float, expected: float
+    search: CodeSearch,
+    codes_read: Sequence[ReadCode],
+    min_count: int,
+    deadline: float,
+    first_duration: float,
 ) -> list[ReadCode]:
     """Try rungs until enough codes are read; return ``codes_read`` and the additional codes.
 
     Args:
         search: the picture and the wanted codes.
         codes_read: codes that the first reading has found.
-        least: number of codes that is enough.
+        min_count: number of codes that is enough.
         deadline: time of ``time.monotonic()`` at which this function must end; rungs that would
             probably take longer are skipped.
-        expected: duration of the first reading, seconds, from which a rung's is estimated.
+        first_duration: duration of the first reading, seconds, from which a rung's is estimated.
     """
     grey = search.grey
     codes = list(codes_read)
     unconfirmed: list[ReadCode] = []
     for rung in RUNGS:
-        if len(codes) >= least:
+        if len(codes) >= min_count:
             break
         cost = max(rung.scale**2, 1.0)
-        if cost * grey.size > MAX_RUNG_PIXELS or time.monotonic() + cost * expected > deadline:
+        expected_end = time.monotonic() + cost * first_duration
+        if cost * grey.size > MAX_RUNG_PIXELS or expected_end > deadline:
             continue
         codes_in_smaller: list[ReadCode] | None = None
         for code in _read_with_rung(rung, search):
@@ -251,7 +256,7 @@ RUNGS: Final[tuple[Rung, ...]] = (
     _make_rung("median, threshold", _median, _threshold, binarizer=_FIXED),
     _make_rung("a quarter as large, blurred", partial(_blur, sigma=1.0), scale=0.25),
     _make_rung("inverted, threshold", np.invert, _threshold, binarizer=_FIXED),
-    _make_rung("half again as large", scale=1.5),
+    _make_rung("1.5 times as large", scale=1.5),
     _make_rotation_rung(-22),
     _make_rung("local threshold", _local_threshold, binarizer=_FIXED),
     _make_rung("twice as large, sharpened", partial(_sharpen, sigma=3.0, amount=3.0), scale=2),

@@ -18,7 +18,7 @@ class PatternError(ValueError):
     """Error in a pattern."""
 
 
-class TooLongError(Exception):
+class MatchTimeoutError(Exception):
     """Error for a match that takes too long."""
 
 
@@ -51,10 +51,10 @@ class TextPattern:
         """Return True if the whole text matches the pattern.
 
         Raises:
-            TooLongError: matching takes longer than :data:`MAX_MATCH_SECONDS`.
+            MatchTimeoutError: matching takes longer than :data:`MAX_MATCH_SECONDS`.
         """
         try:
             match = self._compiled.fullmatch(text, timeout=MAX_MATCH_SECONDS, concurrent=True)
         except (TimeoutError, MemoryError, RecursionError) as exc:
-            raise TooLongError from exc
+            raise MatchTimeoutError from exc
         return match is not None

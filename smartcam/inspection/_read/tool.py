@@ -14,7 +14,7 @@ from smartcam.inspection._finding import Finding
 from smartcam.inspection._places import PixelPose
 from smartcam.inspection._read.codes import ReadCode, formats_of, read_codes
 from smartcam.inspection._read.ladder import CodeSearch, read_again
-from smartcam.inspection._read.patterns import TextPattern, TooLongError
+from smartcam.inspection._read.patterns import MatchTimeoutError, TextPattern
 from smartcam.inspection._tool import Tool, ToolSettings
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ class ReadSettings(ToolSettings):
     expect: Annotated[str | None, AfterValidator(_check_pattern)] = Field(
         None,
         max_length=1000,
-        description="expected text: a regular expression, or input: the value of the input",
+        description="expected text: a regular expression, or the word input: the text of the "
+        "trigger's input",
     )
     most: int = Field(1, ge=1, le=MAX_CODES, description="largest number of codes in the result")
     least: int = Field(1, ge=0, le=MAX_CODES, description="least number of codes")
@@ -76,7 +77,9 @@ class ReadTool(Tool[ReadSettings]):
     def __init__(self, settings: ReadSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
         if settings.least > settings.most:
-            raise ConfigurationError(f"expected least up to most, {settings.most}")
+            raise ConfigurationError(
+                f"least: expected up to {settings.most} (most), got {settings.least}"
+            )
         try:
             self._formats = formats_of(settings.codes)
         except ValueError as exc:
@@ -170,11 +173,13 @@ class ReadTool(Tool[ReadSettings]):
                 return f"read {code.data[:40]!r}, expected the input {input_data[:40]!r}"
             if not self._fits_layout(code):
                 size = len(code.text.encode())
-                return f"the text has {size} bytes or a zero, expected up to {settings.length}"
+                if size <= settings.length:
+                    return "the text contains a NUL character"
+                return f"the text has {size} bytes, expected up to {settings.length}"
             if self._pattern is not None:
                 try:
                     fits = self._pattern.fits(code.text)
-                except TooLongError:
+                except MatchTimeoutError:
                     return f"comparing {code.text[:40]!r} with expect takes too long"
                 if not fits:
                     return f"read {code.text[:40]!r}, expected {settings.expect}"
