@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._inside import LengthUnit
     from smartcam.depth import Cloud
-    from smartcam.web._inside import Up
+    from smartcam.web._inside import UpAxis
 
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 """Values of ``--up``: the axis that points upwards on the page."""
@@ -80,7 +80,7 @@ _unit_option = click.option(
 @option("--seconds")
 @async_command(*OUTPUT_OPTIONS)
 async def show(
-    file: str, up: Up, unit: LengthUnit | None, web: PageOptions, options: Options
+    file: str, up: UpAxis, unit: LengthUnit | None, web: PageOptions, options: Options
 ) -> None:
     from smartcam.depth import load_cloud
     from smartcam.web import CloudSite

@@ -59,9 +59,9 @@ def numbered_names(file: str, count: int) -> list[str]:
 def _encoded_pixels(frame: Frame, encoding: Encoding) -> NDArray[Any]:
     import numpy as np
 
-    from smartcam.web._inside import picture
+    from smartcam.web._inside import pixels_to_show
 
-    pixels = picture(frame, grey=encoding.grey)
+    pixels = pixels_to_show(frame, grey=encoding.grey)
     if encoding.eight_bits and pixels.dtype != np.uint8:
         pixels = (pixels >> (frame.format.depth - 8)).astype(np.uint8)
     return pixels
@@ -85,7 +85,7 @@ def _npy(frame: Frame, encoding: Encoding) -> bytes:
 def _jpeg(frame: Frame, encoding: Encoding) -> bytes:
     import numpy as np
 
-    from smartcam.web._inside import encoded, is_whole_jpeg
+    from smartcam.web._inside import encode_pixels, is_whole_jpeg
 
     if not encoding.grey and is_whole_jpeg(frame):
         return bytes(frame.data)
@@ -96,7 +96,7 @@ def _jpeg(frame: Frame, encoding: Encoding) -> bytes:
             "that ends with .png, .jxl, .npy or .raw, which keep all bits, or --8-bit, which keeps "
             "the upper 8"
         )
-    return encoded(frame, pixels, encoding.quality)
+    return encode_pixels(frame, pixels, encoding.quality)
 
 
 def _png(frame: Frame, encoding: Encoding) -> bytes:

@@ -259,7 +259,7 @@ def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
     rtsp_statistics = {} if server is None else server.statistics()
     rows: list[str] = []
     for index, (name, source) in enumerate(unique_names(site.sources).items()):
-        addresses = sorted(viewer.address for viewer in site.viewers if viewer.place == index)
+        addresses = sorted(viewer.address for viewer in site.viewers if viewer.index == index)
         rtsp_count = rtsp_statistics[name].viewers if name in rtsp_statistics else 0
         addresses += [f"{rtsp_count} by RTSP"] if rtsp_count else []
         rows += [f"{source.name}: {', '.join(addresses)}"] if addresses else []

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._file.recording import RecordSection
     from smartcam.fleet._file.ros import RosSection
     from smartcam.fleet._opening import fleet_camera
-    from smartcam.fleet._operations.metric_families import exposition, require_client
+    from smartcam.fleet._operations.metric_families import exposition, require_prometheus
     from smartcam.fleet._operations.metrics import read_numbers
     from smartcam.fleet._outlets import FleetOutlets
     from smartcam.fleet._program.fleet import FleetResults
@@ -59,7 +59,7 @@ __all__ = [
     "raise_descriptor_limit",
     "read_identity",
     "read_numbers",
-    "require_client",
+    "require_prometheus",
     "ros_of",
     "shake_hands",
 ]
@@ -81,7 +81,7 @@ if not TYPE_CHECKING:
             "_file.recording": "RecordSection",
             "_file.ros": "RosSection",
             "_opening": "fleet_camera",
-            "_operations.metric_families": "exposition require_client",
+            "_operations.metric_families": "exposition require_prometheus",
             "_operations.metrics": "read_numbers",
             "_outlets": "FleetOutlets",
             "_ros": "RosFleet ros_of",

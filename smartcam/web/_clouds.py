@@ -41,7 +41,7 @@ PART_BYTES: Final = 1 << 16
 SHOW_TIMEOUT: Final = 60.0
 """Seconds within which a page must have received and shown a cloud."""
 
-Up: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
+UpAxis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 class _PackedCloud(NamedTuple):
@@ -78,19 +78,21 @@ class CloudSite(ThreadedSite):
         self,
         cloud: Cloud | None = None,
         *,
-        up: Up = "z",
+        up: UpAxis = "z",
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
     ) -> None:
         super().__init__(CALLS, "cloud", host=host, port=port, token=token)
-        if up not in get_args(Up):
-            raise ConfigurationError(f"up: expected one of {', '.join(get_args(Up))}, got {up!r}")
+        if up not in get_args(UpAxis):
+            raise ConfigurationError(
+                f"up: expected one of {', '.join(get_args(UpAxis))}, got {up!r}"
+            )
         self.viewers: set[CloudViewer] = set()
         self._up = up
         self._cloud: Cloud = Cloud(np.empty((0, 3)))
         self._number = 0  # number of the cloud; 0: none yet
-        self._cloud_shown = asyncio.Event()
+        self._new_cloud = asyncio.Event()
         self._packing_job: tuple[int, asyncio.Future[_PackedCloud]] | None = None
         if cloud is not None:
             self.show(cloud)
@@ -108,8 +110,8 @@ class CloudSite(ThreadedSite):
             raise ConfigurationError(f"show: expected a Cloud, got {type(cloud).__name__}")
         self._cloud = cloud
         self._number += 1
-        self._cloud_shown.set()
-        self._cloud_shown = asyncio.Event()
+        self._new_cloud.set()
+        self._new_cloud = asyncio.Event()
 
     async def stop(self) -> None:
         """Close the port, and end the viewers."""
@@ -126,7 +128,7 @@ class CloudSite(ThreadedSite):
         Cancellation: safe; other callers that wait for the cloud still get it.
         """
         while self._number <= number:
-            await self._cloud_shown.wait()
+            await self._new_cloud.wait()
         if self._packing_job is None or self._packing_job[0] != self._number:
             loop = asyncio.get_running_loop()
             future = loop.run_in_executor(self._threads, pack_cloud, self._cloud)
@@ -185,15 +187,15 @@ def _pack_points(cloud: Cloud) -> _PackedCloud:
     return _PackedCloud(fields, body)
 
 
-def thin_cloud(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
-    """Return a cloud of at most ``most`` points, and the voxels' size in metres if thinned."""
-    if len(cloud) <= most:
+def thin_cloud(cloud: Cloud, max_points: int) -> tuple[Cloud, float | None]:
+    """Return a cloud of ``max_points`` at most, and the voxels' size in metres if thinned."""
+    if len(cloud) <= max_points:
         return cloud, None
     extent = float(np.ptp(cloud.points.astype(np.float64), axis=0).max())
     # a voxel must not be smaller than float32's resolution at the farthest point
     size = max(extent / 1024, 1e-6 * float(np.abs(cloud.points).max()), 1e-9)
-    while len(thin := voxel_grid(cloud, size)) > most:
-        size *= max(1.05, (len(thin) / most) ** 0.5)  # a surface has about 1 / size**2 voxels
+    while len(thin := voxel_grid(cloud, size)) > max_points:
+        size *= max(1.05, (len(thin) / max_points) ** 0.5)  # a surface has about 1 / size**2 voxels
     return thin, size
 
 
@@ -252,8 +254,8 @@ def _cloud(site: CloudSite, _call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/clouds",
-    about="A WebSocket: the newest cloud after each `next`. JSON with the number of "
-    "bytes; then these in parts: x, y, z as float32, red, green, blue as uint8.",
+    about="A WebSocket: after each message `next`, the newest cloud. JSON with the number of "
+    "bytes; then the bytes in parts: x, y, z as float32, red, green, blue as uint8.",
 )
 async def _clouds(site: CloudSite, call: CallRequest) -> web.StreamResponse:
     check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)

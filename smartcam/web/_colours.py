@@ -185,7 +185,7 @@ class ColourSite(ThreadedSite):
             "format": frame.format.name,
             "age": frame.age,
             "range": asdict(colours),
-            "part": float(mask.mean()),
+            "share": float(mask.mean()),
             "regions": [
                 {
                     "area": region.area,
@@ -208,7 +208,9 @@ class ColourSite(ThreadedSite):
         """Count a request that waits for a frame in the block; refuse it if there are too many."""
         if self._waiting_count >= MAX_WAITING_REQUESTS:
             raise RefusedError(
-                503, f"picture {MAX_WAITING_REQUESTS + 1}", f"{MAX_WAITING_REQUESTS} at one time"
+                503,
+                f"waiting request {MAX_WAITING_REQUESTS + 1}",
+                f"{MAX_WAITING_REQUESTS} at most",
             )
         self._waiting_count += 1
         try:
@@ -245,7 +247,7 @@ class RangeBody(CallBody):
 
 
 class LookBody(CallBody):
-    """The query of a picture."""
+    """The body of a request for a picture."""
 
     viewer: _Viewer
     range: RangeBody
@@ -253,7 +255,7 @@ class LookBody(CallBody):
 
 
 class AroundBody(CallBody):
-    """The query of the colours around a pixel of a picture."""
+    """The body of a request for the colours around a pixel of a picture."""
 
     viewer: _Viewer
     sequence: int
@@ -279,7 +281,7 @@ def _source(site: ColourSite, _call: CallRequest) -> object:
     body=LookBody,
     sample='{"viewer": "me", "range": {"hue": [0, 179], "saturation": [0, 255], "value": [0, 60]}}',
     about="The next frame as a JPEG and the mask of a range as a PNG, after JSON with the regions;"
-    ' `"again": true`: of the last frame that this viewer got. The device streams for it.',
+    ' `"again": true`: the frame that this viewer got last. The device streams until it has come.',
 )
 async def _look(site: ColourSite, call: CallRequest) -> web.Response:
     body: LookBody = call.body

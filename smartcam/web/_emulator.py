@@ -31,7 +31,7 @@ MAX_ENTRIES = 1000
 MAX_WAIT = 30.0
 """Seconds that a call may wait for a log entry."""
 
-MAX_WAITING_CHANGES = 16
+MAX_WAITING_CALLS = 16
 """Largest number of calls that may wait for a log entry at the same time. Together with the event
 streams they take half of the connections."""
 
@@ -90,11 +90,11 @@ class EmulatorSite(Site):
         The wait also ends when the site stops or the client disconnects.
 
         Raises:
-            RefusedError: 503, :data:`MAX_WAITING_CHANGES` calls wait already.
+            RefusedError: 503, :data:`MAX_WAITING_CALLS` calls wait already.
         """
-        if self._waiting_count >= MAX_WAITING_CHANGES:
+        if self._waiting_count >= MAX_WAITING_CALLS:
             raise RefusedError(
-                503, f"waiting call {MAX_WAITING_CHANGES + 1}", f"{MAX_WAITING_CHANGES} at one time"
+                503, f"waiting call {MAX_WAITING_CALLS + 1}", f"{MAX_WAITING_CALLS} at most"
             )
         self._waiting_count += 1
         try:
@@ -206,13 +206,13 @@ def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
 
 
 @CALLS.add("GET", API)
-def _calls(_site: EmulatorSite, _ask: CallRequest) -> object:
+def _calls(_site: EmulatorSite, _call: CallRequest) -> object:
     """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 
 @CALLS.add("GET", f"{API}/cameras")
-def _cameras(site: EmulatorSite, _ask: CallRequest) -> object:
+def _cameras(site: EmulatorSite, _call: CallRequest) -> object:
     """All cameras, in short."""
     return {
         "cameras": [serialize.camera_row(name, camera) for name, camera in site.cameras.items()]
@@ -261,18 +261,18 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
     body: _ApplicationBody = call.body
     if body.id not in emulator.application_ids:
         known = ", ".join(str(ident) for ident in emulator.application_ids)
-        field = {"field": "id", "came": str(body.id), "expected": f"one of {known}"}
+        field = {"field": "id", "received": str(body.id), "expected": f"one of {known}"}
         raise RefusedError(422, f"application {body.id}", f"one of {known}", (field,))
     if not switch(body.id, running=body.running):
         mode = emulator.device.mode
         state = getattr(mode, "value", mode)
-        raise RefusedError(409, f"the camera is {state}", "it to be stopped or running")
+        raise RefusedError(409, f"the camera is {state}", "a camera that is stopped or running")
     return {"camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/reboot", body=_RebootBody, optional=True, sample='{"seconds": 0.5}')
 def _reboot(site: EmulatorSite, call: CallRequest) -> object:
-    """Restart the camera, as by its power switch; without a body, by the quirk's setting."""
+    """Restart the camera, as by its power switch; default: for the time of quirk `reboot_time`."""
     body: _RebootBody = call.body
     _device_method(site, call, "reboot")(body.seconds)
     return {"camera": _state(site, call)}
@@ -298,7 +298,7 @@ def _endian(site: EmulatorSite, call: CallRequest) -> object:
 
 
 @CALLS.add("GET", f"{API}/faults")
-def _kinds(_site: EmulatorSite, _ask: CallRequest) -> object:
+def _kinds(_site: EmulatorSite, _call: CallRequest) -> object:
     """Every kind of fault, with the JSON Schema of its fields."""
     return {"kinds": serialize.kinds()}
 
@@ -327,7 +327,7 @@ def _clear_faults(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/commands/{{command}}")
 def _command(site: EmulatorSite, call: CallRequest) -> object:
-    """Give the command to the cues of the scenario's timeline."""
+    """Give a command for which cues of the scenario's timeline wait."""
     emulator, name = _emulator(site, call), call.path["command"]
     if name not in emulator.commands:
         known = ", ".join(emulator.commands) or "none: its scenario's timeline has no command"
@@ -350,24 +350,24 @@ def _scene(site: EmulatorSite, call: CallRequest) -> object:
 )
 def _put_part(site: EmulatorSite, call: CallRequest) -> object:
     """Add a part to the table, or move it: metres and radians."""
-    pieces, name = _table(site, call).pieces, call.path["part"]
+    parts, name = _table(site, call).pieces, call.path["part"]
     if not (name.isascii() and name.isprintable() and len(name) <= 50):
         raise RefusedError(
             422, f"the part {name!r}", "a name of 1 to 50 printable ASCII characters"
         )
-    if name not in pieces and len(pieces) >= MAX_PARTS:
+    if name not in parts and len(parts) >= MAX_PARTS:
         raise RefusedError(422, f"part {MAX_PARTS + 1}", f"{MAX_PARTS} parts on a table at most")
     body: _PartPose = call.body
-    pieces[name] = TablePose(body.x, body.y, body.theta)
+    parts[name] = TablePose(body.x, body.y, body.theta)
     return _scene(site, call)
 
 
 @CALLS.add("DELETE", f"{_CAMERA}/scene/parts/{{part}}")
 def _remove_part(site: EmulatorSite, call: CallRequest) -> object:
     """Take a part off the table."""
-    pieces, name = _table(site, call).pieces, call.path["part"]
-    if pieces.pop(name, None) is None:
-        known = ", ".join(pieces) or "nothing: the table is empty"
+    parts, name = _table(site, call).pieces, call.path["part"]
+    if parts.pop(name, None) is None:
+        known = ", ".join(parts) or "nothing: the table is empty"
         raise RefusedError(404, f"no part is called {name!r}", known)
     return _scene(site, call)
 
@@ -375,9 +375,9 @@ def _remove_part(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("POST", f"{_CAMERA}/scene/reset")
 def _reset_scene(site: EmulatorSite, call: CallRequest) -> object:
     """Put all parts back to their first places."""
-    pieces = _table(site, call).pieces
-    pieces.clear()
-    pieces.update(PIECES)
+    parts = _table(site, call).pieces
+    parts.clear()
+    parts.update(PIECES)
     return _scene(site, call)
 
 
@@ -387,15 +387,15 @@ async def _log(site: EmulatorSite, call: CallRequest) -> object:
 
     With `?wait=` seconds it waits for the first one.
     """
-    emulator, part = _emulator(site, call), call.query
-    since: int = part.since or 0
+    emulator, query = _emulator(site, call), call.query
+    since: int = query.since or 0
 
     def has_entry() -> bool:
         return bool(emulator.log.since(since, 1)[0])
 
-    if part.wait:
-        await site.wait_for(call.request, has_entry, part.wait)
-    return serialize.log_part(emulator, since, part.limit)[0]
+    if query.wait:
+        await site.wait_for(call.request, has_entry, query.wait)
+    return serialize.log_part(emulator, since, query.limit)[0]
 
 
 @CALLS.add("GET", f"{_CAMERA}/log/{{serial}}")

@@ -21,7 +21,7 @@ class RefusedError(Exception):
     status: int  # the HTTP status code
     received: str
     expected: str
-    # of each wrong field: ``field``, ``came`` (the received value) and ``expected``
+    # of each wrong field: ``field``, ``received`` and ``expected``
     fields: tuple[dict[str, str], ...] = ()
     headers: Mapping[str, str] = field(default_factory=dict[str, str])  # headers of the answer
 
@@ -30,7 +30,7 @@ class RefusedError(Exception):
         answer = {
             "error": f"{call}: {self.received}; expected {self.expected}",
             "tried": call,
-            "came": self.received,
+            "received": self.received,
             "expected": self.expected,
         }
         return {**answer, "fields": self.fields} if self.fields else answer
@@ -56,11 +56,11 @@ def wrong_fields_error(error: ValidationError) -> RefusedError:
     fields = tuple(
         {
             "field": ".".join(str(part) for part in item["loc"]),
-            "came": "nothing" if item["type"] == "missing" else short_repr(item["input"]),
+            "received": "nothing" if item["type"] == "missing" else short_repr(item["input"]),
             "expected": _expected(item["type"], item["msg"]),
         }
         for item in error.errors(include_url=False)
     )
-    received = "; ".join(f"{field['field'] or 'the body'}: {field['came']}" for field in fields)
+    received = "; ".join(f"{field['field'] or 'the body'}: {field['received']}" for field in fields)
     expected = "; ".join(field["expected"] for field in fields)
     return RefusedError(422, received, expected, fields)

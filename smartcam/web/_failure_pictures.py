@@ -53,9 +53,9 @@ class FailurePictures:
                 if loop.time() - row.picture_at < CAMERA_PERIOD:
                     continue
                 self._view.failing.pop(row, None)
-                if row.failure and row.history.wants_picture:
+                if row.failure_serial and row.history.wants_picture:
                     row.picture_at = loop.time()
-                    await self._fetch(row, row.failure)
+                    await self._fetch(row, row.failure_serial)
 
     async def _fetch(self, row: FleetRow, serial: int) -> None:
         camera = row.camera
@@ -66,7 +66,7 @@ class FailurePictures:
         except SmartCamError:
             return  # not reported here: the live page shows the camera's error
         await asyncio.sleep(NEWER_RESULT_DELAY)
-        if row.failure != serial:
+        if row.failure_serial != serial:
             return
         row.history.attach_picture(serial, data)
         self._attached.append((row, serial, len(data)))

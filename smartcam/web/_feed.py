@@ -19,7 +19,7 @@ second are sent."""
 MAX_FAULTS_TOLD = 100
 """Largest number of faults that one event reports."""
 
-LOOKS_PER_CLOCK = round(1.0 / PERIOD)
+CHECKS_PER_CLOCK_REPORT = round(1.0 / PERIOD)
 """Number of checks for changes between two reports of the clock, so that a report is sent once a
 second. Sending a report also detects that the reader is gone."""
 
@@ -35,7 +35,7 @@ class EmulatorWatcher:
         self._emulator = emulator
         self._serial = serialize.log_count(emulator) if since is None else since
         self._last_values: dict[str, Any] = {}
-        self._look_count = 0
+        self._check_count = 0
 
     def find_events(self) -> Iterator[StreamEvent]:
         """Yield the changes since the last call; the first call yields the whole state."""
@@ -50,9 +50,9 @@ class EmulatorWatcher:
             yield StreamEvent("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
         if log is not None:
             yield log
-        if self._look_count % LOOKS_PER_CLOCK == 0:
+        if self._check_count % CHECKS_PER_CLOCK_REPORT == 0:
             yield StreamEvent("clock", serialize.times(emulator))
-        self._look_count += 1
+        self._check_count += 1
 
     def _event_if_changed(self, kind: str, value: Any) -> Iterator[StreamEvent]:
         if self._last_values.get(kind) != value:
@@ -68,7 +68,7 @@ class EmulatorWatcher:
     def _log_event(self) -> StreamEvent | None:
         emulator = self._emulator
         part, entries = serialize.log_part(emulator, self._serial, MAX_LOG_NEWS)
-        self._serial = part["next"]  # lower than before if another emulator began
+        self._serial = part["next"]  # lower than before if the emulator was replaced
         if not entries and not part["missed"]:
             return None
         return StreamEvent("log", part, self._serial)

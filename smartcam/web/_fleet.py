@@ -101,7 +101,7 @@ class FleetSite(Site):
         self.view: FleetView = FleetView(fleet, self.units.shown)
         self.viewers: set[FleetSocket] = set()
         self.outlets: OutletsView = OutletsView(fleet)
-        self._live: dict[str, WatchedCamera] = {}
+        self._watched: dict[str, WatchedCamera] = {}
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
@@ -131,8 +131,8 @@ class FleetSite(Site):
         for viewer in self.viewers:
             viewer.end()
         try:
-            for name in list(self._live):
-                await self._live.pop(name).stop()
+            for name in list(self._watched):
+                await self._watched.pop(name).stop()
             await super().stop()
         finally:
             await self.view.stop()
@@ -148,47 +148,47 @@ class FleetSite(Site):
 
     # ------------------------------------------------------------------ one camera
 
-    def live(self, name: str) -> WatchedCamera:
+    def watched_camera(self, name: str) -> WatchedCamera:
         """Return the camera with this name; begin to follow it for its own page if needed.
 
         Raises:
             RefusedError: 404, no camera has this name; 503, there are :data:`MAX_CAMERAS` already.
         """
-        live = self._live.get(name)
-        if live is None:
-            live = self._follow_camera(name)
-        live.used_at = asyncio.get_running_loop().time()
-        return live
+        watched = self._watched.get(name)
+        if watched is None:
+            watched = self._follow_camera(name)
+        watched.used_at = asyncio.get_running_loop().time()
+        return watched
 
     def _follow_camera(self, name: str) -> WatchedCamera:
         try:
             camera = self.fleet[name]
         except ConfigurationError as exc:
             raise RefusedError(404, str(exc)[:300], "a camera of the fleet") from exc
-        if len(self._live) >= MAX_CAMERAS:
+        if len(self._watched) >= MAX_CAMERAS:
             label = f"camera {MAX_CAMERAS + 1} on a page of its own"
             raise RefusedError(503, label, f"{MAX_CAMERAS} at one time")
         row = self.view.rows.get(name)
-        live = WatchedCamera(camera, control=self.control, units=self.units, row=row)
-        self._live[name] = live
-        live.start()
+        watched = WatchedCamera(camera, control=self.control, units=self.units, row=row)
+        self._watched[name] = watched
+        watched.start()
         if row is not None and row.last is not None:
-            live.view.add_result(row.last)
-        return live
+            watched.view.add_result(row.last)
+        return watched
 
     async def _update_live_cameras(self) -> None:
         """Stop following cameras without viewers; replace objects of cameras that have ended."""
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(VIEWER_CHECK_PERIOD)
-            for name, live in list(self._live.items()):
-                if not live.is_watched and loop.time() - live.used_at > LINGER:
-                    del self._live[name]
-                    await live.stop()
+            for name, watched in list(self._watched.items()):
+                if not watched.is_watched and loop.time() - watched.used_at > LINGER:
+                    del self._watched[name]
+                    await watched.stop()
                     continue
-                camera = live.view.camera
+                camera = watched.view.camera
                 if (current := self.fleet[name]) is not camera:
-                    await live.view.follow(current, live.view.loss)
+                    await watched.view.follow(current, watched.view.loss)
 
 
 # ---------------------------------------------------------------------- calls
@@ -205,7 +205,7 @@ def _calls(_site: FleetSite, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/fleet")
 def _fleet(site: FleetSite, _call: CallRequest) -> object:
-    """The fleet: numbers of cameras by state, and the outcomes of the last ten minutes."""
+    """The fleet: how many cameras are in each state, and the outcomes of the last ten minutes."""
     about = {"fleet": site.fleet.url, "control": site.control, "agents": sorted(site.view.agents)}
     return {**about, "totals": site.view.totals(), "bars": list(site.view.series)}
 
@@ -215,7 +215,7 @@ def _fleet(site: FleetSite, _call: CallRequest) -> object:
     f"{API}/cameras",
     query=RowsInSight,
     about="Some rows of the table: the query may have `first`, `count`, `search`, `filter`, "
-    "`sort`, `down`.",
+    "`sort`, `descending`.",
 )
 async def _cameras(site: FleetSite, call: CallRequest) -> object:
     rows_in_sight: RowsInSight = call.query
@@ -247,8 +247,8 @@ async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
 
 @CALLS.add("GET", f"{API}/outlets")
 async def _outlets(site: FleetSite, _call: CallRequest) -> object:
-    """The accounts of all agents' outlets: results = delivered + spooled + dropped."""
-    return {"outlets": [account._asdict() for account in await site.outlets.accounts()]}
+    """The counts of all agents' outlets: results = delivered + spooled + dropped."""
+    return {"outlets": [counts._asdict() for counts in await site.outlets.counts()]}
 
 
 @CALLS.add(
@@ -256,7 +256,7 @@ async def _outlets(site: FleetSite, _call: CallRequest) -> object:
     f"{API}/stored",
     query=StoredQuery,
     about="The contents of agents' stores of results: the query may have `hours`, `failed` "
-    "(errors, gaps, failures), `camera` (a pattern), `most`.",
+    "(errors, gaps, failures), `camera` (a pattern), `limit`.",
 )
 async def _stored(site: FleetSite, call: CallRequest) -> object:
     return {"stores": [answer._asdict() for answer in await site.outlets.stored(call.query)]}
@@ -266,7 +266,7 @@ def _act_on_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
     """Return a handler that acts on the camera whose name is in the path."""
 
     def handle(site: FleetSite, call: CallRequest) -> object:
-        return handler(site.live(call.path["camera"]), call)
+        return handler(site.watched_camera(call.path["camera"]), call)
 
     return handle
 

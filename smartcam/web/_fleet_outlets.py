@@ -30,7 +30,7 @@ class StoredQuery(BaseModel):
     hours: float = Field(default=8.0, gt=0, le=10 * 366 * 24)
     failed: bool = False
     camera: str = Field(default="**", max_length=200)
-    most: int = Field(default=200, ge=0, le=1000)
+    limit: int = Field(default=200, ge=0, le=1000)
 
 
 class OutletsView:
@@ -42,12 +42,12 @@ class OutletsView:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._accounts: list[ReportedOutlet] = []
+        self._counts: list[ReportedOutlet] = []
         self._asked_at = -ANSWER_AGE
         self._lock = asyncio.Lock()
         self._store_questions = asyncio.Semaphore(MAX_STORE_QUESTIONS)
 
-    async def accounts(self) -> list[ReportedOutlet]:
+    async def counts(self) -> list[ReportedOutlet]:
         """Return the counts of all outlets, at most :data:`ANSWER_AGE` seconds old.
 
         Raises:
@@ -57,11 +57,11 @@ class OutletsView:
         async with self._lock:
             if loop.time() - self._asked_at >= ANSWER_AGE:
                 try:
-                    self._accounts = await self._fleet.outlets()
+                    self._counts = await self._fleet.outlets()
                 except ConnectionClosedError as exc:
                     raise RefusedError(503, str(exc)[:300], expected="an open fleet") from exc
                 self._asked_at = loop.time()
-            return self._accounts
+            return self._counts
 
     async def stored(self, query: StoredQuery) -> list[ReportedStore]:
         """Return the stored results that match a query, from all agents' stores.
@@ -73,7 +73,7 @@ class OutletsView:
         async with self._store_questions:
             try:
                 return await self._fleet.stored_results(
-                    query.camera, since=since, failed=query.failed, most=query.most
+                    query.camera, since=since, failed=query.failed, most=query.limit
                 )
             except ConfigurationError as exc:
                 raise RefusedError(422, str(exc)[:300], expected="a pattern of cameras") from exc

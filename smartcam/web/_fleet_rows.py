@@ -100,7 +100,7 @@ class FleetRow:
         error_at: time of the last error, on the loop's clock.
         history: outcomes and failures of the last hours.
         changed_at: time at which the camera was last connected or lost, seconds since 1970.
-        changed_seen: False if ``changed_at`` is only the time of the first update; the change
+        changed_at_exact: False if ``changed_at`` is only the time of the first update; the change
             itself was earlier.
         picture_at: time of the last try to get the picture of a failure, on the loop's clock.
     """
@@ -121,7 +121,7 @@ class FleetRow:
         self.may_have_changed: bool = False
         self.history: ShiftHistory = ShiftHistory()
         self.changed_at: float = time.time()
-        self.changed_seen: bool = False
+        self.changed_at_exact: bool = False
         self.picture_at: float = -math.inf
         self._on_change = on_change
         self._units = units
@@ -196,9 +196,9 @@ class FleetRow:
         """Count missed results as errors, and dropped results as "other", in ``outcomes``."""
         if self._results is None:
             return
-        account, last_counts = self._results.statistics(), self._last_lost_counts
-        self._last_lost_counts = (account.missed, account.dropped)
-        missed, dropped = account.missed - last_counts[0], account.dropped - last_counts[1]
+        counts, last_counts = self._results.statistics(), self._last_lost_counts
+        self._last_lost_counts = (counts.missed, counts.dropped)
+        missed, dropped = counts.missed - last_counts[0], counts.dropped - last_counts[1]
         if missed:
             text = f"{missed} results did not come: the agent was out of reach for too long"
             self._mark_error(text, now)
@@ -218,7 +218,7 @@ class FleetRow:
         connected = camera is not None and camera.connected and bool(self.agents)
         lost = self._connected and not connected
         if connected != self._connected:
-            self.changed_at, self.changed_seen = time.time(), self._state is not UNKNOWN
+            self.changed_at, self.changed_at_exact = time.time(), self._state is not UNKNOWN
         self._connected, self.may_have_changed = connected, False
         status, application, reason, has_ended = Status(0), None, "", False
         if camera is not None:
@@ -280,10 +280,10 @@ class FleetRow:
         return self._counts_by_second[0] != self.count
 
     @property
-    def failure(self) -> int:
+    def failure_serial(self) -> int:
         """Serial of the newest result if it is a failure; otherwise, or if not counted yet, 0."""
         has_uncounted = self._results is None or self._results.waiting
-        return 0 if has_uncounted else self.history.last_failure
+        return 0 if has_uncounted else self.history.newest_result_failure
 
     # ------------------------------------------------------------------ for the page
 
@@ -318,7 +318,7 @@ class FleetRow:
             "errors": self.errors,
             "last": None if self._last is None else self._result_fields(self._last),
             "changed_at": round(self.changed_at),
-            "changed_seen": self.changed_seen,
+            "changed_at_exact": self.changed_at_exact,
             "failed_since": self.history.failed_since,
             "in_a_row": self.history.in_a_row,
             "shift": self.history.totals,
@@ -386,23 +386,23 @@ def _flags(mode: str, state: RowState, *, has_error: bool) -> frozenset[str]:
     return frozenset(name for name, on in flags.items() if on)
 
 
-def line_of(value: Any, units: Any, shown: ShownUnits = SI) -> str:
+def line_of(value: Any, units: Any, displayed: ShownUnits = SI) -> str:
     """Return a value as a text of one line.
 
     Args:
         value: value in its JSON form.
         units: SI unit of the value, or the units of its fields by name.
-        shown: units in which the line shows numbers.
+        displayed: units in which the line shows numbers.
     """
     if isinstance(value, dict):
         fields = list(value.items())[:20]
         return ", ".join(
-            f"{name} {line_of(value, units.get(name, {}), shown)}" for name, value in fields
+            f"{name} {line_of(value, units.get(name, {}), displayed)}" for name, value in fields
         )
     if isinstance(value, list):
-        return f"{len(value)}: " + " | ".join(line_of(item, units, shown) for item in value[:3])
+        return f"{len(value)}: " + " | ".join(line_of(item, units, displayed) for item in value[:3])
     if isinstance(value, float):
         if isinstance(units, str):
-            return f"{shown.shown(value, units):.5g} {shown.of(units).name}"
+            return f"{displayed.shown(value, units):.5g} {displayed.of(units).name}"
         return f"{value:.5g}"
     return value if value and isinstance(value, str) else json.dumps(value)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from smartcam.web._fleet_view import PERIOD, Filter, RowQuery, Sort
 from smartcam.web._sockets import PageSocket
-from smartcam.web._streams import SHOW_TIMEOUT
+from smartcam.web._streams import READER_TIMEOUT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -56,12 +56,12 @@ class RowsInSight(BaseModel):
     search: str = Field(default="", max_length=MAX_SEARCH_CHARACTERS)
     filter: Filter = "all"
     sort: Sort = "name"
-    down: bool = False
+    descending: bool = False
 
     @property
     def query(self) -> RowQuery:
         """Query of the rows in sight, with their order."""
-        return RowQuery(self.search, self.filter, self.sort, self.down)
+        return RowQuery(self.search, self.filter, self.sort, self.descending)
 
 
 class FleetSocket(PageSocket):
@@ -69,13 +69,13 @@ class FleetSocket(PageSocket):
 
     Args:
         view: view of the fleet.
-        about: values of the first message.
+        about: facts about the fleet, which the first message carries.
         request: request that asks for the WebSocket.
     """
 
     def __init__(self, view: FleetView, about: dict[str, Any], request: web.Request) -> None:
         super().__init__(
-            request, PROTOCOL, "row", heartbeat=SHOW_TIMEOUT, max_message_bytes=MAX_MESSAGE_BYTES
+            request, PROTOCOL, "row", heartbeat=READER_TIMEOUT, max_message_bytes=MAX_MESSAGE_BYTES
         )
         self._view = view
         self._about = about
@@ -88,7 +88,7 @@ class FleetSocket(PageSocket):
         ] = ()  # last sent to the page: number of found rows, first shown row, names of the rows
         self._totals: dict[str, Any] = {}
         self._totals_at = -TOTALS_INTERVAL
-        self._bars = 0  # start of the last bar of outcomes that the page has
+        self._last_bar_start = 0  # of the bars of outcomes that the page has
 
     def _handle_message(self, message: str) -> bool:
         try:
@@ -117,7 +117,7 @@ class FleetSocket(PageSocket):
 
     async def _send(self, text: str) -> None:
         self._was_shown.clear()
-        async with asyncio.timeout(SHOW_TIMEOUT):
+        async with asyncio.timeout(READER_TIMEOUT):
             await self._socket.send_str(text)
             await self._was_shown.wait()
 
@@ -172,7 +172,7 @@ class FleetSocket(PageSocket):
         return parts
 
     def _new_bars(self) -> Iterator[str]:
-        bars = [bar for bar in self._view.series if bar[0] > self._bars]
+        bars = [bar for bar in self._view.series if bar[0] > self._last_bar_start]
         if bars:
-            self._bars = bars[-1][0]
+            self._last_bar_start = bars[-1][0]
             yield f'"bars":{json.dumps(bars)}'

@@ -52,8 +52,8 @@ ORDER_DURATION: Final = 1.0
 """Seconds for which the rows keep their order although their values change, since people cannot
 read rows that jump."""
 
-MAX_ORDERS: Final = 64
-"""Largest number of orders that are kept for viewers."""
+MAX_SORTED_LISTS: Final = 64
+"""Largest number of sorted lists of rows that are kept for viewers."""
 
 Filter: TypeAlias = Literal["all", "connected", "errors", "busy", "stopped"]
 Sort: TypeAlias = Literal["name", "state", "rate", "last", "errors"]
@@ -73,7 +73,7 @@ class RowQuery(NamedTuple):
     search: str = ""  # words that a row must all contain
     filter: Filter = "all"
     sort: Sort = "name"
-    down: bool = False  # descending order
+    descending: bool = False
 
 
 class RowOrder(NamedTuple):
@@ -164,7 +164,7 @@ class FleetView:
                     ticks = 0
                     await self._update_timed_rows()
         except Exception:
-            _log.exception("! the fleet's page follows no more: a fault of ours")
+            _log.exception("! the fleet's page stopped following the fleet: a fault of smartcam")
             raise
 
     # ------------------------------------------------------------------ agents and cameras
@@ -189,11 +189,11 @@ class FleetView:
         stream = self._events
         if stream is None:
             return
-        account = stream.statistics()
-        if account.dropped:
+        counts = stream.statistics()
+        if counts.dropped:
             await self._read_fleet()
         else:
-            await self._read_events(stream, account.queued)
+            await self._read_events(stream, counts.queued)
 
     async def _read_events(self, stream: Subscription[FleetEvent], count: int) -> None:
         for number in range(count):
@@ -274,8 +274,8 @@ class FleetView:
     def _refresh_row(self, row: FleetRow, now: float) -> None:
         """Update a camera's state."""
         flags = row.flags
-        changed, lost = row.refresh(now)
-        if lost:
+        changed, connection_lost = row.refresh(now)
+        if connection_lost:
             self._errors += 1
         if changed:
             self._mark_changed(row)
@@ -361,7 +361,7 @@ class FleetView:
         order = RowOrder(await self._find_rows(query), version, now)
         self._orders[query] = order
         self._orders.move_to_end(query)
-        while len(self._orders) > MAX_ORDERS:
+        while len(self._orders) > MAX_SORTED_LISTS:
             self._orders.popitem(last=False)
         return order
 
@@ -378,8 +378,8 @@ class FleetView:
             found += [row for row in rows if row is not None and _matches(row, query.filter, words)]
             await asyncio.sleep(0)
         if query.sort in SORTS:
-            found.sort(key=SORTS[query.sort], reverse=query.down)
-        elif query.down:
+            found.sort(key=SORTS[query.sort], reverse=query.descending)
+        elif query.descending:
             found.reverse()
         return [row.name for row in found]
 

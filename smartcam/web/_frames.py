@@ -104,7 +104,7 @@ CALLS: Calls[FramesSite] = Calls()
 
 
 def _source_index(site: FramesSite, call: CallRequest) -> int:
-    text = call.path["place"]
+    text = call.path["index"]
     if not text.isdecimal() or len(text) > 3 or int(text) >= len(site.sources):
         raise RefusedError(404, f"source {short_repr(text)}", f"0 to {len(site.sources) - 1}")
     return int(text)
@@ -126,7 +126,7 @@ def _changeable_source_index(site: FramesSite, call: CallRequest) -> int:
     """Return the index of a source that viewers may change."""
     if not site.changes:
         raise RefusedError(
-            403, "a change of a device", "one that was started with --changes, or changes=True"
+            403, "a change of a device", "a site that was started with --changes, or changes=True"
         )
     return _source_index(site, call)
 
@@ -163,7 +163,7 @@ def _sources(site: FramesSite, _call: CallRequest) -> object:
     return {"sources": [site.pictures.state(index) for index in range(len(site.sources))]}
 
 
-@CALLS.add("GET", f"{API}/sources/{{place}}/features")
+@CALLS.add("GET", f"{API}/sources/{{index}}/features")
 async def _features(site: FramesSite, call: CallRequest) -> object:
     """The features of a source's device, with value and range; and whether they may be set here."""
     index = _source_index(site, call)
@@ -180,7 +180,7 @@ async def _features(site: FramesSite, call: CallRequest) -> object:
 
 @CALLS.add(
     "POST",
-    f"{API}/sources/{{place}}/feature",
+    f"{API}/sources/{{index}}/feature",
     body=_FeatureBody,
     sample='{"name": "Gain", "value": 6.0}',
 )
@@ -192,7 +192,7 @@ async def _set_feature(site: FramesSite, call: CallRequest) -> object:
 
 
 @CALLS.add(
-    "POST", f"{API}/sources/{{place}}/command", body=_NameBody, sample='{"name": "UserSetLoad"}'
+    "POST", f"{API}/sources/{{index}}/command", body=_NameBody, sample='{"name": "UserSetLoad"}'
 )
 async def _command(site: FramesSite, call: CallRequest) -> object:
     """Execute a command, if changes are allowed; answers when the device has done it."""
@@ -202,7 +202,7 @@ async def _command(site: FramesSite, call: CallRequest) -> object:
     return {}
 
 
-@CALLS.add("POST", f"{API}/sources/{{place}}/trigger")
+@CALLS.add("POST", f"{API}/sources/{{index}}/trigger")
 async def _trigger(site: FramesSite, call: CallRequest) -> web.Response:
     """Trigger the device, if changes are allowed; answers the triggered picture as a JPEG."""
     index = _changeable_source_index(site, call)
@@ -210,9 +210,9 @@ async def _trigger(site: FramesSite, call: CallRequest) -> web.Response:
         return await _jpeg_answer(site, index, await site.sources[index].trigger())
 
 
-@CALLS.add("GET", f"{API}/sources/{{place}}/picture")
+@CALLS.add("GET", f"{API}/sources/{{index}}/picture")
 async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
-    """The newest frame, as a JPEG; the device streams for it."""
+    """The newest frame, as a JPEG; the device streams until it has come."""
     index = _source_index(site, call)
     with _refuse_on_error(site, index):
         return await _jpeg_answer(site, index, await site.sources[index].newest())
@@ -220,8 +220,8 @@ async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
 
 @CALLS.add(
     "GET",
-    f"{API}/sources/{{place}}/pictures",
-    about="A WebSocket: the newest frame after each `next`, as a JPEG after JSON.",
+    f"{API}/sources/{{index}}/pictures",
+    about="A WebSocket: after each message `next`, JSON and the newest frame as a JPEG.",
 )
 async def _pictures(site: FramesSite, call: CallRequest) -> web.StreamResponse:
     return await site.pictures.serve_viewer(_source_index(site, call), call.request)

@@ -149,8 +149,10 @@ def check_token(token: str) -> None:
         ConfigurationError: the token is too short, or has characters that a header or a URL
             cannot carry.
     """
-    signs = token.replace("-", "").replace("_", "")
-    if len(token) < MIN_TOKEN_CHARACTERS or not (signs.isascii() and signs.isalnum()):
+    other_characters = token.replace("-", "").replace("_", "")
+    if len(token) < MIN_TOKEN_CHARACTERS or not (
+        other_characters.isascii() and other_characters.isalnum()
+    ):
         raise ConfigurationError(
             f"web: a token has {MIN_TOKEN_CHARACTERS} letters, digits, '-' and '_' at least, "
             f"this one has {len(token)} characters"

@@ -171,7 +171,7 @@ class ShiftHistory:
             self.version += 1
 
     @property
-    def last_failure(self) -> int:
+    def newest_result_failure(self) -> int:
         """Serial of the newest result if it is a failure, else 0."""
         return self._newest_failure
 
@@ -198,13 +198,13 @@ class ShiftHistory:
     def trend(self) -> dict[str, Any]:
         """Return the short trend, for a row of a table.
 
-        ``end`` is the end of the last slot, seconds since 1970. ``places`` has one character for
-        each slot of :data:`SLOT_SECONDS`. A digit is the share of failed results and errors, in
-        tenths, rounded up, among these and the results that passed; ``X``: all failed; ``-``: no
-        result had a verdict; a space: no results.
+        ``end`` is the end of the last slot, seconds since 1970. ``characters`` has one for each
+        slot of :data:`SLOT_SECONDS`, without the empty slots at the beginning. A digit is the share
+        of failed results and errors, in tenths, rounded up, among these and the results that
+        passed; ``X``: all failed; ``-``: no result had a verdict; a space: no results.
         """
         if not self._bars:
-            return {"end": 0, "places": ""}
+            return {"end": 0, "characters": ""}
         last = self._bars[-1][0] // SLOT_SECONDS
         count = SHIFT_SECONDS // SLOT_SECONDS
         slots = [[0, 0, 0, 0] for _ in range(count)]
@@ -216,7 +216,7 @@ class ShiftHistory:
                 ]
         return {
             "end": (last + 1) * SLOT_SECONDS,
-            "places": "".join(map(_slot_character, slots)).lstrip(" "),
+            "characters": "".join(map(_slot_character, slots)).lstrip(" "),
         }
 
 

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.web._clouds import Up
+    from smartcam.web._clouds import UpAxis
     from smartcam.web._guard import new_token
-    from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
+    from smartcam.web._jpeg import encode_pixels, is_whole_jpeg, pixels_to_show
     from smartcam.web._teach import TeachSite
 
 __all__ = [
     "TeachSite",
-    "Up",
-    "encoded",
+    "UpAxis",
+    "encode_pixels",
     "is_whole_jpeg",
     "new_token",
-    "picture",
+    "pixels_to_show",
 ]
 
 if not TYPE_CHECKING:
@@ -26,8 +26,8 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_teach": "TeachSite",
-            "_clouds": "Up",
+            "_clouds": "UpAxis",
             "_guard": "new_token",
-            "_jpeg": "encoded is_whole_jpeg picture",
+            "_jpeg": "encode_pixels is_whole_jpeg pixels_to_show",
         },
     )

@@ -24,7 +24,7 @@ HEAD_BYTES: Final = 4096
 """Number of bytes at the start of a JPEG in which the Huffman tables are looked for."""
 
 DIRECT_FORMATS: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
-"""Formats that can be encoded as a JPEG without a conversion, in addition to YUV formats."""
+"""Formats that can be encode_pixels as a JPEG without a conversion, in addition to YUV formats."""
 
 
 def jpeg(frame: Frame, quality: int) -> bytes:
@@ -44,11 +44,11 @@ def jpeg(frame: Frame, quality: int) -> bytes:
     if is_whole_jpeg(frame):
         return bytes(frame.data)
     if not _can_encode_directly(frame):
-        return encoded(frame, scale_to_8_bits(picture(frame)), quality)
+        return encode_pixels(frame, scale_to_8_bits(pixels_to_show(frame)), quality)
     return _encode(frame, quality)
 
 
-def encoded(frame: Frame, pixels: NDArray[np.uint8], quality: int) -> bytes:
+def encode_pixels(frame: Frame, pixels: NDArray[np.uint8], quality: int) -> bytes:
     """Return pixels of a frame, (H, W) or (H, W, 3) with red first, as a JPEG.
 
     Raises:
@@ -73,7 +73,7 @@ def is_whole_jpeg(frame: Frame) -> bool:
     return frame.format.name == "MJPEG" and head.startswith(JPEG_START) and HUFFMAN_TABLES in head
 
 
-def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
+def pixels_to_show(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
     """Return the pixels to show: (H, W, 3), red first; (H, W) for a frame without colours.
 
     Raises:

@@ -28,7 +28,7 @@ MAX_NEWS = 20
 """Largest number of results in one event. With ten events a second the page gets up to 200 results
 a second; of further results it gets only the number."""
 
-LOOKS_PER_CLOCK = round(1.0 / PERIOD)
+CHECKS_PER_CLOCK_REPORT = round(1.0 / PERIOD)
 """Number of checks for changes between two reports of the clock and of the counts, so that a report
 is sent once a second."""
 
@@ -104,7 +104,7 @@ class LiveReader:
         oldest = self._view.entries[0].serial if self._view.entries else self._view.serial
         self._serial = oldest if since is None else since
         self._last_values: dict[str, Any] = {}
-        self._look_count = 0
+        self._check_count = 0
         self._sent_history_version = -1
 
     def find_events(self) -> Iterator[StreamEvent]:
@@ -114,14 +114,14 @@ class LiveReader:
         yield from self._result_events()
         picture = 0 if view.picture is None else view.picture.serial
         yield from self._event_if_changed("picture", {"serial": picture})
-        if self._look_count % LOOKS_PER_CLOCK == 0:
-            yield from self._event_if_changed("account", view.account())
-            points = list(view.series) if self._look_count == 0 else list(view.series)[-1:]
+        if self._check_count % CHECKS_PER_CLOCK_REPORT == 0:
+            yield from self._event_if_changed("counts", view.counts())
+            points = list(view.series) if self._check_count == 0 else list(view.series)[-1:]
             yield StreamEvent("clock", {"series": points})
             if self._sent_history_version != view.history.version:
                 self._sent_history_version = view.history.version
                 yield StreamEvent("history", view.history.as_json())
-        self._look_count += 1
+        self._check_count += 1
 
     def _result_events(self) -> Iterator[StreamEvent]:
         view = self._view
@@ -163,7 +163,7 @@ CALLS: Calls[ShowsCamera] = Calls()
 async def _run_command(site: ShowsCamera, command: Callable[[], Awaitable[Any]]) -> Any:
     """Run a command to the camera if the page may command it; turn its error into a refusal."""
     if not site.control:
-        raise RefusedError(403, "a command to the camera", "looking only: no --control was given")
+        raise RefusedError(403, "a command to the camera", "a page started with --control")
     try:
         return await command()
     except SmartCamError as exc:
@@ -181,7 +181,7 @@ def _calls(_site: ShowsCamera, _call: CallRequest) -> object:
 @CALLS.add("GET", f"{API}/camera")
 def _camera(site: ShowsCamera, _call: CallRequest) -> object:
     """Return the camera's state, and its counts."""
-    return {**site.state(), "account": site.view.account()}
+    return {**site.state(), "counts": site.view.counts()}
 
 
 @CALLS.add("GET", f"{API}/results")
@@ -192,7 +192,7 @@ def _results(site: ShowsCamera, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/history")
 def _history(site: ShowsCamera, _call: CallRequest) -> object:
-    """Outcomes in bars of five minutes, the last failures, and the first since a pass."""
+    """Outcomes in bars of five minutes, the last failures, and the first one since a pass."""
     return site.view.history.as_json()
 
 
@@ -203,7 +203,7 @@ def _failure(site: ShowsCamera, call: CallRequest) -> web.Response:
     is_valid = serial.isdecimal() and len(serial) < 12
     picture = site.view.history.picture(int(serial)) if is_valid else None
     if picture is None:
-        raise RefusedError(404, "no picture of it", "one of the last failures that have one")
+        raise RefusedError(404, "no picture of this failure", "a recent failure with a picture")
     return _image(picture)
 
 
@@ -236,19 +236,19 @@ def _want_picture(site: ShowsCamera, _call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/frames",
-    about="A WebSocket of a camera with frames, as [here](frames.md#calls): one after each `next`.",
+    about="A WebSocket: a frame of the camera after each `next`, as [here](frames.md#calls).",
 )
 async def _frames(site: ShowsCamera, call: CallRequest) -> web.StreamResponse:
     pictures = site.frames.pictures
     if pictures is None:
-        raise RefusedError(404, "a camera without frames", "one of a fleet, with frames: URL there")
+        raise RefusedError(404, "a camera without frames", "one with frames: in the fleet's file")
     return await pictures.serve_viewer(0, call.request)
 
 
 @CALLS.add(
     "GET",
     f"{API}/events",
-    about="What happens, as server-sent events: camera, results, picture, account, clock, history.",
+    about="What happens, as server-sent events: camera, results, picture, counts, clock, history.",
 )
 def _events(site: ShowsCamera, call: CallRequest) -> object:
     last = call.request.headers.get("Last-Event-ID", "")

@@ -1,4 +1,4 @@
-"""Define what the live page needs from a site, and one camera of a fleet's site for this page."""
+"""Define what the live page needs from a site, and a camera of a fleet that such a page shows."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class WatchedCamera:
         history = None if row is None else row.history
         self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)), history)
         if row is not None:
-            self.view.changed_at, self.view.changed_seen = row.changed_at, row.changed_seen
+            self.view.changed_at, self.view.changed_at_exact = row.changed_at, row.changed_at_exact
         self.frames: LiveFrames = LiveFrames(lambda: self.view.camera)
         self.used_at: float = 0.0
 

@@ -109,7 +109,7 @@ class LiveView:
         self.picture: Picture | None = None
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # time of the last connection or loss
-        self.changed_seen: bool = False  # False: the change happened before the view was started
+        self.changed_at_exact: bool = False  # False: the change was earlier
         self.loss: str = ""  # reason why the camera is not connected, or ""
         self._end_error: SmartCamError | None = (
             None  # error that ended the camera's events for good
@@ -117,7 +117,7 @@ class LiveView:
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
-        self._asked_failure = 0  # serial of the last failure whose picture was fetched
+        self._fetched_failure = 0  # serial of the last failure whose picture was fetched
         self._latencies: list[float] = []  # latencies of the current second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
@@ -180,10 +180,10 @@ class LiveView:
             "loss": self.loss,
             "last_error": "" if camera.connected else camera.statistics().last_error or "",
             "changed_at": self.changed_at,
-            "changed_seen": self.changed_seen,
+            "changed_at_exact": self.changed_at_exact,
             "status": camera.status.names if has_state else [],
             "application": camera.active_application,
-            "can": camera.capabilities if has_state else None,
+            "capabilities": camera.capabilities if has_state else None,
             "picture_error": self.picture_error,
         }
 
@@ -196,8 +196,8 @@ class LiveView:
             return "taken"
         return "lost" if self._end_error is None else "ended"
 
-    def account(self) -> dict[str, Any]:
-        """Return the counters of results, as values for JSON."""
+    def counts(self) -> dict[str, Any]:
+        """Return the counts of results, as values for JSON."""
         statistics = self.camera.statistics()
         names = (
             *("received", "triggered", "streamed", "late", "wrong_application"),
@@ -250,7 +250,7 @@ class LiveView:
         try:
             async for event in self._events:
                 if isinstance(event, (Connected, Reconnected, Disconnected)):
-                    self.changed_at, self.changed_seen = event.at.timestamp(), True
+                    self.changed_at, self.changed_at_exact = event.at.timestamp(), True
                     self.loss = event.reason if isinstance(event, Disconnected) else ""
                     if (
                         isinstance(event, Disconnected)
@@ -261,7 +261,7 @@ class LiveView:
                     self._picture_wanted |= not self.loss
         except SmartCamError as exc:
             self._end_error, self.loss = exc, str(exc)
-            self.changed_at, self.changed_seen = time.time(), True
+            self.changed_at, self.changed_at_exact = time.time(), True
 
     async def _sample_rates(self) -> None:
         last_received = self.camera.statistics().received
@@ -278,12 +278,14 @@ class LiveView:
     async def _fetch_pictures(self) -> None:
         while True:
             is_wanted = self._picture_wanted and self._is_watched()
-            failure = self.history.last_failure
+            failure = self.history.newest_result_failure
             is_missing = (
-                self._owns_history and self.history.wants_picture and failure != self._asked_failure
+                self._owns_history
+                and self.history.wants_picture
+                and failure != self._fetched_failure
             )
             if (is_wanted or is_missing) and self.camera.connected:
-                self._asked_failure = failure
+                self._fetched_failure = failure
                 self._picture_wanted = False
                 if self.camera.capabilities.read_image:
                     await self._fetch_picture()
@@ -292,7 +294,7 @@ class LiveView:
 
     async def _fetch_picture(self) -> None:
         """Fetch the camera's last picture; the state reports an error."""
-        failure = self.history.last_failure
+        failure = self.history.newest_result_failure
         try:
             camera: object = self.camera
             if isinstance(camera, DrawsPictures):
@@ -306,7 +308,7 @@ class LiveView:
             # if a newer result came meanwhile, the picture may belong to that result
             if (
                 self._owns_history
-                and failure == self.history.last_failure
+                and failure == self.history.newest_result_failure
                 and not self._results.waiting
             ):
                 self.history.attach_picture(failure, data)

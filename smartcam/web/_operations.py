@@ -15,7 +15,7 @@ from smartcam._accepting import is_loopback
 from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._inside import OperationsSection, exposition, read_numbers, require_client
+from smartcam.fleet._inside import OperationsSection, exposition, read_numbers, require_prometheus
 from smartcam.settings import validated
 from smartcam.web._connections import connection_of
 from smartcam.web._errors import RefusedError
@@ -55,8 +55,8 @@ class OperationsSite(Server):
     """
 
     def __init__(self, server: FleetServer, *, listen: str | None = None) -> None:
-        require_client()
-        self._server = server
+        require_prometheus()
+        self._agent_server = server
         section = server.file.operations or OperationsSection.model_validate({})
         if listen is not None:
             section = validated(
@@ -135,7 +135,7 @@ class OperationsSite(Server):
         The agent is ready when it is on the bus and has once tried to connect to each camera. A
         camera that is lost, or added by a reload, does not change this.
         """
-        server = self._server
+        server = self._agent_server
         hosts = server.hosts.values()
         started = server.agent is not None
         tried = sum(host.was_tried for host in hosts)
@@ -169,7 +169,7 @@ class OperationsSite(Server):
         return web.Response(body=body, headers={"Content-Type": kind})
 
     async def _make_metrics(self) -> tuple[bytes, str]:
-        numbers = await read_numbers(self._server)
+        numbers = await read_numbers(self._agent_server)
         return await exposition(numbers, per_camera=self._per_camera)
 
 
@@ -208,9 +208,9 @@ async def _answer(
     except web.HTTPException as exc:
         text = f"{exc.status} {exc.reason}: there are /healthz, /readyz, /metrics\n"
         return web.Response(status=exc.status, text=text)
-    except Exception:  # noqa: BLE001 - the last place
-        _log.exception("! %s %s: a fault of ours", request.method, request.path)
-        return web.Response(status=500, text="500 a fault of ours: see the log\n")
+    except Exception:  # noqa: BLE001 - no other handler follows
+        _log.exception("! %s %s: a fault of smartcam", request.method, request.path)
+        return web.Response(status=500, text="500 a fault of smartcam: see the log\n")
 
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:

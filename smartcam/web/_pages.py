@@ -12,15 +12,15 @@ class Page(NamedTuple):
 
     Attributes:
         title: title of the page.
-        printed: the command that prints the page's address, as HTML; empty for a page that has its
+        command: the command that prints the page's address, as HTML; empty for a page that has its
             own top.
         styles: names of the style sheets before its own.
         beside: HTML that is shown next to the title.
-        does: verb in the page's sentence "everything that this page does (or shows) is a call".
+        does: verb in the page's sentence "everything it does (or shows) is an HTTP call, too".
     """
 
     title: str
-    printed: str = ""
+    command: str = ""
     styles: tuple[str, ...] = ("base",)
     beside: str = '<p id="name"></p>'
     does: str = "does"
@@ -58,6 +58,6 @@ def page_html(name: str) -> str:
     page = PAGES[name]
     sheets = [f'  <link rel="stylesheet" href="/{sheet}.css">' for sheet in (*page.styles, name)]
     values = page._asdict() | {"styles": "\n".join(sheets), "script": name}
-    parts = ("head.html", "top.html") if page.printed else ("head.html",)
+    parts = ("head.html", "top.html") if page.command else ("head.html",)
     common = [Template(read_file(part).decode()).substitute(values) for part in parts]
-    return "".join((*common, "\n" if page.printed else "", read_file(f"{name}.html").decode()))
+    return "".join((*common, "\n" if page.command else "", read_file(f"{name}.html").decode()))

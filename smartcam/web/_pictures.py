@@ -25,7 +25,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.web._sockets import PageSocket, check_websocket
-from smartcam.web._streams import SHOW_TIMEOUT
+from smartcam.web._streams import READER_TIMEOUT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -50,7 +50,7 @@ MAX_PICTURE_BYTES: Final = 1 << 24
 """Largest number of bytes of a picture that is sent; JPEGs that come from a camera can be of any
 size."""
 
-ACCOUNT_PERIOD: Final = 1.0
+COUNTS_PERIOD: Final = 1.0
 """Seconds without a frame after which the page gets only the counts of frames."""
 
 THREADS: Final = 2
@@ -121,17 +121,17 @@ class SitePictures:
             format_text: str | None = str(source.format)
         except LocalProtocolError:  # not open
             format_text = None
-        account = source.statistics()
+        counts = source.statistics()
         return {
-            "place": index,
+            "index": index,
             "name": source.name,
             "format": format_text,
             "failure": self._failure(index) if format_text is None else "",
-            "streaming": account.streaming,
-            "readers": account.readers,
-            "started": account.started,
-            "frames": account.frames,
-            "lost": account.lost,
+            "streaming": counts.streaming,
+            "readers": counts.readers,
+            "started": counts.started,
+            "frames": counts.frames,
+            "lost": counts.lost,
             "features": source.has_features,
         }
 
@@ -221,7 +221,7 @@ class Viewer(PageSocket):
     """The WebSocket that sends the pictures of a source to a page.
 
     Attributes:
-        place: index of the source.
+        index: index of the source.
         address: address of the viewer.
         has_left: event that is set when the viewer has left.
     """
@@ -230,7 +230,7 @@ class Viewer(PageSocket):
         super().__init__(request, PROTOCOL, "picture")
         self._pictures = pictures
         self._source = pictures.sources[index]
-        self.place: int = index
+        self.index: int = index
         self.address: str = request.remote or ""
         self.has_left = asyncio.Event()
         self._sent_count = 0
@@ -243,8 +243,8 @@ class Viewer(PageSocket):
         finally:
             self._pictures.viewers.discard(self)
             self.has_left.set()
-            if not any(viewer.place == self.place for viewer in self._pictures.viewers):
-                self._pictures.jpeg_maker(self.place).drop_picture()
+            if not any(viewer.index == self.index for viewer in self._pictures.viewers):
+                self._pictures.jpeg_maker(self.index).drop_picture()
 
     async def _send_messages(self) -> None:
         """Send pictures, and read the source again after it was lost.
@@ -255,13 +255,15 @@ class Viewer(PageSocket):
         while True:
             count_before = self._sent_count
             try:
-                async with self._source.reader(timeout=ACCOUNT_PERIOD) as reader:
+                async with self._source.reader(timeout=COUNTS_PERIOD) as reader:
                     if not lost:
-                        await self._send({"state": "waiting", **self._pictures.state(self.place)})
+                        await self._send(
+                            {"state": "no_frame_yet", **self._pictures.state(self.index)}
+                        )
                     await self._send_pictures(reader)
             except LocalProtocolError:
                 await self._send(
-                    {"state": "awaited", "text": self._pictures.state(self.place)["failure"]}
+                    {"state": "not_open", "text": self._pictures.state(self.index)["failure"]}
                 )
                 lost = False
             except (FrameSourceError, ConfigurationError) as exc:
@@ -282,35 +284,35 @@ class Viewer(PageSocket):
             try:
                 frame = await anext(reader)
             except FrameTimeoutError:
-                await self._send({"account": _account(reader, bad_count)})
+                await self._send({"counts": _counts(reader, bad_count)})
                 continue
             except StopAsyncIteration:
                 return
             try:
-                picture = await self._pictures.jpeg_maker(self.place).jpeg(frame)
+                picture = await self._pictures.jpeg_maker(self.index).jpeg(frame)
             except FrameFormatError as exc:
                 bad_count += 1
-                await self._send({"account": _account(reader, bad_count), "bad": str(exc)})
+                await self._send({"counts": _counts(reader, bad_count), "bad": str(exc)})
                 continue
-            await self._send_picture(_frame_fields(frame), _account(reader, bad_count), picture)
+            await self._send_picture(_frame_fields(frame), _counts(reader, bad_count), picture)
 
     async def _send_picture(
-        self, frame: dict[str, Any], account: dict[str, Any], picture: bytes
+        self, frame: dict[str, Any], counts: dict[str, Any], picture: bytes
     ) -> None:
         """Send JSON and a picture, and wait until the page has shown it.
 
         Raises:
             TimeoutError: the page did not show the picture in time.
         """
-        head = json.dumps({"frame": frame, "account": account}).encode()
+        head = json.dumps({"frame": frame, "counts": counts}).encode()
         self._was_shown.clear()
-        async with asyncio.timeout(SHOW_TIMEOUT):
+        async with asyncio.timeout(READER_TIMEOUT):
             await self._socket.send_bytes(len(head).to_bytes(4, "little") + head + picture)
             self._sent_count += 1
             await self._was_shown.wait()
 
     async def _send(self, value: dict[str, Any]) -> None:
-        async with asyncio.timeout(SHOW_TIMEOUT):
+        async with asyncio.timeout(READER_TIMEOUT):
             await self._socket.send_str(json.dumps(value))
 
 
@@ -326,14 +328,14 @@ def _frame_fields(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _account(reader: FrameReader, bad_count: int) -> dict[str, Any]:
+def _counts(reader: FrameReader, bad_count: int) -> dict[str, Any]:
     """Return the counts of a viewer's frames so far, with the time of the count."""
-    account = reader.statistics()
+    counts = reader.statistics()
     return {
         "at": time.monotonic(),
-        "offered": account.offered,
-        "delivered": account.delivered,
-        "skipped": account.skipped,
-        "lost": account.lost,
+        "offered": counts.offered,
+        "delivered": counts.delivered,
+        "skipped": counts.skipped,
+        "lost": counts.lost,
         "bad": bad_count,
     }

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 MAX_BODY_BYTES = 1 << 18
-"""Largest number of bytes of a call's body: room for a fault that inserts 64 kB, in hex."""
+"""Largest number of bytes of a call's body: room for an emulator's fault that inserts
+64 kB, written in hex."""
 
 READ_TIMEOUT = 10.0
 """Seconds within which a call's body must have been received."""
@@ -100,7 +101,7 @@ class _Call(Generic[C]):
                 data = await request.read()
         except TimeoutError as exc:
             raise RefusedError(
-                408, "an unfinished body", f"the whole of it within {READ_TIMEOUT:g} s"
+                408, "an unfinished body", f"the whole body within {READ_TIMEOUT:g} s"
             ) from exc
         if not data:
             if self.body is None or self.optional:
@@ -240,7 +241,7 @@ def middleware(guard: Guard, prefix: str) -> Any:
         except ConnectionError:
             refusal = RefusedError(400, "a connection that ended", "the whole of a request")
         except ConfigurationError as exc:
-            refusal = RefusedError(422, str(exc), "what this camera has")
+            refusal = RefusedError(422, str(exc), "values that can be used")
         except Exception:  # noqa: BLE001  no error may be without an answer
             refusal = _internal_error(request)
         call = f"{request.method} {request.path}"
@@ -251,8 +252,8 @@ def middleware(guard: Guard, prefix: str) -> Any:
 
 def _internal_error(request: web.Request) -> RefusedError:
     """Log the exception that is handled now, and return the refusal for the client."""
-    _log.exception("! %s %s: a fault of ours", request.method, request.path)
-    return RefusedError(500, "a fault of ours", "this to be reported, with the log")
+    _log.exception("! %s %s: a fault of smartcam", request.method, request.path)
+    return RefusedError(500, "a fault of smartcam", "a report of it, with the log")
 
 
 def _translated_error(error: web.HTTPException, prefix: str) -> RefusedError:

@@ -142,8 +142,8 @@ def camera_entry(
 ) -> dict[str, Any]:
     """Return an entry of the log; ``serial`` is its number among all entries so far, from 0.
 
-    Unless ``whole``, a long payload is cut; ``size`` and ``wire_size`` give its length, and
-    ``values`` is null.
+    Unless ``whole``, ``hex`` and ``wire`` end after MAX_HEX_BYTES (``size`` and ``wire_size`` give
+    the whole length), and ``values`` is null for more than MAX_VALUES_BYTES.
     """
     hex_length = None if whole else MAX_HEX_BYTES * 3 - 1
     message, wire = entry.message, entry.wire
@@ -161,7 +161,9 @@ def camera_entry(
         "hex": entry.hex[:hex_length],
         "size": _hex_size(entry.hex),
         "error": entry.error,
-        "search": _client_dialect(entry.hex) if entry.error and entry.direction == "in" else None,
+        "client_dialect": _client_dialect(entry.hex)
+        if entry.error and entry.direction == "in"
+        else None,
         "fault": entry.fault,
         "wire": None if wire is None else wire[:hex_length],
         "wire_size": None if wire is None else _hex_size(wire),
@@ -277,8 +279,8 @@ def kinds() -> list[dict[str, Any]]:
 def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
     """Return the table: true poses of the parts, the camera's view, and the last reported poses.
 
-    Lengths are in metres on the table, angles in radians. ``lookers`` are the ids of the
-    applications that use the table.
+    Lengths are in metres on the table, angles in radians. ``table_applications`` are
+    the ids of the applications that use the table.
     """
     applications = emulator.device.applications.values()
     return {
@@ -292,7 +294,7 @@ def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
         "seed": scene.seed,
         "y_down": scene.y_down,
         "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
-        "lookers": [application.id for application in applications if _uses_table(application)],
+        "table_applications": [one.id for one in applications if _uses_table(one)],
         "reported": _reported(emulator, scene),
     }
 

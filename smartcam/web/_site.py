@@ -86,7 +86,7 @@ class Site(Server):
         return self._port
 
     @property
-    def api(self) -> str:
+    def origin(self) -> str:
         """Address to which the calls' paths are appended, ``http://HOST:PORT``.
 
         HOST is this machine's name if the site listens on all addresses.
@@ -97,7 +97,7 @@ class Site(Server):
     @property
     def url(self) -> str:
         """Address of the page; the token follows ``#``, a part that browsers do not send."""
-        return f"{self.api}/" + ("" if self.token is None else f"#token={self.token}")
+        return f"{self.origin}/" + ("" if self.token is None else f"#token={self.token}")
 
     async def start(self) -> None:
         """Open the port; do nothing if it is started already.
@@ -115,7 +115,7 @@ class Site(Server):
                 self._application(), self.host, self._port, local=self.token is None
             )
         except (OSError, ValueError, OverflowError) as exc:
-            raise ConfigurationError(f"web: cannot listen on {self.api}: {exc}") from exc
+            raise ConfigurationError(f"web: cannot listen on {self.origin}: {exc}") from exc
         self._port, self._open_port = opened.port, opened
 
     async def stop(self) -> None:
@@ -154,7 +154,7 @@ class OpenPort:
         if runner.server is None:
             raise RuntimeError("the runner is not set up")
         self._connections = SiteConnections(runner.server)
-        self.places = self._connections.places
+        self.places = self._connections.places  # slots of connections
         self._runner = runner
         self._listener = listener
         self.port: int = listener.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Serve WebSockets on which a message is sent when the page has shown the message before."""
+"""Serve WebSockets that send a message only after the page has shown the previous one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.web")
 
-MAX_WORD_BYTES: Final = 64
+MAX_NEXT_BYTES: Final = 64
 """Largest number of bytes of the message by which a page requests the next message."""
 
 
@@ -58,7 +58,7 @@ class PageSocket(ABC):
         subject: str,
         *,
         heartbeat: float | None = None,
-        max_message_bytes: int = MAX_WORD_BYTES,
+        max_message_bytes: int = MAX_NEXT_BYTES,
     ) -> None:
         self._request = request
         self._subject = subject

@@ -29,7 +29,7 @@ MAX_STREAMS = 16
 PERIOD = 0.1
 """Seconds between two looks for events."""
 
-SHOW_TIMEOUT = 10.0
+READER_TIMEOUT = 10.0
 """Seconds that a reader has to accept written events; then its stream ends."""
 
 
@@ -111,7 +111,7 @@ def is_open(request: web.Request) -> bool:
 
 async def _write(response: web.StreamResponse, text: str | None) -> None:
     """Write a text; None: end the stream."""
-    async with asyncio.timeout(SHOW_TIMEOUT):
+    async with asyncio.timeout(READER_TIMEOUT):
         if text is None:
             await response.write_eof()
         elif text:

@@ -132,7 +132,7 @@ class TeachSite(ThreadedSite):
             RefusedError: there is no frame.
         """
         if self.source is None:
-            raise RefusedError(409, "a picture of now", "a camera; these are files")
+            raise RefusedError(409, "a new picture", "a page with a camera; this one has files")
         try:
             frame = await self.source.newest(max_age=0.5, timeout=SHOT_TIMEOUT)
         except FrameSourceError as exc:
@@ -300,7 +300,7 @@ async def _shoot(site: TeachSite, _call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/try", body=ToolsBody, sample=_SAMPLE)
 async def _try(site: TeachSite, call: CallRequest) -> object:
-    """Verdicts and values of the tools for every picture, and the tools' settings."""
+    """Verdicts and values of the tools for every picture, and remarks."""
     return await site.work(site.try_tools, call.body.tools)
 
 

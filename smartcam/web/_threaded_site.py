@@ -47,5 +47,5 @@ class ThreadedSite(Site):
         Cancellation: safe; a function that has begun runs to its end.
         """
         if self._threads is None:
-            raise RefusedError(503, "a closed site", "an open one")
+            raise RefusedError(503, "a closed site", expected="an open site")
         return await asyncio.get_running_loop().run_in_executor(self._threads, work, *args)

@@ -22,7 +22,7 @@ class PageUnits:
 
     Attributes:
         shown: units that the switch offers.
-        first: whether the page begins with these units; else with SI.
+        shown_first: whether the page begins with these units; else with SI.
 
     Raises:
         ConfigurationError: a name is no unit, or two units are of the same quantity.
@@ -30,12 +30,12 @@ class PageUnits:
 
     def __init__(self, names: Sequence[str] | None = None) -> None:
         self.shown: ShownUnits = ShownUnits(PRACTICAL_UNITS if names is None else names)
-        self.first: bool = names is not None
+        self.shown_first: bool = names is not None
 
     def as_json(self) -> dict[str, Any]:
         """Return the units for the page: name and factor of each, by the SI unit it replaces."""
         units = {symbol: self.shown.of(symbol) for symbol in SI_SYMBOLS.values()}
         return {
-            "first": self.first,
+            "shown_first": self.shown_first,
             "instead": {si: [*unit] for si, unit in units.items() if unit.name != si},
         }

@@ -28,7 +28,7 @@ def verdicts(value: Any) -> list[dict[str, Any]]:
 
 
 def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
-    good_value = meaning(name)
+    good_value = _good_value_of(name)
     verdict = (
         None
         if good_value is None
@@ -39,7 +39,7 @@ def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
     return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
 
 
-_meaning = functools.lru_cache(maxsize=4096)(meaning)
+_good_value_of = functools.lru_cache(maxsize=4096)(meaning)
 
 
 def outcome_of(value: Any) -> Outcome:
@@ -51,7 +51,7 @@ def outcome_of(value: Any) -> Outcome:
             return "other"
         for name, field in row._asdict().items():
             if field is True or field is False:
-                good_value = _meaning(name)
+                good_value = _good_value_of(name)
                 if good_value is not None and field is not good_value:
                     return "failed"
                 if good_value is not None:
@@ -64,7 +64,7 @@ def describe_failures(value: Any) -> str:
     failures = [row for row in verdicts(jsonable(value)) if row["verdict"] == "fail"]
     texts = []
     for row in failures:
-        wanted = "true" if meaning(row["name"]) else "false"
+        wanted = "true" if _good_value_of(row["name"]) else "false"
         records = "" if row["of"] == 1 else f" in {row['true']} of {row['of']} records"
         actual = {"true": "false", "false": "true"}[wanted] if row["of"] == 1 else "true"
         texts.append(f"{row['name']} is {actual}{records}, expected {wanted}")

@@ -114,7 +114,7 @@ _STATUS = {
 def _refused_error(error: CalibrationError) -> RefusedError:
     cause, expected = [*re.split(r"[;:] expected ", str(error), maxsplit=1), ""][:2]
     status = next((status for code, status in _STATUS.items() if code == error.code), 422)
-    field = {"field": "code", "came": error.code, "expected": ""}
+    field = {"field": "code", "received": error.code, "expected": ""}
     return RefusedError(
         status, cause, expected or "what the folder and its wizard can do", (field,)
     )
@@ -143,7 +143,9 @@ def _call(
             except CalibrationError as exc:
                 raise _refused_error(exc) from exc
             except OSError as exc:
-                raise RefusedError(500, f"the {writes}: {exc.strerror}", "one to write to") from exc
+                raise RefusedError(
+                    500, f"the {writes}: {exc.strerror}", f"a {writes} that can be written"
+                ) from exc
 
         return handler
 
@@ -151,7 +153,7 @@ def _call(
 
 
 @CALLS.add("GET", API)
-def _calls(_site: WizardSite, _ask: CallRequest) -> object:
+def _calls(_site: WizardSite, _request: CallRequest) -> object:
     """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
@@ -170,10 +172,10 @@ async def _listing(service: CalibrationService, _body: object) -> object:
 
 @_call("POST", "/start", body=_StartBody, sample='{"name": "table"}')
 def _start(service: CalibrationService, body: _StartBody) -> object:
-    """Start a wizard under a name, or continue an interrupted one; answers its step.
+    """Start a wizard under a name, or continue an interrupted one; returns its current step.
 
-    `wizard` is `plane`, `drift` to check a calibration, `sheet` or `hand-eye`, which look at
-    pictures. `fresh` begins anew in any case. `resumed` has the date of a continued wizard, and its
+    `wizard` is `plane`, `drift` (checks a calibration), `sheet` or `hand-eye` (both use pictures).
+    `fresh` begins anew in any case. `resumed` has the date of a continued wizard, and its
     answers.
     """
     view = service.start(body.name, body.wizard, body.parameters, fresh=body.fresh)
@@ -216,8 +218,8 @@ def _abort(service: CalibrationService, body: _StepToken) -> object:
 @_call(
     "POST",
     "/export",
-    about="Copy a calibration to a file of `exports/`: `.json` whole, `.yaml` its matrix, or with "
-    "`form` its frame as another program reads it.",
+    about="Copy a calibration to a file of `exports/`: all of it to `.json`, its matrix to `.yaml` "
+    "or, with `form`, its transform in another program's format.",
     body=_Export,
     sample='{"name": "table", "target": "table.yaml"}',
 )

@@ -262,7 +262,7 @@ async def test_terminal_is_told_who_looks_once_a_second_at_most(
     async with FramesSite(sources) as site, aiohttp.ClientSession() as session:
         assert viewers_text(site) == "nobody looks"
         telling = asyncio.create_task(frames_serve._show_viewers(site, None))
-        url = f"{site.api}/api/sources/1/pictures"
+        url = f"{site.origin}/api/sources/1/pictures"
         for _ in range(3):  # who comes and goes within a second is not told
             async with session.ws_connect(url, protocols=["smartcam.frames"]):
                 pass

@@ -139,7 +139,7 @@ async def test_a_page_shows_accounts_and_what_failed(tmp_path: Path) -> None:
         async with aiohttp.ClientSession() as session:
 
             async def get(path: str, **query: str) -> Any:
-                async with session.get(f"{site.api}/api/{path}", params=query) as answer:
+                async with session.get(f"{site.origin}/api/{path}", params=query) as answer:
                     return answer.status, await answer.json()
 
             status, said = await get("outlets")

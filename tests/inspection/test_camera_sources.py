@@ -279,18 +279,18 @@ async def test_live_page_shows_the_picture_with_the_tools_marks(
         smartcam.connect(f"software:{path}", connect_timeout=PATIENCE) as camera,
         LiveSite(camera) as site,
         aiohttp.ClientSession() as session,
-        session.get(f"{site.api}/api/events") as events,  # somebody looks
+        session.get(f"{site.origin}/api/events") as events,  # somebody looks
     ):
         assert events.status == 200
         await camera.trigger(timeout=PATIENCE)
         async with asyncio.timeout(PATIENCE):
             while True:
-                async with session.get(f"{site.api}/api/picture") as answer:
+                async with session.get(f"{site.origin}/api/picture") as answer:
                     if answer.status == 200:
                         break
                 await asyncio.sleep(0.05)
             assert answer.content_type == "image/png"
-            async with session.get(f"{site.api}/api/picture") as answer:
+            async with session.get(f"{site.origin}/api/picture") as answer:
                 data = await answer.read()
     drawn = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     assert drawn.shape == (48, 64, 3)

@@ -265,8 +265,8 @@ async def web(program: Any) -> None:
         async with program.entered(site) as made, aiohttp.ClientSession() as session:
             if made is not None:
                 async with asyncio.timeout(50):
-                    await program.call(_answer(session, f"{site.api}/api/cameras"))
-                    await program.call(_answer(session, site.api + "/"))
+                    await program.call(_answer(session, f"{site.origin}/api/cameras"))
+                    await program.call(_answer(session, site.origin + "/"))
 
 
 async def _answer(session: aiohttp.ClientSession, url: str) -> bytes:

@@ -22,7 +22,7 @@ from smartcam.web._connections import (
 )
 from smartcam.web._emulator import CALLS as EMULATOR_CALLS
 from smartcam.web._emulator import MAX_PARTS as EMULATOR_MAX_PARTS
-from smartcam.web._emulator import MAX_WAITING_CHANGES
+from smartcam.web._emulator import MAX_WAITING_CALLS
 from smartcam.web._errors import RefusedError
 from smartcam.web._fleet import CALLS, LINGER, MAX_CAMERAS
 from smartcam.web._fleet import MAX_VIEWERS as FLEET_MAX_VIEWERS
@@ -55,6 +55,5 @@ from smartcam.web._pictures import JpegMaker
 from smartcam.web._routes import MAX_BODY_BYTES, CallBody, _parse_json, _validate
 from smartcam.web._serialize import MAX_HEX_BYTES, MAX_REPLY_BYTES, MAX_VALUES_BYTES
 from smartcam.web._site import Site
-from smartcam.web._streams import MAX_STREAMS, StreamEvent, Streams
-from smartcam.web._streams import SHOW_TIMEOUT as STREAMS_SHOW_TIMEOUT
+from smartcam.web._streams import MAX_STREAMS, READER_TIMEOUT, StreamEvent, Streams
 from smartcam.web._verdicts import outcome_of, verdicts

@@ -36,8 +36,8 @@ class Caller:
 
     def url(self, path: str) -> str:
         if path.startswith("/"):
-            return self.site.api + path
-        return f"{self.site.api}/api/cameras/{quote(self.camera, safe='')}/{path}".rstrip("/")
+            return self.site.origin + path
+        return f"{self.site.origin}/api/cameras/{quote(self.camera, safe='')}/{path}".rstrip("/")
 
     async def call(self, method: str, path: str, body: object = None, **options: Any) -> Answer:
         if body is not None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from playwright.async_api import Page
 
-    from smartcam.web._inside import Up
+    from smartcam.web._inside import UpAxis
 
 imagecodecs: Any = pytest.importorskip("imagecodecs", reason="needs the extra frames")
 
@@ -60,7 +60,7 @@ SCENE = Cloud.joined(
 
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page, cloud: Cloud | None, *, up: Up = "-y", **options: Any
+    page: Page, cloud: Cloud | None, *, up: UpAxis = "-y", **options: Any
 ) -> AsyncIterator[CloudSite]:
     """Show a cloud; what the browser finds wrong with the page fails the test."""
     with nothing_wrong(page):
@@ -239,7 +239,7 @@ async def test_newer_cloud_takes_the_place(page: Page, monkeypatch: pytest.Monke
 async def test_server_that_goes_is_said_and_comes_back(page: Page) -> None:
     with nothing_wrong(page):
         async with CloudSite(SCENE, token=TOKEN, port=free_port()) as site:
-            await page.goto(site.api)
+            await page.goto(site.origin)
             await page.fill("#token", TOKEN)
             await page.click("#gate button")
             await page.locator(LIVE).wait_for()

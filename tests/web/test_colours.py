@@ -109,7 +109,7 @@ async def test_picture_comes_with_its_mask_and_regions() -> None:
         seen = await all_of.get(coloured(7))
     assert seen.about["sequence"] == 7
     assert seen.about["range"] == BLACK
-    assert seen.about["part"] == pytest.approx(1200 / 9600)
+    assert seen.about["share"] == pytest.approx(1200 / 9600)
     (region,) = seen.about["regions"]
     assert (region["area"], region["sides"], region["orientation"]) == (1200, [60, 20], 0)
     assert region["centre"] == [69.5, 39.5]
@@ -138,7 +138,7 @@ async def test_other_range_is_shown_of_the_same_picture_without_the_device() -> 
         light = {**BLACK, "value": [100, 255]}
         seen = await all_of.ask(again=True, range=light)
         assert (seen.about["sequence"], seen.about["range"]) == (1, light)
-        assert seen.about["part"] == pytest.approx(1 - 1200 / 9600)
+        assert seen.about["share"] == pytest.approx(1 - 1200 / 9600)
         assert all_of.driver.calls == calls
 
 
@@ -190,7 +190,7 @@ async def test_those_who_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
 async def test_source_that_gives_nothing_says_why() -> None:
     async with world(opened=False) as all_of:
         answer = await all_of.refused("/api/look", range=BLACK)
-        assert (answer.status, answer.value["came"]) == (409, "scripted is not open")
+        assert (answer.status, answer.value["received"]) == (409, "scripted is not open")
     async with world() as all_of:
         answer = await all_of.refused("/api/look", range=BLACK)
         assert answer.status == 409
@@ -203,7 +203,9 @@ async def test_source_that_gives_nothing_says_why() -> None:
             all_of.driver.sink.ended(error)
             answer = await asking
             assert answer.status == status
-            assert answer.value["came"] == ("scripted has ended" if error is None else str(error))
+            assert answer.value["received"] == (
+                "scripted has ended" if error is None else str(error)
+            )
 
 
 async def test_broken_frame_is_reported_and_the_next_is_shown() -> None:

@@ -193,7 +193,7 @@ async def test_token_is_asked_for(page: Page) -> None:
     camera = Camera(driver)
     async with source, ColourSite(source, token=TOKEN) as site:
         giving = asyncio.create_task(camera.run())
-        await page.goto(site.api)
+        await page.goto(site.origin)
         await pass_gate(page)
         await see(page, LIVE)
         await page.goto("about:blank")

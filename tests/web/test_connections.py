@@ -22,7 +22,7 @@ from tests.web.inside import (
     MAX_CONNECTIONS,
     MAX_HEAD_BYTES,
     MAX_STREAMS,
-    MAX_WAITING_CHANGES,
+    MAX_WAITING_CALLS,
     SiteConnection,
 )
 from tests.web.inside import _connections as connections
@@ -102,14 +102,14 @@ async def test_connection_that_was_used_last_goes_last() -> None:
 
 
 async def test_streams_and_calls_that_wait_leave_places_free() -> None:
-    assert MAX_STREAMS + MAX_WAITING_CHANGES <= MAX_CONNECTIONS // 2
+    assert MAX_STREAMS + MAX_WAITING_CALLS <= MAX_CONNECTIONS // 2
     async with served() as world:
         waiting = [
-            asyncio.create_task(world.caller.get("log?wait=30")) for _ in range(MAX_WAITING_CHANGES)
+            asyncio.create_task(world.caller.get("log?wait=30")) for _ in range(MAX_WAITING_CALLS)
         ]
-        await until(lambda: world.site._waiting_count == MAX_WAITING_CHANGES)
+        await until(lambda: world.site._waiting_count == MAX_WAITING_CALLS)
         answer = await world.caller.call("GET", "log?wait=30")
-        assert (answer.status, answer.value["expected"]) == (503, "16 at one time")
+        assert (answer.status, answer.value["expected"]) == (503, "16 at most")
         assert (await world.caller.get("log"))["entries"] == []
         await world.site.stop()
         await asyncio.gather(*waiting, return_exceptions=True)

@@ -79,7 +79,7 @@ def test_fleet_page_has_its_numbers() -> None:
     said = {
         f"in the last {ERROR_MARK_SECONDS:g} s lost",
         f"at most {MAX_ROWS} rows",
-        f"shows nothing for {streams.SHOW_TIMEOUT:g} s",
+        f"shows nothing for {streams.READER_TIMEOUT:g} s",
         f"At most {MAX_FLEET_VIEWERS} browsers",
         f"at most {MAX_CAMERAS} cameras",
         f"and {LINGER:g} s longer",
@@ -97,7 +97,7 @@ def _listed(words: Sequence[str]) -> str:
 
 def test_frames_page_has_its_numbers() -> None:
     assert f"At most {MAX_VIEWERS} WebSockets are open" in FRAMES_PAGE
-    assert f"takes no picture for {streams.SHOW_TIMEOUT:g} s" in FRAMES_PAGE
+    assert f"takes no picture for {streams.READER_TIMEOUT:g} s" in FRAMES_PAGE
 
 
 def test_bounds_are_those_of_the_code() -> None:
@@ -105,7 +105,7 @@ def test_bounds_are_those_of_the_code() -> None:
         f"did not come within {routes.READ_TIMEOUT:g} s",
         f"more than {routes.MAX_BODY_BYTES >> 10} KiB",
         f"{streams.MAX_STREAMS} event streams",
-        f"nothing for {streams.SHOW_TIMEOUT:g} s",
+        f"nothing for {streams.READER_TIMEOUT:g} s",
         f"at most {serialize.MAX_HEX_BYTES} bytes of a payload, "
         f"and decode results of at most {serialize.MAX_VALUES_BYTES}",
     }
@@ -136,7 +136,7 @@ async def test_curl_lines_are_answered() -> None:
         for line in CURL:
             token = "Authorization" in line
             words = shlex.split(line.replace("just-for-this-test-bench", TOKEN))
-            api = (closed if token else site).api
+            api = (closed if token else site).origin
             words = [word.replace("http://localhost:8080", api) for word in words]
             stream = "-N" in words
             words[1:1] = ["-sS", "--fail-with-body", "--max-time", "60"]

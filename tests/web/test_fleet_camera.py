@@ -52,7 +52,7 @@ class World(NamedTuple):
 
     @contextlib.asynccontextmanager
     async def events(self, camera: str = "line1/cam1") -> AsyncIterator[Listener]:
-        url = self.caller.site.api + self.path("/events", camera)
+        url = self.caller.site.origin + self.path("/events", camera)
         async with self.caller.session.get(url) as response:
             assert response.status == 200
             yield Listener(response)
@@ -74,7 +74,7 @@ async def test_camera_is_triggered_and_its_page_and_row_tell_it() -> None:
             assert (answer.status, answer.value["number"]) == (200, 1)
             told = await events.until("results", lambda told: told["results"])
             parts = {part["name"] for part in told["results"][0]["parts"]}
-            account = await events.until("account", lambda told: told["received"])
+            account = await events.until("counts", lambda told: told["received"])
             assert account["received"] == account["triggered"] == 1
         row = world.site.view.rows["line1/cam1"]
         await until(lambda: row.count == 1)
@@ -103,14 +103,14 @@ async def test_refusal_of_the_camera_is_reported() -> None:
     async with served(smartcam.fleet.open(CELL), control=True) as world:
         answer = await world.post("/switch", {"application": 999})
         assert answer.status == 409
-        assert "999" in answer.value["came"]
+        assert "999" in answer.value["received"]
 
 
 async def test_unknown_camera_is_refused_with_what_was_meant() -> None:
     async with served(smartcam.fleet.open(CELL), control=True) as world:
         answer = await world.post("/trigger", camera="line1/cm1")
         assert answer.status == 404
-        assert "did you mean 'line1/cam1'" in answer.value["came"]
+        assert "did you mean 'line1/cam1'" in answer.value["received"]
 
 
 async def test_camera_is_left_when_nobody_looks_any_more() -> None:

@@ -128,7 +128,7 @@ async def test_outlets_have_their_accounts_and_what_failed_with_whole_texts(
             ("broker", 1, 0, 1, 0, "MqttError: [Errno 111] Connection refused"),
             ("results", 1, 1, 0, 0, "well"),
         ):
-            await see(page, "#accounts tr", f"{name}{''.join(map(str, numbers))}{state}")
+            await see(page, "#outlet-counts tr", f"{name}{''.join(map(str, numbers))}{state}")
         await page.click("#failures summary")
         await see(page, "#counted", "1 of 1 failed, 1 errors, 0 lost in 0 gaps")
         await see(page, "#failed tr", "expected 24 bytes, got 150: 126 too many from offset 24")

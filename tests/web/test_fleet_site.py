@@ -26,12 +26,12 @@ from tests.web.inside import (
     MAX_KEPT_BYTES,
     MAX_QUEUE,
     MAX_ROWS,
+    READER_TIMEOUT,
     line_of,
     outcome_of,
 )
 from tests.web.inside import FLEET_MAX_VIEWERS as MAX_VIEWERS
 from tests.web.inside import FLEET_SOCKET_PROTOCOL as PROTOCOL
-from tests.web.inside import STREAMS_SHOW_TIMEOUT as SHOW_TIMEOUT
 from tests.web.inside import _fleet as site_module
 from tests.web.inside import _fleet_view as view_module
 from tests.web.madeup import AT, READY, MadeUpFleet, names
@@ -244,11 +244,11 @@ async def test_orders() -> None:
         cameras[1].send(GOOD)
         cameras[2].lose("gone")
         await asyncio.sleep(1.5)
-        assert (await world.shown(down="true"))[0] == names(5)[4]
-        assert (await world.shown(sort="rate", down="true"))[:2] == [names(5)[3], names(5)[1]]
-        assert (await world.shown(sort="last", down="true"))[:2] == [names(5)[1], names(5)[3]]
+        assert (await world.shown(descending="true"))[0] == names(5)[4]
+        assert (await world.shown(sort="rate", descending="true"))[:2] == [names(5)[3], names(5)[1]]
+        assert (await world.shown(sort="last", descending="true"))[:2] == [names(5)[1], names(5)[3]]
         assert (await world.shown(sort="state"))[0] == names(5)[2]
-        assert (await world.shown(sort="errors", down="true"))[0] == names(5)[2]
+        assert (await world.shown(sort="errors", descending="true"))[0] == names(5)[2]
 
 
 @pytest.mark.parametrize(
@@ -426,7 +426,7 @@ async def test_who_does_not_read_holds_up_nobody_and_gets_the_newest() -> None:
 async def test_who_never_reads_is_disconnected() -> None:
     async with served(3) as world, world.looking() as quick, world.looking() as slow:
         await slow.listen(3.0)
-        for number in range(2 * int(SHOW_TIMEOUT)):
+        for number in range(2 * int(READER_TIMEOUT)):
             world.fleet["line01/cam000"].send(GOOD)
             await quick.listen(1.0)
             assert quick.rows["line01/cam000"]["count"] == number + 1
@@ -521,7 +521,7 @@ async def test_row_has_its_result_in_si_and_in_the_units_of_the_switch() -> None
     rows = Layout(layout).parse_table(struct.pack("<ff", 12.5, 90.0))
     async with served(2) as world, world.looking() as looker:
         assert looker.said["units"]["instead"]["m"] == ["mm", 1000.0]
-        assert looker.said["units"]["first"] is False
+        assert looker.said["units"]["shown_first"] is False
         table, plain = (world.fleet[name] for name in names(2))
         table.read_as({7: f"table: {layout}"})
         table.send(rows)

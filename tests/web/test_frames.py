@@ -19,14 +19,13 @@ from smartcam.exceptions import ConfigurationError, FrameFormatError, MissingExt
 from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import FramesSite, _jpeg
 from smartcam.web._frames import CALLS
-from smartcam.web._inside import is_whole_jpeg, picture
+from smartcam.web._inside import is_whole_jpeg, pixels_to_show
 from smartcam.web._jpeg import HUFFMAN_TABLES, jpeg
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.handmade import until
 from tests.web.inside import PICTURES_MAX_VIEWERS as MAX_VIEWERS
 from tests.web.inside import PICTURES_PROTOCOL as PROTOCOL
-from tests.web.inside import STREAMS_SHOW_TIMEOUT as SHOW_TIMEOUT
-from tests.web.inside import JpegMaker
+from tests.web.inside import READER_TIMEOUT, JpegMaker
 from tests.web.inside import _pictures as pictures_module
 from tests.web.sitekit import TOKEN, Caller, Raw
 
@@ -60,7 +59,7 @@ class Looker:
         end = 4 + int.from_bytes(data[:4], "little")
         told = json.loads(data[4:end])
         pixels = simplejpeg.decode_jpeg(data[end:], colorspace="GRAY")[..., 0]
-        return Shown(told["frame"], told["account"], pixels)
+        return Shown(told["frame"], told["counts"], pixels)
 
     async def next(self) -> None:
         await self.socket.send_str("next")
@@ -106,7 +105,7 @@ def plain(number: int, grey: int = 128, **other: Any) -> Frame:
 async def test_looker_gets_the_newest_frame_and_its_account() -> None:
     async with world() as all_of, all_of.looking() as looker:
         told = await looker.word()
-        assert (told["state"], told["format"]) == ("waiting", "Mono8 4x2 at 30/s")
+        assert (told["state"], told["format"]) == ("no_frame_yet", "Mono8 4x2 at 30/s")
         await all_of.driver.streams()
         all_of.driver.give(plain(7, 200, lost=3))
         shown = await looker.picture()
@@ -159,7 +158,7 @@ async def test_looker_that_shows_nothing_more_is_disconnected() -> None:
         await looker.picture()
         message = (
             await looker.socket.receive()
-        )  # takes no time of ours, but pictures_module.SHOW_TIMEOUT
+        )  # takes no time of ours, but pictures_module.READER_TIMEOUT
         assert message.type in {aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR}
         await all_of.driver.rests()
 
@@ -180,7 +179,7 @@ async def test_looker_that_reads_nothing_holds_up_nobody_and_is_disconnected() -
             all_of.driver.give(frame(number, data=noise, **large))
             assert (await looker.picture()).frame["sequence"] == number
             await looker.next()
-        await asyncio.sleep(SHOW_TIMEOUT + 1)
+        await asyncio.sleep(READER_TIMEOUT + 1)
         assert all_of.source.statistics().readers == 1
 
 
@@ -199,7 +198,7 @@ async def test_looker_is_told_the_account_if_no_frame_comes() -> None:
         await looker.word()
         await all_of.driver.streams()
         first, second = await looker.word(), await looker.word()
-    assert first["account"]["offered"] == second["account"]["offered"] == 0
+    assert first["counts"]["offered"] == second["counts"]["offered"] == 0
 
 
 async def test_source_that_dies_is_told_and_read_again() -> None:
@@ -232,9 +231,9 @@ async def test_source_that_is_not_open_is_awaited_with_the_reason() -> None:
     async with world(opened=False) as all_of, all_of.looking() as looker:
         all_of.site.failures[0] = "scripted: no such device"
         assert (await looker.word())["text"] == "scripted is not open"
-        assert await looker.word() == {"state": "awaited", "text": "scripted: no such device"}
+        assert await looker.word() == {"state": "not_open", "text": "scripted: no such device"}
         async with all_of.source:
-            while (await looker.word())["state"] != "waiting":
+            while (await looker.word())["state"] != "no_frame_yet":
                 pass
 
 
@@ -245,7 +244,7 @@ async def test_frame_that_is_broken_is_reported_and_the_next_is_shown() -> None:
         all_of.driver.give(plain(1, data=b"too short"))
         told = await looker.word()
         assert "expected" in told["bad"]
-        assert told["account"]["bad"] == 1
+        assert told["counts"]["bad"] == 1
         all_of.driver.give(plain(2))
         assert (await looker.picture()).account["bad"] == 1
         assert all_of.driver.calls == ["open", "start"]
@@ -295,7 +294,7 @@ async def test_site_that_stops_says_good_bye() -> None:
         await all_of.driver.rests()
         await all_of.site.start()
         async with all_of.looking() as again:
-            assert (await again.word())["state"] == "waiting"
+            assert (await again.word())["state"] == "no_frame_yet"
 
 
 async def test_viewers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -318,7 +317,7 @@ async def test_websocket_needs_the_token_among_its_protocols() -> None:
                 await stranger.ws_connect(url, protocols=protocols)
         async with stranger.ws_connect(url, protocols=[PROTOCOL, f"bearer.{TOKEN}"]) as socket:
             assert socket.protocol == PROTOCOL
-            assert json.loads(await socket.receive_str())["state"] == "waiting"
+            assert json.loads(await socket.receive_str())["state"] == "no_frame_yet"
         headers = {"Sec-WebSocket-Protocol": f"bearer.{TOKEN}"}
         async with stranger.get(all_of.caller.url("/api/sources"), headers=headers) as response:
             assert response.status == 401  # of a WebSocket alone
@@ -458,7 +457,7 @@ def test_more_than_eight_bits_are_stretched_to_be_seen() -> None:
 def test_distances_are_shown_as_they_are() -> None:
     levels = np.arange(256, dtype=np.uint16).reshape(16, 16)
     depth = plain(1, data=levels.tobytes(), format=find_format("Z16"), stride=32)
-    assert np.array_equal(picture(depth), levels)
+    assert np.array_equal(pixels_to_show(depth), levels)
     assert jpeg(depth, 80).startswith(b"\xff\xd8")
 
 

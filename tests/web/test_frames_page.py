@@ -157,7 +157,7 @@ async def test_source_that_is_awaited_says_why(page: Page) -> None:
     _, source = scripted(stall=None)
     async with opened(page, [source]) as site:
         site.failures[0] = "scripted: no such device"
-        await see(page, ".source[data-state=awaited] .why", "scripted: no such device")
+        await see(page, ".source[data-state=not_open] .why", "scripted: no such device")
 
 
 async def test_hidden_page_lets_the_device_rest(page: Page) -> None:
@@ -194,7 +194,7 @@ async def test_server_that_goes_is_said_and_comes_back(page: Page) -> None:
 async def test_token_is_asked_for_and_opens_the_sockets(page: Page) -> None:
     driver, source = scripted(stall=None)
     async with source, FramesSite([source], token=TOKEN) as site:
-        await page.goto(site.api)
+        await page.goto(site.origin)
         await pass_gate(page)
         await see(page, LIVE)
         await driver.streams()
@@ -304,7 +304,7 @@ async def test_tap_enlarges_one_and_the_others_stop(page: Page, width: int, heig
     async with four(page, width, height) as site:
         (small, *_) = await page.evaluate(DRAWN)
         await page.click("[data-place='2'] .view")
-        await until(lambda: [one.place for one in site.viewers] == [2], PATIENCE)
+        await until(lambda: [one.index for one in site.viewers] == [2], PATIENCE)
         await until(
             lambda: [s.statistics().readers for s in site.sources] == [0, 0, 1, 0], PATIENCE
         )
@@ -317,7 +317,7 @@ async def test_tap_enlarges_one_and_the_others_stop(page: Page, width: int, heig
         await page.click("[data-place='2'] .view")
         await until(lambda: len(site.viewers) == 4, PATIENCE)
         await page.click("[data-place='1'] .view")
-        await until(lambda: [one.place for one in site.viewers] == [1], PATIENCE)
+        await until(lambda: [one.index for one in site.viewers] == [1], PATIENCE)
         await page.keyboard.press("Escape")
         await until(lambda: len(site.viewers) == 4, PATIENCE)
         for place in range(4):

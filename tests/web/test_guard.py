@@ -89,16 +89,16 @@ async def test_page_may_be_linked_to_from_elsewhere() -> None:
 async def test_token_is_needed_for_calls_alone() -> None:
     async with served(token=TOKEN) as world:
         assert world.site.token == TOKEN
-        assert world.site.url == f"{world.site.api}/#token={TOKEN}"
+        assert world.site.url == f"{world.site.origin}/#token={TOKEN}"
         assert len((await world.caller.get("/api/cameras"))["cameras"]) == 1
         async with aiohttp.ClientSession() as stranger:
-            async with stranger.get(f"{world.site.api}/") as page:
+            async with stranger.get(f"{world.site.origin}/") as page:
                 assert page.status == 200
-            async with stranger.get(f"{world.site.api}/api/cameras") as refused:
+            async with stranger.get(f"{world.site.origin}/api/cameras") as refused:
                 answer = await refused.json()
         assert refused.status == 401
         assert refused.headers["WWW-Authenticate"] == 'Bearer realm="smartcam"'
-        assert answer["came"] == "no Authorization"
+        assert answer["received"] == "no Authorization"
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_address_that_others_reach_gets_a_token() -> None:
 async def test_site_on_all_addresses_is_reached_by_any_with_the_token() -> None:
     async with EmulatorSite({}, host="0.0.0.0") as site, Raw.connected(site) as raw:  # noqa: S104
         name, _, token = site.url.partition("/#token=")
-        assert name == f"http://{socket.gethostname()}:{site.port}" == site.api
+        assert name == f"http://{socket.gethostname()}:{site.port}" == site.origin
         status, body = await raw.call(
             "GET /api/cameras HTTP/1.1", "Host: any", f"Authorization: Bearer {token}"
         )
@@ -170,7 +170,7 @@ async def test_every_answer_has_the_headers() -> None:
     async with served() as world, world.events() as events:
         answers = [events.response.headers]
         for path in ("/", "/emulator.js", "/emulator.css", "/api", "/nothing", "/api/nothing"):
-            async with world.caller.session.get(world.site.api + path) as response:
+            async with world.caller.session.get(world.site.origin + path) as response:
                 answers.append(response.headers)
     for headers in answers:
         assert {key: headers.get(key) for key in HEADERS} == HEADERS
@@ -180,7 +180,7 @@ async def test_page_names_nothing_from_elsewhere() -> None:
     async with served() as world:
         texts: list[str] = []
         for name in ("", "emulator.js", "emulator.css"):
-            async with world.caller.session.get(f"{world.site.api}/{name}") as response:
+            async with world.caller.session.get(f"{world.site.origin}/{name}") as response:
                 assert response.status == 200
                 texts.append((await response.text()).replace("http://www.w3.org/2000/svg", ""))
     assert [text for text in texts if "http:" in text or "https:" in text or "url(" in text] == []
@@ -198,7 +198,7 @@ async def test_site_starts_and_stops_as_often_as_wanted() -> None:
         for _ in range(2):
             await site.start()
             await site.start()
-            async with session.get(f"{site.api}/api/cameras") as response:
+            async with session.get(f"{site.origin}/api/cameras") as response:
                 assert response.status == 200
             port = site.port
             await site.stop()

@@ -142,12 +142,12 @@ async def test_commands_with_control(emulator: EmulatedCamera) -> None:
         caller = world.caller
         assert "RUNNING" not in (await caller.post("/api/stop"))["status"]
         refused = await caller.call("POST", "/api/trigger")
-        assert (refused.status, "NotRunningError" in refused.value["came"]) == (409, True)
+        assert (refused.status, "NotRunningError" in refused.value["received"]) == (409, True)
         assert "RUNNING" in (await caller.post("/api/start"))["status"]
         assert (await caller.post("/api/trigger", {"timeout": 30.0}))["number"] == 1
         assert (await caller.post("/api/switch", {"application": 6}))["application"] == 6
         gone = await caller.call("POST", "/api/switch", {"application": 99})
-        assert (gone.status, "CommandRejectedError" in gone.value["came"]) == (409, True)
+        assert (gone.status, "CommandRejectedError" in gone.value["received"]) == (409, True)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ async def test_result_is_reported_and_the_account_adds_up(emulator: EmulatedCame
         assert (first.data["connection"], first.data["control"]) == ("connected", False)
         result = await world.camera.trigger()
         (told,) = (await events.next("results")).data["results"]
-        account = await events.until("account", lambda account: account["received"])
+        account = await events.until("counts", lambda account: account["received"])
         (later,) = (await events.until("clock", lambda clock: clock["series"]))["series"][-1:]
     assert told["number"] == result.number
     assert told["value"] == {"ok": True, "width": 12.5}
@@ -220,7 +220,7 @@ async def test_container_that_cannot_be_read_is_reported(emulator: EmulatedCamer
             await world.camera.trigger()
         await until(lambda: world.site.view.entries)
         (told,) = (await world.caller.get("/api/results"))["results"]
-        account = (await world.caller.get("/api/camera"))["account"]
+        account = (await world.caller.get("/api/camera"))["counts"]
     assert set(told) == {"serial", "error"}
     assert account["uninterpretable"] == account["received"] == 1
 
@@ -308,7 +308,7 @@ async def test_lost_camera_is_reported_and_found_again(emulator: EmulatedCamera)
         again = EmulatedCamera(APPLICATIONS, active=5, running=True, port=emulator.port)
         async with again:
             found = await events.until("camera", lambda state: state["connection"] == "connected")
-            account = await events.until("account", lambda account: account["reconnects"])
+            account = await events.until("counts", lambda account: account["reconnects"])
             await world.camera.trigger()
             serials = [one.serial for one in world.site.view.entries]
     assert (found["loss"], found["last_error"]) == ("", "")
@@ -326,7 +326,7 @@ async def test_a_cameras_own_connection_error_is_not_taken_for_a_reader_that_is_
         async with world.events() as events:
             await events.next("camera")
             monkeypatch.setattr(world.site.view, "state", lost)
-            await until(lambda: "a fault of ours" in caplog.text)
+            await until(lambda: "a fault of smartcam" in caplog.text)
         answer = await world.caller.call("GET", "/api/camera")
     assert answer.status == 500
     assert "the camera is gone" in caplog.text
@@ -352,7 +352,7 @@ async def test_another_camera_is_followed_while_the_first_is_not_there(
         other = smartcam.connect(emulator.url)
         await world.site.view.follow(other, "nothing there")
         told = await events.until("camera", lambda state: state["connection"] == "awaited")
-        assert (told["loss"], told["status"], told["can"]) == ("nothing there", [], None)
+        assert (told["loss"], told["status"], told["capabilities"]) == ("nothing there", [], None)
         async with other:
             await events.until("camera", lambda state: state["connection"] == "connected")
             await other.trigger()
@@ -393,7 +393,7 @@ async def test_picture_that_cannot_be_had_is_reported() -> None:
 async def test_camera_without_pictures_is_asked_for_none(emulator: EmulatedCamera) -> None:
     async with shown(emulator.url) as world, world.events() as events:
         await world.caller.post("/api/picture")
-        await events.next("account")
+        await events.next("counts")
         await events.next("clock")
         assert world.site.view.picture is None
         assert world.site.view.picture_error == ""
@@ -444,7 +444,7 @@ def test_what_is_kept_is_bounded() -> None:
     history = ShiftHistory()
     for number in range(2 * MAX_BARS):
         history.add(shift_result(number, ok=False, seconds=BAR_SECONDS * number))
-        history.attach_picture(history.last_failure, b"BM" + bytes([number]))
+        history.attach_picture(history.newest_result_failure, b"BM" + bytes([number]))
         history.add(shift_result(number, ok=True, seconds=BAR_SECONDS * number))
     found = history.as_json()
     assert (len(found["bars"]), len(found["failures"])) == (MAX_BARS, MAX_FAILURES)
@@ -468,7 +468,7 @@ def test_picture_belongs_to_no_failure_once_anything_came_after_it() -> None:
     assert history.wants_picture
     history.add(shift_result(2, ok=False)._replace(value=b"no verdict"))
     assert not history.wants_picture
-    history.attach_picture(history.last_failure, b"BM of another part")
+    history.attach_picture(history.newest_result_failure, b"BM of another part")
     assert history.as_json()["failures"][0]["picture"] is False
 
 
@@ -485,14 +485,14 @@ def test_losses_and_missed_results_are_failures_with_their_time() -> None:
 
 def test_short_trend_tells_how_many_of_ten_were_bad() -> None:
     history = ShiftHistory()
-    assert history.trend() == {"end": 0, "places": ""}
+    assert history.trend() == {"end": 0, "characters": ""}
     for number, ok in enumerate([True] * 39 + [False]):
         history.add(shift_result(number, ok))
     later = 2 * SLOT_SECONDS
     history.add(shift_result(40, ok=True, seconds=later)._replace(value=b"no verdict"))
     history.add(shift_result(41, ok=False, seconds=later + SLOT_SECONDS))
     begin = SHIFT_BEGIN.timestamp()
-    assert history.trend() == {"end": begin + 4 * SLOT_SECONDS, "places": "1 -X"}
+    assert history.trend() == {"end": begin + 4 * SLOT_SECONDS, "characters": "1 -X"}
 
 
 def test_a_text_is_shown_as_text_and_not_as_hex() -> None:
@@ -527,7 +527,7 @@ async def test_failure_has_its_picture_though_nobody_looks() -> None:
             assert site.view.history.as_json()["failures"][0]["picture"] is True
             async with (
                 aiohttp.ClientSession() as session,
-                session.get(f"{site.api}/api/failures/1") as answer,
+                session.get(f"{site.origin}/api/failures/1") as answer,
             ):
                 assert (answer.status, (await answer.read())[:2]) == (200, b"BM")
 
@@ -556,17 +556,17 @@ async def test_page_of_a_fleets_camera_knows_since_when_it_is_lost() -> None:
     async with EmulatedCamera(active=21, running=True) as emulator:
         file = FleetFile.model_validate({"cameras": {"a": {"url": emulator.url}}})
         async with smartcam.fleet.open(file) as fleet, FleetSite(fleet) as site:
-            assert site.live("a").state()["changed_seen"] is False
-            await site.live("a").stop()
-            site._live.clear()
+            assert site.watched_camera("a").state()["changed_at_exact"] is False
+            await site.watched_camera("a").stop()
+            site._watched.clear()
             await emulator.stop()
             row = site.view.rows["a"]
             await until(lambda: row.mode == "lost")
             lost_at = row.changed_at
             await asyncio.sleep(0.05)
-            told = site.live("a").state()
-            assert (told["changed_at"], told["changed_seen"]) == (lost_at, True)
-            assert row.fields()["changed_seen"] is True
+            told = site.watched_camera("a").state()
+            assert (told["changed_at"], told["changed_at_exact"]) == (lost_at, True)
+            assert row.fields()["changed_at_exact"] is True
             (failure,) = row.history.as_json()["failures"]
             assert failure["what"].startswith("connection lost: ")
 

@@ -119,9 +119,9 @@ async def test_device_that_is_not_there_says_why_and_comes() -> None:
                 while (
                     "no such device" not in (told := json.loads(await socket.receive_str()))["text"]
                 ):
-                    assert told["state"] == "awaited"
+                    assert told["state"] == "not_open"
                 del plant.driver.fails["open"]
-                while json.loads(await socket.receive_str())["state"] != "waiting":
+                while json.loads(await socket.receive_str())["state"] != "no_frame_yet":
                     pass
                 await plant.driver.streams()
                 plant.driver.give(frame(5))

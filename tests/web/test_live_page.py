@@ -69,7 +69,7 @@ async def opened(
 
 async def counts(page: Page) -> dict[str, int]:
     """Return the account as the page shows it."""
-    rows = await page.locator("#account [data-count]").all()
+    rows = await page.locator("#counts [data-count]").all()
     return {str(await one.get_attribute("data-count")): int(await one.inner_text()) for one in rows}
 
 

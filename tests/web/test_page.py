@@ -81,7 +81,7 @@ async def opened(
             await stack.enter_async_context(camera)
         named = {camera.name: camera for camera in cameras}
         site = await stack.enter_async_context(EmulatorSite(named, token=token, port=port))
-        await page.goto(site.url if at is None else site.api + at)
+        await page.goto(site.url if at is None else site.origin + at)
         view = View(page, named, site)
         if at is None:
             await view.see(LIVE)

@@ -182,7 +182,7 @@ async def test_application_is_loaded_and_runs() -> None:
         world.clock.advance(0.5)
         state = await world.caller.get()
     assert again.status == 409
-    assert again.value["came"] == "the camera is switching"
+    assert again.value["received"] == "the camera is switching"
     assert (state["active_application"], state["mode"]) == (7, "running")
 
 
@@ -244,7 +244,7 @@ async def test_commands_are_those_of_the_timeline(tmp_path: Any) -> None:
         answer = await world.caller.post("commands/sensor")
         unknown = await world.caller.call("POST", "commands/door")
     assert answer["camera"]["status"] == ["OVERHEAT"]
-    assert (unknown.status, unknown.value["came"]) == (404, "no command is called 'door'")
+    assert (unknown.status, unknown.value["received"]) == (404, "no command is called 'door'")
     assert unknown.value["expected"] == "sensor"
 
 
@@ -287,7 +287,7 @@ async def test_part_is_put_and_taken_off() -> None:
     assert put.value["parts"][5]["x"] == 0.2
     bolt = new.value["parts"][-1]
     assert (bolt["name"], bolt["outline"], bolt["in_view"]) == ("a bolt", None, False)
-    assert (gone.status, gone.value["came"]) == (404, "no part is called 'square'")
+    assert (gone.status, gone.value["received"]) == (404, "no part is called 'square'")
 
 
 async def test_parts_are_no_more_than_fit() -> None:
@@ -474,7 +474,7 @@ async def test_unknown_camera_is_404_with_those_there_are() -> None:
     assert answer.value == {
         "error": "POST /api/cameras/line 2/trigger: no camera is called 'line 2'; expected camera",
         "tried": "POST /api/cameras/line 2/trigger",
-        "came": "no camera is called 'line 2'",
+        "received": "no camera is called 'line 2'",
         "expected": "camera",
     }
 
@@ -500,7 +500,7 @@ async def test_wrong_field_is_422_with_its_name(
     async with served() as world:
         answer = await world.caller.call("POST", path, body)
     assert answer.status == 422
-    assert answer.value["fields"] == [{"field": field, "came": came, "expected": expected}]
+    assert answer.value["fields"] == [{"field": field, "received": came, "expected": expected}]
     assert answer.value["error"].startswith(f"POST /api/cameras/camera/{path}: ")
 
 
@@ -511,7 +511,7 @@ async def test_fault_that_the_dialect_lacks_is_422_and_none_is_added() -> None:
         )
         assert world.emulator.faults == []
     assert answer.status == 422
-    assert "fault 2" in answer.value["came"]
+    assert "fault 2" in answer.value["received"]
 
 
 @pytest.mark.parametrize(
@@ -545,12 +545,12 @@ async def test_body_that_no_call_takes_is_refused() -> None:
         none = await world.caller.call("POST", "application")
         query = await world.caller.call("GET", "scene?since=3")
         limit = await world.caller.call("GET", "log?limit=1001")
-    assert (body.status, body.value["came"]) == (422, "the body {'times': 3}")
+    assert (body.status, body.value["received"]) == (422, "the body {'times': 3}")
     assert (none.status, none.value["expected"]) == (
         422,
         'JSON, for example {"id": 7, "running": true}',
     )
-    assert (query.status, query.value["came"]) == (422, "the query {'since': '3'}")
+    assert (query.status, query.value["received"]) == (422, "the query {'since': '3'}")
     assert limit.value["fields"][0]["field"] == "limit"
 
 

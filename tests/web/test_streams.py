@@ -114,7 +114,7 @@ def flood(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def test_slow_reader_is_disconnected(flood: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "SHOW_TIMEOUT", 0.05)
+    monkeypatch.setattr(streams, "READER_TIMEOUT", 0.05)
     async with served() as world, Raw.connected(world.site) as raw:
         await stuffed(raw, world)
         await until(lambda: not len(world.site.streams))

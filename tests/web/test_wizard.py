@@ -37,7 +37,7 @@ class World(NamedTuple):
 
     async def call(self, method: str, path: str, body: object = None) -> tuple[int, Any]:
         options: dict[str, Any] = {} if body is None else {"json": body}
-        url = f"{self.site.api}/api{path}"
+        url = f"{self.site.origin}/api{path}"
         async with self.session.request(method, url, **options) as response:
             return response.status, await response.json()
 
@@ -183,7 +183,7 @@ async def test_call_that_cannot_be_done_is_refused(
 ) -> None:
     async with served(tmp_path) as world:
         got, answer = await world.call("POST", path, body)
-    assert (got, answer["fields"][0]["came"]) == (status, code)
+    assert (got, answer["fields"][0]["received"]) == (status, code)
     assert files(tmp_path) == []
 
 
@@ -191,7 +191,7 @@ async def test_old_token_is_refused(tmp_path: Path) -> None:
     async with served(tmp_path) as world:
         await world.post("/start", name="table")
         status, answer = await world.call("POST", "/undo", {"token": "old"})
-    assert (status, answer["fields"][0]["came"]) == (409, "STALE_STEP")
+    assert (status, answer["fields"][0]["received"]) == (409, "STALE_STEP")
 
 
 async def test_unknown_field_is_refused(tmp_path: Path) -> None:
@@ -213,6 +213,6 @@ async def test_site_with_a_token_wants_it(tmp_path: Path) -> None:
 async def test_page_s_files_are_served(tmp_path: Path) -> None:
     async with served(tmp_path) as world:
         for path in ("/", "/wizard.js", "/wizard.css"):
-            async with world.session.get(f"{world.site.api}{path}") as response:
+            async with world.session.get(f"{world.site.origin}{path}") as response:
                 assert response.status == 200
                 assert len(await response.text()) > 500

@@ -62,7 +62,7 @@ async def exposition(numbers: AgentNumbers | None, *, per_camera: bool) -> tuple
     Raises:
         MissingExtraError: prometheus-client is not installed.
     """
-    client = require_client()
+    client = require_prometheus()
     parts: list[bytes] = [await asyncio.to_thread(_process_text, client)]
     if numbers is not None:
         for family in _agent_families(client.core, numbers):
@@ -80,7 +80,7 @@ async def exposition(numbers: AgentNumbers | None, *, per_camera: bool) -> tuple
     return b"".join(parts), client.CONTENT_TYPE_LATEST
 
 
-def require_client() -> Any:
+def require_prometheus() -> Any:
     """Return prometheus-client.
 
     Raises:

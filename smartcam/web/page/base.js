@@ -46,7 +46,7 @@ export const headers = () => (token() ? { Authorization: `Bearer ${token()}` } :
 
 export class Refused extends Error {
   constructor(status, answer) {
-    super(answer.came ?? `HTTP ${status}`);
+    super(answer.received ?? `HTTP ${status}`);
     this.status = status;
     this.answer = answer;
   }
@@ -76,7 +76,7 @@ export function atGate(goOn) {
 export function askToken(answer) {
   $("main").hidden = $("alarm").hidden = true;
   $("gate").hidden = false;
-  $("gate-error").textContent = token() ? `Refused: ${answer.came}` : "";
+  $("gate-error").textContent = token() ? `Refused: ${answer.received}` : "";
   live("lost", "token needed");
 }
 
@@ -95,7 +95,7 @@ export function takeUnits(units, changed) {
   if (JSON.stringify(units.instead) === JSON.stringify(instead)) return;
   instead = units.instead;
   const chosen = localStorage.getItem(UNITS);
-  $("practical").checked = chosen === null ? units.first : chosen === "true";
+  $("practical").checked = chosen === null ? units.shown_first : chosen === "true";
   setText("practical-names", Object.values(instead).map(([name]) => name).join(", "));
   $("practical").onchange = () => {
     localStorage.setItem(UNITS, String($("practical").checked));

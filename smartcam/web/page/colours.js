@@ -33,7 +33,7 @@ async function show(response, newest) {
     frame(paint($("mask"), mask), about);
     shown = { ...about, came };
     setText("about", `${about.format} ${about.width}x${about.height}, number ${about.sequence}`);
-    setText("part", `${(100 * about.part).toFixed(1)} % of the pixels`);
+    setText("part", `${(100 * about.share).toFixed(1)} % of the pixels`);
     list(about.regions);
   }
   picture.close();

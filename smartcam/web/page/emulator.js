@@ -57,8 +57,8 @@ async function act(what, method, where, body) {
 
 function reason(error) {
   if (!(error instanceof Refused)) return `No answer: ${error.message}`;
-  const { came, expected } = error.body;
-  return expected ? `${came}; expected ${expected}` : error.message;
+  const { received, expected } = error.body;
+  return expected ? `${received}; expected ${expected}` : error.message;
 }
 
 function tell(text, bad = false) {
@@ -85,7 +85,7 @@ function askToken(answer) {
   stream?.abort();
   $("main").hidden = true;
   $("gate").hidden = false;
-  $("gate-error").textContent = token ? `Refused: ${answer.came}` : "";
+  $("gate-error").textContent = token ? `Refused: ${answer.received}` : "";
   live("lost", "token needed");
 }
 
@@ -408,7 +408,7 @@ function showScene() {
   if (!scene) return;
   const width = scene.table.width * MM;
   const depth = scene.table.depth * MM;
-  const looking = scene.lookers.includes(state.active_application);
+  const looking = scene.table_applications.includes(state.active_application);
   $("picture").classList.toggle("away", !looking);
   const view = scene.field_of_view;
   const xs = [0, width, ...view.map((one) => one.x * MM)];
@@ -590,8 +590,8 @@ function showPart() {
   const part = scene.parts.find((one) => one.name === selected);
   const seen = scene.reported?.parts.find((one) => one.name === selected);
   let text = "";
-  if (!scene.lookers.includes(state.active_application)) {
-    const names = scene.lookers.map((id) => `${id} ${state.applications.find((one) => one.id === id)?.name ?? ""}`.trim());
+  if (!scene.table_applications.includes(state.active_application)) {
+    const names = scene.table_applications.map((id) => `${id} ${state.applications.find((one) => one.id === id)?.name ?? ""}`.trim());
     text = `The active application does not look at the table${names.length ? `; ${names.join(", ")} does: load it to see parts reported` : ""}.`;
   } else if (!selected) {
     text = scene.reported
@@ -862,7 +862,7 @@ const log = {
 };
 
 // a client that searches for the dialect does nothing wrong
-const isMarked = (entry) => Boolean(entry.fault || (entry.error && !entry.search));
+const isMarked = (entry) => Boolean(entry.fault || (entry.error && !entry.client_dialect));
 
 const searchable = (entry) => [entry.message ?? "", entry.peer, entry.hex, entry.error ?? "", entry.fault ?? "", JSON.stringify(entry.fields), JSON.stringify(entry.values)].join(" ").toLowerCase();
 
@@ -878,7 +878,7 @@ function short(value) {
 }
 
 function says(entry) {
-  if (entry.search) return `a client searches: it tried dialect ${entry.search}; this camera speaks ${state.dialect}`;
+  if (entry.client_dialect) return `a client searches: it tried dialect ${entry.client_dialect}; this camera speaks ${state.dialect}`;
   if (entry.error) return entry.error;
   const fields = Object.entries(entry.fields).map(([key, value]) => `${key} ${short(value)}`).join(", ");
   const values = entry.values === null ? "" : short(entry.values);
@@ -886,7 +886,7 @@ function says(entry) {
 }
 
 function makeRow(entry) {
-  const name = entry.search ? "search" : entry.message ?? entry.text ?? (entry.message_id === null ? "bytes" : `id 0x${entry.message_id.toString(16).padStart(2, "0")}`);
+  const name = entry.client_dialect ? "search" : entry.message ?? entry.text ?? (entry.message_id === null ? "bytes" : `id 0x${entry.message_id.toString(16).padStart(2, "0")}`);
   const opener = make("button", { type: "button", className: "opener", "aria-expanded": "false", textContent: name });
   const what = make("td", { title: says(entry) });
   if (entry.fault) what.append(make("span", { className: "mark", textContent: `${entry.fault} ` }));

@@ -26,7 +26,7 @@ const DOWN = new Set(["rate", "last", "errors"]); // the most first
 const TOTALS = { cameras: "cameras", connected: "connected", rate: "results/s", failures: "errors so far" };
 
 let socket = null;
-let wanted = { search: "", filter: "all", sort: "name", down: false }; // which rows, in which order
+let wanted = { search: "", filter: "all", sort: "name", descending: false }; // which rows, in which order
 let said = ""; // what the server was told to be in sight
 let table = { found: 0, first: 0, names: [] }; // what it has told
 let fields = new Map(); // of those rows, by name
@@ -111,7 +111,7 @@ function sight() {
   const count = Math.min(MAX_ROWS, Math.ceil(clientHeight / height()) + 2 * AHEAD);
   const first = Math.max(0, top - AHEAD);
   const before = said ? JSON.parse(said) : null;
-  const same = before && ["search", "filter", "sort", "down", "count"].every((key) => before[key] === { ...wanted, count }[key]);
+  const same = before && ["search", "filter", "sort", "descending", "count"].every((key) => before[key] === { ...wanted, count }[key]);
   if (same && Math.abs(before.first - first) < AHEAD / 2) return;
   said = JSON.stringify({ ...wanted, first, count });
   socket.send(said);
@@ -235,7 +235,7 @@ function want(changes) {
   const query = new URLSearchParams();
   if (wanted.search) query.set("search", wanted.search);
   if (wanted.filter !== "all") query.set("filter", wanted.filter);
-  if (wanted.sort !== "name" || wanted.down) query.set("sort", `${wanted.down ? "-" : ""}${wanted.sort}`);
+  if (wanted.sort !== "name" || wanted.descending) query.set("sort", `${wanted.descending ? "-" : ""}${wanted.sort}`);
   history.replaceState(null, "", String(query) ? `/?${query}` : "/");
   showWanted();
   sight();
@@ -245,29 +245,29 @@ function showWanted() {
   for (const chip of $("chips").children) chip.setAttribute("aria-pressed", String(chip.dataset.filter === wanted.filter));
   for (const head of $("heads").children) {
     if (!head.dataset.sort) continue;
-    if (head.dataset.sort === wanted.sort) head.setAttribute("aria-sort", wanted.down ? "descending" : "ascending");
+    if (head.dataset.sort === wanted.sort) head.setAttribute("aria-sort", wanted.descending ? "descending" : "ascending");
     else head.removeAttribute("aria-sort");
   }
   $("sort").value = wanted.sort;
   if (document.activeElement !== $("search")) $("search").value = wanted.search;
 }
 
-const sortBy = (key) => want(key === wanted.sort ? { down: !wanted.down } : { sort: key, down: DOWN.has(key) });
+const sortBy = (key) => want(key === wanted.sort ? { descending: !wanted.descending } : { sort: key, descending: DOWN.has(key) });
 
 function begin() {
   const query = new URLSearchParams(location.search);
   const sort = query.get("sort") ?? "name";
-  const [key, down] = [sort.replace(/^-/, ""), sort.startsWith("-")];
+  const [key, descending] = [sort.replace(/^-/, ""), sort.startsWith("-")];
   wanted.search = (query.get("search") ?? "").slice(0, 100);
   if (FILTERS[query.get("filter")]) wanted.filter = query.get("filter");
-  if (SORTS[key]) Object.assign(wanted, { sort: key, down });
+  if (SORTS[key]) Object.assign(wanted, { sort: key, descending });
   const chip = ([name, label]) => make("button", { type: "button", "data-filter": name, onclick: () => want({ filter: name }) }, label, make("b"));
   $("chips").replaceChildren(...Object.entries(FILTERS).map(chip));
   const head = ([name, label, number]) => make("div", { role: "columnheader", className: number ? "number" : "", "data-sort": name || null },
     name ? make("button", { type: "button", textContent: label, onclick: () => sortBy(name) }) : label);
   $("heads").replaceChildren(...COLUMNS.map(head));
   $("sort").replaceChildren(...Object.entries(SORTS).map(([name, label]) => make("option", { value: name, textContent: label })));
-  $("sort").addEventListener("change", () => want({ sort: $("sort").value, down: DOWN.has($("sort").value) }));
+  $("sort").addEventListener("change", () => want({ sort: $("sort").value, descending: DOWN.has($("sort").value) }));
   let pause = null;
   $("search").addEventListener("input", () => {
     clearTimeout(pause);

@@ -1,8 +1,8 @@
-// Outlets on the fleet's page: their accounts, and what the stores of results say of a shift.
+// Outlets on the fleet's page: their counts, and what the stores of results say of a shift.
 
 import { $, headers, make, setText } from "./base.js";
 
-const PERIOD_MS = 5000; // between two questions for the accounts
+const PERIOD_MS = 5000; // between two questions for the counts
 const NUMBERS = ["results", "delivered", "spooled"];
 
 const ask = async (path) => {
@@ -10,23 +10,23 @@ const ask = async (path) => {
   return answer?.ok ? answer.json() : null;
 };
 
-// Show the accounts from now on; the panel is there as soon as an agent tells of an outlet.
+// Show the counts from now on; the panel is there as soon as an agent tells of an outlet.
 export async function followOutlets() {
   $("failures").addEventListener("toggle", showFailures);
   $("since").addEventListener("change", showFailures);
   for (;;) {
     const said = document.hidden ? null : await ask("/api/outlets");
-    if (said) showAccounts(said.outlets);
+    if (said) showCounts(said.outlets);
     await new Promise((done) => setTimeout(done, PERIOD_MS));
   }
 }
 
-function showAccounts(outlets) {
+function showCounts(outlets) {
   $("outlets").hidden = !outlets.length;
-  $("accounts").replaceChildren(...outlets.map(account));
+  $("outlet-counts").replaceChildren(...outlets.map(countsRow));
 }
 
-function account(one) {
+function countsRow(one) {
   const dropped = Object.entries(one.dropped).map(([why, count]) => `${count} ${why}`);
   const numbers = NUMBERS.map((name) => cell(one[name], name));
   const cells = [cell(one.agent), cell(one.outlet), ...numbers, cell(dropped.join(", ") || "0", "dropped"), cell(one.trouble || "well")];

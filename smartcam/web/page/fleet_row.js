@@ -65,7 +65,7 @@ export class Row {
     text(this.agents, one.agents.join(", "));
     text(this.mode, `${sign} ${word}`);
     const application = one.application === null ? "" : one.application < 0 ? "application without an id" : `application ${one.application}`;
-    const when = tone === "bad" && one.mode !== "error" ? since(one.changed_at, one.changed_seen) : "";
+    const when = tone === "bad" && one.mode !== "error" ? since(one.changed_at, one.changed_at_exact) : "";
     text(this.reason, [when, one.reason || (when ? "" : application)].filter(Boolean).join(": "));
     this.reason.title = this.reason.textContent;
     text(this.rate, one.rate ? `${one.rate.toLocaleString("en")}/s` : "");
@@ -95,17 +95,17 @@ function says(last) {
 }
 
 // The outcomes of ten hours, half an hour each: how many of those with a verdict were bad.
-function trend({ shift, trend: { end, places } }, now) {
+function trend({ shift, trend: { end, characters } }, now) {
   const counts = shift.map((count, index) => `${count.toLocaleString("en")} ${["passed", "failed", "without a verdict", "errors"][index]}`);
   const svg = draw("svg", { viewBox: `0 0 ${SLOTS * SLOT} ${HIGH}`, role: "img", "aria-label": `Last ten hours: ${counts.join(", ")}` }, draw("title", {}, counts.join(", ")));
   svg.append(draw("line", { class: "rule", x1: 0, x2: SLOTS * SLOT, y1: HIGH - 0.5, y2: HIGH - 0.5 }));
   const late = Math.max(0, Math.ceil((now - end) / SLOT_S)); // places that have gone by since
-  [...places].forEach((place, index) => {
-    const x = (SLOTS - late - places.length + index) * SLOT;
-    if (place === " " || x < 0) return;
+  [...characters].forEach((character, index) => {
+    const x = (SLOTS - late - characters.length + index) * SLOT;
+    if (character === " " || x < 0) return;
     const bar = (kind, y, high) => high > 0 && svg.append(draw("rect", { class: kind, x, y, width: SLOT - 1, height: high }));
-    if (place === "-") return bar("other", HIGH / 2, HIGH / 2);
-    const bad = ((place === "X" ? 10 : Number(place)) / 10) * HIGH;
+    if (character === "-") return bar("other", HIGH / 2, HIGH / 2);
+    const bad = ((character === "X" ? 10 : Number(character)) / 10) * HIGH;
     bar("passed", bad, HIGH - bad);
     bar("failed", 0, bad);
   });

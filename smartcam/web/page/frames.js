@@ -33,9 +33,9 @@ async function look() {
 function arrange(told) {
   if (told.length !== sources.length || told.some(({ name }, index) => sources[index].title.textContent !== name)) {
     for (const one of sources) one.end();
-    sources = told.map(({ place, name }) => new Source({ name, place, path: `/api/sources/${place}/pictures`, lost: look }));
+    sources = told.map(({ index, name }) => new Source({ name, place: index, path: `/api/sources/${index}/pictures`, lost: look }));
     for (const one of sources) one.view.addEventListener("click", () => enlarge($("main").dataset.large ? null : one));
-    sources.forEach((one, place) => told[place].features && one.panel.append(new Features(`/api/sources/${place}`).panel));
+    sources.forEach((one, index) => told[index].features && one.panel.append(new Features(`/api/sources/${index}`).panel));
     $("main").replaceChildren(...sources.map((one) => one.panel));
     enlarge(null);
   }

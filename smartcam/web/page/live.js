@@ -30,7 +30,7 @@ async function ask(path, options = {}) {
   if (response.ok) return response;
   const answer = await response.json();
   if (response.status === 401) askToken(answer);
-  throw Object.assign(new Error(answer.expected ? `${answer.came}; expected ${answer.expected}` : answer.error), { status: response.status });
+  throw Object.assign(new Error(answer.expected ? `${answer.received}; expected ${answer.expected}` : answer.error), { status: response.status });
 }
 
 async function act(what, path, body) {
@@ -84,7 +84,7 @@ async function listen() {
   }
 }
 
-const TAKE = { camera: takeState, results: takeResults, account: showAccount, picture: takePicture, clock: takeClock, history: takeHistory };
+const TAKE = { camera: takeState, results: takeResults, counts: showCounts, picture: takePicture, clock: takeClock, history: takeHistory };
 
 // ---------------------------------------------------------------------- how it is
 
@@ -110,11 +110,11 @@ function takeState(value) {
     return make("li", { className: tone, "data-on": String(on), "data-bit": name, textContent: label, "aria-label": `${label}: ${on ? "set" : "not set"}` });
   });
   $("status").replaceChildren(...rows);
-  const can = state.can ?? {};
+  const can = state.capabilities ?? {};
   const facts = {
     Application: state.application < 0 ? "without an id" : (state.application ?? "not known yet"),
     Speaks: can.dialect ?? "not known yet",
-    [state.connection === "connected" ? "Connected" : "Not connected"]: since(state.changed_at, state.changed_seen),
+    [state.connection === "connected" ? "Connected" : "Not connected"]: since(state.changed_at, state.changed_at_exact),
   };
   $("facts").replaceChildren(...list(facts));
   takeUnits(state.units, showUnits);
@@ -154,7 +154,7 @@ function showAlarm() {
   if (unknown) text = `${unknown} It is asked for again.`;
   else if (!reached) text = `This page's server does not answer: ${SERVED} has ended, or the network is gone. What is shown is of before.`;
   else if (state && state.connection !== "connected") {
-    const when = since(state.changed_at, state.changed_seen);
+    const when = since(state.changed_at, state.changed_at_exact);
     const why = state.loss ? ` (${state.loss})` : "";
     const tried = state.last_error && !state.loss.includes(state.last_error) ? ` Last try: ${state.last_error.replace(/\.?$/, ".")}` : "";
     text = {
@@ -424,9 +424,9 @@ async function pictureAt(path) {
 
 $("fetch").addEventListener("click", () => act("", `${API}/picture`));
 
-// ---------------------------------------------------------------------- account and plots
+// ---------------------------------------------------------------------- counts and plots
 
-const ACCOUNT = [
+const FATES = [
   ["triggered", "answers to a trigger of ours"],
   ["streamed", "sent by itself"],
   ["late", "after its trigger had given up"],
@@ -436,11 +436,11 @@ const ACCOUNT = [
 ];
 const BESIDE = [["inspections_by_others", "triggered by others"], ["overtriggers", "overtriggered"], ["reconnects", "reconnects"], ["not_shown", "too fast for this page"]];
 
-function showAccount(account) {
-  const row = ([name, label], sign) => [make("dt", { textContent: `${sign}${label}` }), make("dd", { "data-count": name, textContent: String(account[name]) })];
-  $("account").replaceChildren(...row(["received", "received"], ""), ...ACCOUNT.flatMap((one, index) => row(one, index ? "+ " : "= ")), ...BESIDE.flatMap((one) => row(one, "")));
-  const sum = ACCOUNT.reduce((total, [name]) => total + account[name], 0);
-  setText("sum", sum === account.received ? "adds up" : `does not add up: ${sum} of ${account.received}`);
+function showCounts(counts) {
+  const row = ([name, label], sign) => [make("dt", { textContent: `${sign}${label}` }), make("dd", { "data-count": name, textContent: String(counts[name]) })];
+  $("counts").replaceChildren(...row(["received", "received"], ""), ...FATES.flatMap((one, index) => row(one, index ? "+ " : "= ")), ...BESIDE.flatMap((one) => row(one, "")));
+  const sum = FATES.reduce((total, [name]) => total + counts[name], 0);
+  setText("sum", sum === counts.received ? "adds up" : `does not add up: ${sum} of ${counts.received}`);
 }
 
 function takeClock(value) {

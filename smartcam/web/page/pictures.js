@@ -31,7 +31,7 @@ export class Source {
     this.panel = make("section", { className: "panel source", "data-place": String(place), "data-state": "wait", "aria-label": name },
       make("div", { className: "head" }, this.title, this.state), this.view, this.why, make("dl", { className: "counts" }, ...list));
     this.last = null; // the last picture: its age when it was sent, and when that came
-    this.accounts = []; // of the last seconds
+    this.recent = []; // of the last seconds
     this.socket = null;
     this.pause = 300;
     this.retry = 0;
@@ -68,7 +68,7 @@ export class Source {
   connect() {
     if (this.socket || !this.wanted) return;
     clearTimeout(this.retry);
-    this.accounts = [];
+    this.recent = [];
     const protocols = ["smartcam.frames", ...(token() ? [`bearer.${token()}`] : [])];
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${this.path}`, protocols);
     socket.binaryType = "arraybuffer";
@@ -97,7 +97,7 @@ export class Source {
 
   told(state, text) {
     this.panel.dataset.state = state;
-    this.state.textContent = { live: "live", waiting: "waiting for a frame", awaited: "awaited", lost: "lost", ended: "ended", wait: "connecting" }[state];
+    this.state.textContent = { live: "live", no_frame_yet: "waiting for a frame", not_open: "not open", lost: "lost", ended: "ended", wait: "connecting" }[state];
     if (this.why.textContent !== text) this.why.textContent = text;
     if (state !== "live") for (const key of ["shown", "camera"]) this.count(key, "-");
     this.age();
@@ -111,18 +111,18 @@ export class Source {
   hear(value) {
     this.pause = 300;
     if (value.state) {
-      this.accounts = [];
+      this.recent = [];
       this.told(value.state, value.text ?? "");
       if (value.format) this.count("format", value.format);
     }
-    if (value.account) this.account(value.account);
+    if (value.counts) this.takeCounts(value.counts);
     if (value.bad) this.why.textContent = `A frame cannot be shown: ${value.bad}`;
   }
 
   async show(socket, data, came) {
     this.pause = 300;
     const length = new DataView(data).getUint32(0, true);
-    const { frame, account } = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+    const { frame, counts } = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
     try {
       const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, 4 + length)], { type: "image/jpeg" }));
       if (this.socket !== socket) return bitmap.close();
@@ -142,21 +142,21 @@ export class Source {
     this.count("number", String(frame.sequence));
     this.count("format", `${frame.format} ${frame.width}x${frame.height}`);
     this.counts.age.title = `since the ${frame.moment}`;
-    this.account(account);
+    this.takeCounts(counts);
     this.age();
   }
 
-  account(account) {
-    this.accounts.push(account);
-    while (this.accounts.length > 2 && account.at - this.accounts[0].at > WINDOW_S) this.accounts.shift();
-    const [first] = this.accounts;
-    const seconds = account.at - first.at;
+  takeCounts(counts) {
+    this.recent.push(counts);
+    while (this.recent.length > 2 && counts.at - this.recent[0].at > WINDOW_S) this.recent.shift();
+    const [first] = this.recent;
+    const seconds = counts.at - first.at;
     for (const [key, name] of [["shown", "delivered"], ["camera", "offered"]]) {
-      if (seconds > 0) this.count(key, `${((account[name] - first[name]) / seconds).toFixed(1)}/s`);
+      if (seconds > 0) this.count(key, `${((counts[name] - first[name]) / seconds).toFixed(1)}/s`);
     }
-    this.count("skipped", String(account.skipped));
-    this.count("lost", account.bad ? `${account.lost}, ${account.bad} not readable` : String(account.lost));
-    this.counts.lost.classList.toggle("warn", account.lost + account.bad > 0);
+    this.count("skipped", String(counts.skipped));
+    this.count("lost", counts.bad ? `${counts.lost}, ${counts.bad} not readable` : String(counts.lost));
+    this.counts.lost.classList.toggle("warn", counts.lost + counts.bad > 0);
   }
 
   count(key, text) {
@@ -174,7 +174,7 @@ export class Source {
 
   // Seconds between two frames of the camera, as far as they were counted.
   interval() {
-    const [first, last] = [this.accounts[0], this.accounts.at(-1)];
+    const [first, last] = [this.recent[0], this.recent.at(-1)];
     const count = last ? last.offered - first.offered : 0;
     return count ? (last.at - first.at) / count : 0;
   }

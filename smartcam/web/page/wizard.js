@@ -37,7 +37,7 @@ async function call(method, path, body) {
 }
 
 function showGate(answer) {
-  $("gate-error").textContent = token ? `Refused: ${answer.came}` : "";
+  $("gate-error").textContent = token ? `Refused: ${answer.received}` : "";
   $("main").hidden = true;
   $("gate").hidden = false;
 }
