@@ -11,7 +11,7 @@ FAIL_WORDS = frozenset(
 NOT_WORDS = frozenset({"not", "no"})
 
 
-def meaning(name: str) -> bool | None:
+def good_value_of(name: str) -> bool | None:
     """Return the good value of a truth field, judged by its name; None if the name is unclear.
 
     ``ok`` is good when true, ``defect`` and ``not_ok`` when false. ``present`` may be either.

@@ -250,7 +250,8 @@ def _tolerance_text(
     values: Array, spread: float, guard: float, old: Tolerance | None, unit: str
 ) -> str:
     """Return the text of a tolerance for values (N,), one-sided if the old tolerance is."""
-    mean, one_sided = float(values.mean()), old is not None and math.inf in (-old.least, old.most)
+    mean = float(values.mean())
+    one_sided = old is not None and math.inf in (-old.min_value, old.max_value)
     sigma_width = _tolerance_factor(len(values), one_sided=one_sided) * spread
     half = max(sigma_width, float(np.abs(values - mean).max())) + guard
     digits = min(max(1 - math.floor(math.log10(half)), 0), MAX_DIGITS) if half > 0 else 3
@@ -259,7 +260,7 @@ def _tolerance_text(
     def round_outwards(value: float) -> float:
         return (math.floor(value / step) + 1) * step
 
-    if one_sided and old is not None and old.least == -math.inf:
+    if one_sided and old is not None and old.min_value == -math.inf:
         return f"at most {round_outwards(mean + half):.{digits}f} {unit}"
     if one_sided:
         return f"at least {-round_outwards(-(mean - half)):.{digits}f} {unit}"

@@ -64,9 +64,9 @@ class Picture:
                 f"picture: expected 1 to {MAX_SIDE_PX} pixels along each side, "
                 f"got {width} x {height}"
             )
-        most = 8 * pixels.dtype.itemsize
+        max_depth = 8 * pixels.dtype.itemsize
         self.depth: int = (
-            most if depth is None else check_integer(depth, "depth", 1, most, "Picture")
+            max_depth if depth is None else check_integer(depth, "depth", 1, max_depth, "Picture")
         )
         if frame is not None:
             check_kind(frame, Frame, "frame", "a Frame, or None", "Picture")
@@ -195,8 +195,8 @@ def _saturation_levels(levels: NDArray[Any], depth: int) -> tuple[int, int]:
     """Return the saturation levels of samples of ``depth`` bits."""
     top, step = 2**depth - 1, 2 ** (depth - 8) if depth >= 8 else 0
     black, white = LIMITED_BLACK * step, LIMITED_WHITE * step
-    least, most = int(levels.min()), int(levels.max())
-    return (black if least == black else 0), (white if step and most == white else top)
+    darkest, brightest = int(levels.min()), int(levels.max())
+    return (black if darkest == black else 0), (white if step and brightest == white else top)
 
 
 def _eight_bits(pixels: NDArray[Any], depth: int) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._file_values import matches_any
-from smartcam._meanings import meaning
+from smartcam._meanings import good_value_of
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets._database import open_for_reading
 
@@ -129,7 +129,7 @@ def _failure_condition(database: sqlite3.Connection) -> str:
     for application, name, column in database.execute(
         "SELECT application, name, column_name FROM fields WHERE type = 'bool'"
     ):
-        good_value = meaning(name)
+        good_value = good_value_of(name)
         if good_value is not None:
             quoted = column.replace('"', '""')
             conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good_value)}')

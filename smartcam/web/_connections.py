@@ -149,8 +149,8 @@ class SiteConnection(asyncio.Protocol):
                 self._acceptor.set_time_limit(self, HEAD_TIMEOUT, "no end of a body")
 
     @contextlib.contextmanager
-    def answering(self) -> Iterator[None]:
-        """Keep the connection from being closed for another one, while the block answers."""
+    def running_handler(self) -> Iterator[None]:
+        """Keep the connection from being closed for another one while a handler runs."""
         self.keeps_place = True
         try:
             yield
@@ -158,9 +158,9 @@ class SiteConnection(asyncio.Protocol):
             self.keeps_place = False
             self._acceptor.restart_idle_time(self)
 
-    def close_for(self, why: str) -> None:
+    def close_for(self, reason: str) -> None:
         """Close the connection at once."""
-        _log.info("= %s: connection closed: %s", self._peer, why)
+        _log.info("= %s: connection closed: %s", self._peer, reason)
         self._acceptor.leave(self)
         self._transport.abort()
 

@@ -186,7 +186,7 @@ def _middleware(names: Collection[str] | None) -> Any:
         with contextlib.ExitStack() as stack:
             if connection is not None:
                 stack.enter_context(connection.serving_request(request))
-                stack.enter_context(connection.answering())
+                stack.enter_context(connection.running_handler())
             response = await _answer(request, handler, names)
         if not request.content.is_eof():
             response.force_close()

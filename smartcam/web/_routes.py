@@ -89,7 +89,7 @@ class _Call(Generic[C]):
             body=await self._read_body(request),
         )
         connection = connection_of(request)
-        with contextlib.nullcontext() if connection is None else connection.answering():
+        with contextlib.nullcontext() if connection is None else connection.running_handler():
             value = self.handler(site, call)
             if inspect.isawaitable(value):
                 value = await value

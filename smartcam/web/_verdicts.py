@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any, Final, Literal, TypeAlias
 
-from smartcam._meanings import meaning
+from smartcam._meanings import good_value_of
 from smartcam.models import Localization, jsonable
 
 MAX_JUDGED: Final = 200
@@ -39,7 +39,7 @@ def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
     return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
 
 
-_good_value_of = functools.lru_cache(maxsize=4096)(meaning)
+_good_value_of = functools.lru_cache(maxsize=4096)(good_value_of)
 
 
 def outcome_of(value: Any) -> Outcome:

@@ -36,7 +36,7 @@ from smartcam.inspection._measure.tolerances import Tolerance
 )
 def test_tolerance_is_read(text: str, least: float, most: float, unit: str) -> None:
     found = Tolerance.parse(text)
-    assert (found.least, found.most) == pytest.approx((least, most))
+    assert (found.min_value, found.max_value) == pytest.approx((least, most))
     assert found.unit == unit
 
 
@@ -133,7 +133,7 @@ def test_other_good_parts_are_inside_in_as_many_lessons_as_promised(number: int)
         if "tolerance" not in found.tools["measure"]:
             continue  # one of five was left out
         limits = tolerance(found)
-        inside = [math.erf(one / math.sqrt(2)) / 2 for one in (limits.least, limits.most)]
+        inside = [math.erf(one / math.sqrt(2)) / 2 for one in (limits.min_value, limits.max_value)]
         shares.append(inside[1] - inside[0] >= TOLERANCE_COVERAGE)
     assert len(shares) >= 0.95 * lessons
     assert sum(shares) >= 0.91 * len(shares)  # 95 % are promised, give or take 1.5 %
@@ -144,7 +144,7 @@ def test_a_value_far_from_the_others_is_left_out_and_named() -> None:
     found = lesson(values)
     limits = tolerance(found)
     assert limits.complaint(99.0, SIGMA, 2.0)
-    assert limits.most < 93
+    assert limits.max_value < 93
     assert found.remarks[0].endswith(
         "Not learned from: part14.png (no edge), part13.png (99 px is far from the others)."
     )
@@ -173,21 +173,21 @@ def test_form_and_unit_of_a_tolerance_are_kept(before: str | None, form: str, un
     limits = tolerance(found)
     assert limits.text.startswith(form)
     assert limits.text.endswith(unit)
-    assert (form == "") == math.isfinite(limits.most - limits.least)
+    assert (form == "") == math.isfinite(limits.max_value - limits.min_value)
     assert all(limits.complaint(one, SIGMA, 2.0) == "" for one in values)
 
 
 def test_directions_on_both_sides_of_a_half_turn_are_near_each_other() -> None:
     values = [179.9, -179.9, 179.95, -179.95, 180.0, -179.98]
     limits = tolerance(lesson(values, unit="deg"))
-    assert limits.most - limits.least < 3
+    assert limits.max_value - limits.min_value < 3
     assert all(limits.complaint(one, SIGMA, 2.0) == "" for one in values)
 
 
 def test_equal_pictures_get_a_tolerance_for_the_measuring_error() -> None:
     limits = tolerance(lesson([92.4] * 6))
     assert limits.complaint(92.4, SIGMA, 2.0) == ""
-    assert 0.02 < limits.most - 92.4 < 0.1
+    assert 0.02 < limits.max_value - 92.4 < 0.1
 
 
 def test_a_tool_that_was_not_asked_teaches_nothing() -> None:

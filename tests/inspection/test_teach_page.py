@@ -137,7 +137,7 @@ async def test_a_way_is_drawn_and_a_measured_tolerance_is_learned(
         await see(page, "#saved", "Saved in")
     assert (await asyncio.to_thread(path.read_text)).endswith(" # plates\n")
     tolerance = load_cell(path)["cam"].programs[8].steps[0].tool.settings.tolerance
-    assert 119 < tolerance.least < 120 < tolerance.most < 121
+    assert 119 < tolerance.min_value < 120 < tolerance.max_value < 121
 
 
 async def test_wrong_setting_is_reported_beside_it_and_not_saved(page: Page, path: Path) -> None:

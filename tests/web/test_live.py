@@ -12,7 +12,7 @@ import aiohttp
 import pytest
 
 import smartcam
-from smartcam._meanings import meaning
+from smartcam._meanings import good_value_of
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight
 from smartcam.fleet import FleetFile
 from smartcam.layout import Layout
@@ -282,7 +282,7 @@ def test_parts_are_reported_in_the_plane_and_bounded() -> None:
     ],
 )
 def test_what_is_good_is_judged_by_the_name(name: str, good: bool | None) -> None:
-    assert meaning(name) is good
+    assert good_value_of(name) is good
 
 
 def test_verdict_of_records_counts() -> None:

@@ -101,14 +101,14 @@ def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Sy
             continue
         centre = _find_centre(segments, count or MAX_FOLD)
         centred_shares = _matching_shares(points - centre, normals)
-        least = _min_share(centred_shares, count)
-        if least >= MIN_SAME_SHARE:
+        min_share = _min_share(centred_shares, count)
+        if min_share >= MIN_SAME_SHARE:
             return Symmetry(
                 count, _find_alike_turns(centred_shares, count) if count else ()
             ), centre
-        if least > best_share and count:
+        if min_share > best_share and count:
             x, y = centre.tolist()
-            best, best_share = Symmetry(1, _find_alike_turns(centred_shares, 1), (x, y)), least
+            best, best_share = Symmetry(1, _find_alike_turns(centred_shares, 1), (x, y)), min_share
     return best, np.zeros(2)
 
 

@@ -241,7 +241,7 @@ class MeasureSettings(ToolSettings):
             if is_angle != (self.tolerance.unit == "deg"):
                 expected = "deg" if is_angle else "a unit of length or px"
                 raise ValueError(f"tolerance: expected {expected}, got {self.tolerance.text!r}")
-            one_sided = math.inf in (-self.tolerance.least, self.tolerance.most)
+            one_sided = math.inf in (-self.tolerance.min_value, self.tolerance.max_value)
             if given[0] == "line" and one_sided:
                 raise ValueError(
                     "tolerance: expected both limits of a direction, such as '-5 to 5 deg', "

@@ -161,7 +161,7 @@ def _best_start(pixels: StripPixels, places: Array, starts: Sequence[float | Arr
     """Return start values (N, M): the blur of ``starts`` that fits best, and fitted heights."""
     strip_count, step_count = places.shape
     best = np.zeros((strip_count, 2 * step_count + 3))
-    least_cost = np.full(strip_count, np.inf)
+    min_cost = np.full(strip_count, np.inf)
     for blur in starts:
         values = np.zeros_like(best)
         values[:, :step_count], values[:, step_count + 1] = places, blur
@@ -171,8 +171,8 @@ def _best_start(pixels: StripPixels, places: Array, starts: Sequence[float | Arr
         solution = np.linalg.solve(hessian[:, linear, linear] + ridge, gradient[:, linear, None])
         values[:, linear] = solution[:, :, 0]
         cost = cost - np.einsum("nm,nm->n", gradient[:, linear], solution[:, :, 0])
-        better = cost < least_cost
-        best[better], least_cost[better] = values[better], cost[better]
+        better = cost < min_cost
+        best[better], min_cost[better] = values[better], cost[better]
     return best
 
 

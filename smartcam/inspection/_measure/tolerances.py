@@ -43,14 +43,14 @@ class Tolerance(NamedTuple):
     """The limits of a value.
 
     Attributes:
-        least: smallest good value; minus infinity: no limit.
-        most: largest good value; infinity: no limit.
+        min_value: smallest good value; minus infinity: no limit.
+        max_value: largest good value; infinity: no limit.
         unit: unit of the limits: ``mm``, ``px`` or ``deg``.
         text: original text.
     """
 
-    least: float
-    most: float
+    min_value: float
+    max_value: float
     unit: str
     text: str
 
@@ -69,14 +69,14 @@ class Tolerance(NamedTuple):
         for form, pattern in _FORMS:
             match = pattern.fullmatch(body.strip())
             if match is not None:
-                least, most = _limits(form, match)
+                low, high = _limits(form, match)
                 break
         else:
             raise ConfigurationError(f"{EXPECTED}; got {plain!r}")
-        if not least <= most:
+        if not low <= high:
             raise ConfigurationError(f"tolerance: expected the smaller limit first, got {plain!r}")
         name, factor = UNITS[unit]
-        return cls(least * factor, most * factor, name, plain)
+        return cls(low * factor, high * factor, name, plain)
 
     @property
     def written_unit(self) -> str:
@@ -89,17 +89,17 @@ class Tolerance(NamedTuple):
         The value must be inside the limits by ``guard`` times its sigma; nearer to a limit, the
         true value may be outside. Degrees are compared modulo 360.
         """
-        if self.unit == "deg" and all(map(math.isfinite, (self.least, self.most, value))):
-            middle = (self.least + self.most) / 2
+        if self.unit == "deg" and all(map(math.isfinite, (self.min_value, self.max_value, value))):
+            middle = (self.min_value + self.max_value) / 2
             value = middle + math.remainder(value - middle, 360.0)
         digits = digits_of(sigma)
         shown = f"{value:.{digits}f} {self.unit}"
-        if value > self.most:
-            return f"{shown} is above {self.most:.{digits}f} {self.unit}"
-        if value < self.least:
-            return f"{shown} is below {self.least:.{digits}f} {self.unit}"
+        if value > self.max_value:
+            return f"{shown} is above {self.max_value:.{digits}f} {self.unit}"
+        if value < self.min_value:
+            return f"{shown} is below {self.min_value:.{digits}f} {self.unit}"
         # also true for NaN
-        if not min(self.most - value, value - self.least) >= guard * sigma:
+        if not min(self.max_value - value, value - self.min_value) >= guard * sigma:
             return f"{shown} is too near to the limit: sigma is {sigma:.2g} {self.unit}"
         return ""
 
