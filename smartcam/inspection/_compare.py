@@ -91,9 +91,7 @@ class Compare(Tool[CompareSettings]):
         self._taught = Picture.read(setup.folder / settings.taught).grey
         height, width = self._taught.shape
         if region is None and settings.follow is not None:
-            raise ConfigurationError(
-                "expected a region [x, y, width, height], relative to the part that it follows"
-            )
+            raise ConfigurationError("expected a region [x, y, width, height] of the followed part")
         if region is not None:
             (x1, y1), (x2, y2) = np.min(region, axis=0), np.max(region, axis=0)
             if len(region) != 4 or {*region} != {(x1, y1), (x2, y1), (x2, y2), (x1, y2)}:

@@ -8,14 +8,14 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.inspection._camera.judged_frames import judged_source
-    from smartcam.inspection._camera.pairing import ResultPictures
+    from smartcam.inspection._camera.pairing import PictureFinder
     from smartcam.inspection._cell import CellCamera, SoftwareEntry, make_camera, software_mistakes
     from smartcam.inspection._learning import learn_tolerances
     from smartcam.inspection._teaching import Teaching, read_settings, setting_text, tool_settings
 
 __all__ = [
     "CellCamera",
-    "ResultPictures",
+    "PictureFinder",
     "SoftwareEntry",
     "Teaching",
     "judged_source",
@@ -33,7 +33,7 @@ if not TYPE_CHECKING:
         {
             "_cell": "software_mistakes make_camera SoftwareEntry CellCamera",
             "_camera.judged_frames": "judged_source",
-            "_camera.pairing": "ResultPictures",
+            "_camera.pairing": "PictureFinder",
             "_learning": "learn_tolerances",
             "_teaching": "Teaching read_settings setting_text tool_settings",
         },

@@ -124,7 +124,7 @@ def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
     )
     spots = [finding.records or (finding.values,) for finding in findings]  # of each picture
     areas = [float(spot["area"]) for spot in itertools.chain(*spots) if spot.get("area")]
-    if areas and all(len(found) >= count for found, count in zip(spots, counts, strict=True)):
+    if areas and all(len(listed) >= count for listed, count in zip(spots, counts, strict=True)):
         min_area, max_area = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)
         tolerances["area"] = [max(1, math.floor(min_area)), math.ceil(max_area)]
         remark += (

@@ -294,7 +294,7 @@ def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
         "seed": scene.seed,
         "y_down": scene.y_down,
         "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
-        "table_applications": [one.id for one in applications if _uses_table(one)],
+        "table_applications": [row.id for row in applications if _uses_table(row)],
         "reported": _reported(emulator, scene),
     }
 

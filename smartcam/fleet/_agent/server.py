@@ -411,13 +411,13 @@ class FleetServer(Server):
         camera = await asyncio.to_thread(software_camera, planned.name, entry, folder)
         with from_part("inspection", '"software:" in a fleet file needs'):
             from smartcam.inspection import SoftwareDevice
-            from smartcam.inspection._inside import ResultPictures, judged_source
+            from smartcam.inspection._inside import PictureFinder, judged_source
         device = SoftwareDevice(camera)
         await stack.enter_async_context(device)
         drawn = bool(entry.get("drawn", True))
         make = functools.partial(judged_source, device.inspector, drawn=drawn)
         observers = Observers(self.observers)
-        reporter = ResultPictures(
+        reporter = PictureFinder(
             device.last_sent,
             lambda: self._hosts[planned.name].camera.statistics().received,
             lambda result, judged: observers.picture(result, judged.frame_with_drawings),

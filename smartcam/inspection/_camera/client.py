@@ -17,7 +17,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.inspection._camera.device import SoftwareDevice
-from smartcam.inspection._camera.pairing import MAX_PICTURES_KEPT, ResultPictures
+from smartcam.inspection._camera.pairing import MAX_PICTURES_KEPT, PictureFinder
 from smartcam.inspection._camera.pictures import png_of
 from smartcam.inspection._cell import load_cell
 from smartcam.models import Capabilities, Result, ValueT
@@ -68,7 +68,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         }
         emulator = self._device.emulator
         address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)
-        self._pairs = ResultPictures(
+        self._pairs = PictureFinder(
             self._device.last_sent, lambda: self.statistics().received, self._report_picture
         )
         self._device.inspector.viewers.add(self._pairs.record_picture)
@@ -175,12 +175,10 @@ class SoftwareCamera(SmartCamera[ValueT]):
             raise UnsupportedError(f"{self.name}: no picture was judged yet: trigger first")
         return await self._encode_png(inspected, timeout, drawn=drawn)
 
-    async def _encode_png(
-        self, inspected: InspectedPicture, timeout: float, *, drawn: bool
-    ) -> bytes:
+    async def _encode_png(self, picture: InspectedPicture, timeout: float, *, drawn: bool) -> bytes:
         try:
             async with asyncio.timeout(timeout):
-                return await asyncio.to_thread(png_of, inspected, drawn=drawn)
+                return await asyncio.to_thread(png_of, picture, drawn=drawn)
         except TimeoutError:
             raise ResponseTimeoutError(
                 f"{self.name}: the picture was not made within {timeout:g} s", waited=timeout

@@ -30,7 +30,7 @@ class _SentContainer(NamedTuple):
     picture: InspectedPicture
 
 
-class ResultPictures(Observer):
+class PictureFinder(Observer):
     """Find the picture of each result that a client gets from a device in this process.
 
     All containers of a session arrive, in order. So device and client both count them, and a result

@@ -81,9 +81,7 @@ class TaughtEdges(NamedTuple):
     """The edges of a picture as segments."""
 
     segments: Segments  # places in pixels of the picture
-    exact: NDArray[
-        np.bool_
-    ]  # (N,), mask of segments whose place is measured to a fraction of a pixel
+    exact: NDArray[np.bool_]  # (N,), whether the place is measured to a fraction of a pixel
     points: Array  # (M, 2), all edge pixels
 
 

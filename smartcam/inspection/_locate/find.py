@@ -243,9 +243,8 @@ class _SearchedPicture:
             search.min_score,
             model.symmetry.fold != 0,
         )
-        return fit_pose(
-            self._grey_values, model.segments, model.bands_at(start.scale), start, settings
-        )
+        bands = model.bands_at(start.scale)
+        return fit_pose(self._grey_values, model.segments, bands, start, settings)
 
     def _judge_candidate(
         self,

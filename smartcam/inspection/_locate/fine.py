@@ -171,15 +171,8 @@ def fit_pose(
         fit, blurs = _fit_bands(pixels, segments, shape, extra_variance, first_blur)
         rows, weights, _, _ = _linearize((fit, blurs), segments, shape.pose, settings, iteration)
         fits_changes = iteration >= FIRST_CHANGES_ITERATION
-        free = np.array(
-            [
-                True,
-                True,
-                settings.fits_angle,
-                settings.fits_any_scale or fits_changes,
-                *[fits_changes] * 3,
-            ]
-        )
+        fits_scale = settings.fits_any_scale or fits_changes
+        free = np.array([True, True, settings.fits_angle, fits_scale, *[fits_changes] * 3])
         solved = _solve(
             (rows, fit.shifts, weights), free, expected.deviations(shape), expected.sigmas
         )
@@ -233,9 +226,8 @@ def _pixel_coordinates(
     across, along = segments.coordinates_of(pose.from_picture(pixels.points), pixels.owners)
     blurs = segments.blurs * pose.scale
     blurs = np.sqrt(np.maximum(blurs**2 + extra_variance, MIN_BLUR_PX**2))
-    shifts = pose.scale * segments.blur_shift(extra_variance / pose.scale**2) + shape.offsets(
-        segments
-    )
+    shifts = pose.scale * segments.blur_shift(extra_variance / pose.scale**2)
+    shifts += shape.offsets(segments)
     return (pose.scale * across - shifts[pixels.owners], pose.scale * along), blurs
 
 

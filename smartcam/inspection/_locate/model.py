@@ -519,8 +519,7 @@ def _visible_at(
         magnitude = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
         alike = (gradient * segments.normals).sum(axis=1) / magnitude >= MIN_DIRECTION_COSINE
         is_visible |= alike & (magnitude >= MIN_PYRAMID_RESPONSE * segments.heights)
-    pixels = np.rint(level_places).astype(int)
-    _, first = np.unique(pixels @ [1, 1 << 20], return_index=True)
+    _, first = np.unique(np.rint(level_places).astype(int) @ [1, 1 << 20], return_index=True)
     is_first = np.zeros(len(level_places), dtype=np.bool_)
     is_first[first] = True
     return np.flatnonzero(is_visible & is_first)
@@ -534,8 +533,8 @@ Component = Annotated[float, Field(allow_inf_nan=False, ge=-1.001, le=1.001)]
 Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=20)]
 Height = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
 Row = tuple[Place, Place, Component, Component, Component, Length, Height, Length, Length]
-BlurShift = Annotated[float, Field(allow_inf_nan=False, ge=-2, le=2)]
-BlurShifts = Annotated[list[BlurShift], Field(min_length=len(BLURS_PX2), max_length=len(BLURS_PX2))]
+Shift = Annotated[float, Field(allow_inf_nan=False, ge=-2, le=2)]
+Shifts = Annotated[list[Shift], Field(min_length=len(BLURS_PX2), max_length=len(BLURS_PX2))]
 
 
 class _ModelFile(BaseModel):
@@ -555,9 +554,7 @@ class _ModelFile(BaseModel):
     alike: Annotated[list[tuple[Number, Number]], Field(max_length=100)]
     symmetry_centre: tuple[Number, Number]
     segments: Annotated[list[Row], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
-    blur_shifts: Annotated[
-        list[BlurShifts], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)
-    ]
+    blur_shifts: Annotated[list[Shifts], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
     levels: Annotated[list[list[Annotated[int, Field(ge=0)]]], Field(min_length=1, max_length=20)]
     outline: Annotated[list[tuple[Place, Place]], Field(min_length=3, max_length=1_000_000)]
 

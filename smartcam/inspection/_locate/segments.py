@@ -83,9 +83,8 @@ class Segments(NamedTuple):
         known_shifts = np.column_stack([np.zeros(len(self.blur_shifts)), self.blur_shifts])
         low, high = (0.0, *BLURS_PX2)[index : index + 2]
         fraction = (extra - low) / (high - low)
-        shift: Array = (1 - fraction) * known_shifts[:, index] + fraction * known_shifts[
-            :, index + 1
-        ]
+        low_shift, high_shift = known_shifts[:, index : index + 2].T
+        shift: Array = (1 - fraction) * low_shift + fraction * high_shift
         return shift
 
     def coordinates_of(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:

@@ -84,31 +84,26 @@ class CodeSearch(NamedTuple):
 
 
 def read_again(
-    search: CodeSearch,
-    codes_read: Sequence[ReadCode],
-    min_count: int,
-    deadline: float,
-    first_duration: float,
+    search: CodeSearch, codes_read: Sequence[ReadCode], count: int, deadline: float, duration: float
 ) -> list[ReadCode]:
     """Try rungs until enough codes are read; return ``codes_read`` and the additional codes.
 
     Args:
         search: the picture and the wanted codes.
         codes_read: codes that the first reading has found.
-        min_count: number of codes that is enough.
+        count: number of codes that is enough.
         deadline: time of ``time.monotonic()`` at which this function must end; rungs that would
             probably take longer are skipped.
-        first_duration: duration of the first reading, seconds, from which a rung's is estimated.
+        duration: duration of the first reading, seconds, from which a rung's is estimated.
     """
     grey = search.grey
     codes = list(codes_read)
     unconfirmed: list[ReadCode] = []
     for rung in RUNGS:
-        if len(codes) >= min_count:
+        if len(codes) >= count:
             break
         cost = max(rung.scale**2, 1.0)
-        expected_end = time.monotonic() + cost * first_duration
-        if cost * grey.size > MAX_RUNG_PIXELS or expected_end > deadline:
+        if cost * grey.size > MAX_RUNG_PIXELS or time.monotonic() + cost * duration > deadline:
             continue
         codes_in_smaller: list[ReadCode] | None = None
         for code in _read_with_rung(rung, search):

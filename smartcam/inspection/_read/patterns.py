@@ -45,9 +45,7 @@ class TextPattern:
         try:
             self._compiled = regex.compile(pattern)
         except (regex.error, RecursionError, OverflowError, MemoryError) as exc:
-            raise PatternError(
-                f"expected a regular expression, or 'input' (the trigger's): {exc}"
-            ) from exc
+            raise PatternError(f"expected a regular expression, or 'input': {exc}") from exc
 
     def fits(self, text: str) -> bool:
         """Return True if the whole text matches the pattern.

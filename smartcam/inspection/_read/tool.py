@@ -50,8 +50,7 @@ class ReadSettings(ToolSettings):
     expect: Annotated[str | None, AfterValidator(_check_pattern)] = Field(
         None,
         max_length=1000,
-        description="expected text: a regular expression, or the word input: the text of the "
-        "trigger's input",
+        description="expected text: a regular expression, or the word input: the trigger's input",
     )
     most: int = Field(1, ge=1, le=MAX_CODES, description="largest number of codes in the result")
     least: int = Field(1, ge=0, le=MAX_CODES, description="least number of codes")
@@ -77,9 +76,7 @@ class ReadTool(Tool[ReadSettings]):
     def __init__(self, settings: ReadSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
         if settings.least > settings.most:
-            raise ConfigurationError(
-                f"least: expected up to {settings.most} (most), got {settings.least}"
-            )
+            raise ConfigurationError(f"least: expected up to {settings.most}, as most is")
         try:
             self._formats = formats_of(settings.codes)
         except ValueError as exc:
