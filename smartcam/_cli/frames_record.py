@@ -171,9 +171,9 @@ async def _close_and_report(
 
     await asyncio.to_thread(recorder.close)
     if isinstance(recorder, RotatingRecorder):
-        for name, account in recorder.accounts.items():
-            value = {"camera": name, "pictures": account.written, "left_out": account.lost}
-            _show_account(
+        for name, each in recorder.counts.items():
+            value = {"camera": name, "pictures": each.written, "left_out": each.lost}
+            _show_counts(
                 f"{recorder.path}: {name}", {"file": str(recorder.path), **value}, lost, options
             )
         return
@@ -184,10 +184,10 @@ async def _close_and_report(
     for path in recorder.files:
         size = path.stat().st_size
         value = {"pictures": counts.pictures, "left_out": counts.left_out, "bytes": size}
-        _show_account(str(path), {"file": str(path), **value}, lost, options)
+        _show_counts(str(path), {"file": str(path), **value}, lost, options)
 
 
-def _show_account(label: str, value: dict[str, Any], lost: int, options: Options) -> None:
+def _show_counts(label: str, value: dict[str, Any], lost: int, options: Options) -> None:
     value["lost"] = lost
     counts = f"pictures {value['pictures']}, left out {value['left_out']}, lost {lost}"
     size = f"; {value['bytes']} bytes" if "bytes" in value else ""

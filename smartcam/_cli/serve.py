@@ -285,7 +285,7 @@ def _make_recorder(server: FleetServer, options: Options, as_lines: bool) -> Fle
     from smartcam.recording import FleetRecorder
 
     def show_trouble(trouble: RecordingError | None) -> None:
-        lost = {name: account.lost for name, account in recorder.accounts.items() if account.lost}
+        lost = {name: counts.lost for name, counts in recorder.counts.items() if counts.lost}
         value = {
             "recordings": str(recorder.path),
             "recording": trouble is None,

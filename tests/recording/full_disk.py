@@ -47,7 +47,7 @@ async def main(folder: Path) -> dict[str, Any]:
         agent = server(folder, box.url)
         recorder = FleetRecorder(agent, section(size=1e6))
         async with recorder, agent:
-            await until(lambda: NAME in recorder.accounts and recorder.accounts[NAME].written > 500)
+            await until(lambda: NAME in recorder.counts and recorder.counts[NAME].written > 500)
             received = agent.hosts[NAME].results.following
             ballast = folder / "rec" / "ballast"
             fill(ballast)
@@ -57,15 +57,15 @@ async def main(folder: Path) -> dict[str, Any]:
             at_full = [load_recording(path).counts.results for path in files(folder)]
             ballast.unlink()
             await until(lambda: recorder.trouble is None)
-            healed = recorder.accounts[NAME].written
-            await until(lambda: recorder.accounts[NAME].written > healed + 500)
-            account = recorder.accounts[NAME]
-        account = recorder.accounts[NAME]
+            healed = recorder.counts[NAME].written
+            await until(lambda: recorder.counts[NAME].written > healed + 500)
+            counts = recorder.counts[NAME]
+        counts = recorder.counts[NAME]
         whole = load_recording(folder / "rec")
         return {
             "told": told,
             "lines": lines,
-            "account": account._asdict(),
+            "recorder_counts": counts._asdict(),
             "runs": runs(whole),
             "gaps": [one.records for one in whole.errors() if one.error == GAP],
             "counts": sum(whole.counts),

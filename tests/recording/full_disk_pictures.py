@@ -28,18 +28,18 @@ async def main(folder: Path) -> dict[str, Any]:
     with recorder:
         async with smartcam.frames.open("synthetic://?fps=20") as source:
             recording = asyncio.create_task(recorder.record(source, camera="left"))
-            await until(lambda: "left" in recorder.accounts and recorder.accounts["left"].written)
+            await until(lambda: "left" in recorder.counts and recorder.counts["left"].written)
             fill(ballast)
-            await until(lambda: told and recorder.accounts["left"].lost > 20)
+            await until(lambda: told and recorder.counts["left"].lost > 20)
             ballast.unlink()
             await until(lambda: len(told) == 2)
-            before = recorder.accounts["left"].written
-            await until(lambda: recorder.accounts["left"].written > before + 5)
+            before = recorder.counts["left"].written
+            await until(lambda: recorder.counts["left"].written > before + 5)
             recording.cancel()
             await asyncio.wait([recording])
     async with smartcam.frames.open(f"{folder}#pace=none") as again:
         seen = [(frame.sequence, frame.lost) async for frame in again]
-    return {"told": told, "account": recorder.accounts["left"]._asdict(), "seen": seen}
+    return {"told": told, "counts": recorder.counts["left"]._asdict(), "seen": seen}
 
 
 if __name__ == "__main__":

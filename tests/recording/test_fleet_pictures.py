@@ -94,7 +94,7 @@ async def test_each_result_has_the_first_picture_of_its_trigger(
             for _ in range(8):
                 await camera.trigger()
             await until(lambda: device.given[-1].utc > device.given[0].utc + 0.1)
-        assert recorder.accounts[NAME].lost == 0
+        assert recorder.counts[NAME].lost == 0
     found = load_recording(tmp_path / "rec")
     judged = [*found.judged(NAME)]
     assert len(judged) == 8
@@ -128,8 +128,8 @@ async def test_all_pictures_are_in_files_that_follow_each_other_within_their_bou
             while first.exists() or len(files(tmp_path)) < 2:
                 device.left = 1
                 await agent.hosts[NAME].camera.trigger()
-                await until(lambda: not device.left and not recorder.accounts[NAME].waiting)
-        assert recorder.accounts[NAME].lost == 0
+                await until(lambda: not device.left and not recorder.counts[NAME].waiting)
+        assert recorder.counts[NAME].lost == 0
     found = load_recording(tmp_path / "rec")
     numbers = [one.frame.sequence for one in found.items(NAME) if isinstance(one, RecordedPicture)]
     assert sum(path.stat().st_size for path in files(tmp_path)) <= 60_000 + 2 * 20_000
@@ -148,8 +148,8 @@ async def test_source_that_is_gone_is_told_once_and_used_again(
             await until(lambda: device.calls.count("open") >= 3)
             device.fails.clear()
             await until(lambda: device.given)
-            before = recorder.accounts[NAME].written
-            await until(lambda: recorder.accounts[NAME].written > before + 3)
+            before = recorder.counts[NAME].written
+            await until(lambda: recorder.counts[NAME].written > before + 3)
     found = load_recording(tmp_path / "rec")
     errors = [one.text for one in found.errors()]
     assert [one for one in errors if "the cable is out" in one] == [
@@ -181,9 +181,9 @@ async def test_pictures_leave_room_for_results(
             await until(stuck.is_set)
             device.give(*(frame(number, **large) for number in (9001, 9002, 9003)))
             second = await agent.hosts[NAME].camera.trigger()
-            assert recorder.accounts[NAME].lost == 1
+            assert recorder.counts[NAME].lost == 1
             go_on.set()
-            await until(lambda: device.sink is not None and not recorder.accounts[NAME].waiting)
+            await until(lambda: device.sink is not None and not recorder.counts[NAME].waiting)
     assert folder_pictures.MAX_BYTES_WITH_PICTURES < MAX_WAITING_BYTES
     found = load_recording(tmp_path / "rec")
     kept = [one.frame.sequence for one in found.items(NAME) if isinstance(one, RecordedPicture)]

@@ -96,13 +96,13 @@ async def test_files_follow_and_no_result_is_lost_between(
     async with NumberedCamera(rate=500) as box:
         async with recording(tmp_path, box.url, size=6000) as (recorder, _):
             await until(lambda: len(files(tmp_path)) >= 4)
-        account = recorder.accounts[NAME]
-    assert (account.waiting, account.lost) == (0, 0)
+        counts = recorder.counts[NAME]
+    assert (counts.waiting, counts.lost) == (0, 0)
     found = files(tmp_path)
     assert [path.name for path in found] == sorted(path.name for path in found)
     loaded = [load_recording(path) for path in found]
     assert [one.remark for one in loaded] == [""] * len(found)
-    assert sum(sum(one.counts) for one in loaded) == account.written
+    assert sum(sum(one.counts) for one in loaded) == counts.written
     numbers = all_runs(tmp_path)
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     assert min(len(runs(one)) for one in loaded[:-1]) > 1
@@ -150,11 +150,11 @@ async def test_file_is_over_when_it_is_old_also_of_a_silent_camera(tmp_path: Pat
         NumberedCamera() as box,
         recording(tmp_path, box.url, age=60.0, clock=lambda: now) as (recorder, agent),
     ):
-        await until(lambda: files(tmp_path) and not recorder.accounts[NAME].waiting)
+        await until(lambda: files(tmp_path) and not recorder.counts[NAME].waiting)
         assert "no end" in load_recording(files(tmp_path)[0]).remark
         now = 59.0
         await agent.hosts[NAME].camera.trigger()
-        await until(lambda: not recorder.accounts[NAME].waiting)
+        await until(lambda: not recorder.counts[NAME].waiting)
         assert len(files(tmp_path)) == 1
         now = 61.0
         await until(lambda: not load_recording(files(tmp_path)[0]).remark)
@@ -232,7 +232,7 @@ async def test_oldest_are_deleted_and_never_what_is_not_ours(tmp_path: Path) -> 
                 first = first or next((one for one in files(tmp_path)[1:]), None)
                 await asyncio.sleep(0.01)
             await until(lambda: len(files(tmp_path)) >= 4)
-        assert recorder.accounts[NAME].lost == 0
+        assert recorder.counts[NAME].lost == 0
     assert {name: (folder / name).read_bytes() for name in kept} == kept
     found = [path for path in files(tmp_path) if path.name not in kept]
     assert sum(path.stat().st_size for path in found) <= 30_000 + 2 * 6000
@@ -266,21 +266,21 @@ async def test_full_disk_is_told_once_counted_and_heals(
             await agent.wait_first_attempts()
             camera = agent.hosts[NAME].camera
             assert (await camera.trigger()).raw[:4] == b"\1\0\0\0"
-            await until(lambda: not recorder.accounts[NAME].waiting)
-            before = recorder.accounts[NAME].written
+            await until(lambda: not recorder.counts[NAME].waiting)
+            before = recorder.counts[NAME].written
             disk.error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             for _ in range(20):
                 await camera.trigger()  # results go on
                 await asyncio.sleep(0.01)
-            await until(lambda: not recorder.accounts[NAME].waiting)
-            lost = recorder.accounts[NAME].lost
-            assert recorder.accounts[NAME].written == before
+            await until(lambda: not recorder.counts[NAME].waiting)
+            lost = recorder.counts[NAME].lost
+            assert recorder.counts[NAME].written == before
             assert isinstance(recorder.trouble, RecordingError)
             disk.error = None
             while recorder.trouble is not None:
                 await camera.trigger()
                 await asyncio.sleep(0.01)
-        account = recorder.accounts[NAME]
+        counts = recorder.counts[NAME]
     assert [one if one is None else str(one) for one in told] == [
         f"recordings {tmp_path / 'rec'}: No space left on device",
         None,
@@ -298,11 +298,11 @@ async def test_full_disk_is_told_once_counted_and_heals(
     assert numbers[-1] == box.runs
     assert numbers[1:] == list(range(numbers[1], box.runs + 1))
     (gap,) = [one for one in load_recording(second).errors() if one.error == GAP]
-    assert gap.records == account.lost >= lost >= 20
+    assert gap.records == counts.lost >= lost >= 20
     assert gap.since is not None
     assert gap.since < gap.at
     assert "No space left on device" in gap.text
-    assert sum(whole.counts) == account.written + 1  # the gap, which nobody put in
+    assert sum(whole.counts) == counts.written + 1  # the gap, which nobody put in
     # nothing is taken for another trigger's result across the gap
     takes = plan_replay(whole).applications[1].triggered
     assert [take.containers[0][:4] for take in takes if take.containers] == [
@@ -316,7 +316,7 @@ async def test_folder_that_goes_away_is_told_and_used_again_when_it_is_back(
     async with NumberedCamera() as box, recording(tmp_path, box.url) as (recorder, agent):
         camera = agent.hosts[NAME].camera
         await camera.trigger()
-        await until(lambda: not recorder.accounts[NAME].waiting)
+        await until(lambda: not recorder.counts[NAME].waiting)
         shutil.move(tmp_path / "rec", tmp_path / "away")
         while recorder.trouble is None:
             await camera.trigger()
@@ -330,7 +330,7 @@ async def test_folder_that_goes_away_is_told_and_used_again_when_it_is_back(
         while recorder.trouble is not None:
             await camera.trigger()
             await asyncio.sleep(0.01)
-        assert recorder.accounts[NAME].lost > 0
+        assert recorder.counts[NAME].lost > 0
     assert all_runs(tmp_path)[-1] == box.runs
     assert runs(load_recording(tmp_path / "away"))[0] == 1
 
@@ -358,26 +358,26 @@ async def test_slow_disk_costs_records_and_neither_memory_nor_time(
         async with recording(tmp_path, box.url) as (recorder, agent):
             camera = agent.hosts[NAME].camera
             await camera.trigger()
-            await until(lambda: not recorder.accounts[NAME].waiting)
+            await until(lambda: not recorder.counts[NAME].waiting)
             disk.stuck, before = threading.Event(), disk.calls
             await camera.trigger()
             await until(lambda: disk.calls > before)
             for _ in range(100):
                 await camera.trigger()
-            account = recorder.accounts[NAME]
-            assert account.lost > 100
-            assert account.waiting < 150
+            counts = recorder.counts[NAME]
+            assert counts.lost > 100
+            assert counts.waiting < 150
             assert recorder.trouble is None
             disk.stuck.set()
-            await until(lambda: not recorder.accounts[NAME].waiting)
+            await until(lambda: not recorder.counts[NAME].waiting)
             await camera.trigger()
-        account = recorder.accounts[NAME]
+        counts = recorder.counts[NAME]
     whole = load_recording(tmp_path / "rec")
     gaps = [one for one in whole.errors() if one.error == GAP]
-    assert sum(gap.records or 0 for gap in gaps) == account.lost
+    assert sum(gap.records or 0 for gap in gaps) == counts.lost
     assert "too slow" in gaps[0].text
     assert runs(whole)[-1] == box.runs
-    assert sum(whole.counts) == account.written + len(gaps)
+    assert sum(whole.counts) == counts.written + len(gaps)
     last = [one for one in whole.all_items() if isinstance(one, RecordedState)][-1]
     assert last.application == 1  # events were kept
     assert last.status is not None
@@ -396,7 +396,7 @@ async def test_record_that_makes_no_json_is_counted_and_the_rest_is_written(
             dialect = BVS.dialects["handbook"]
             agent.observers[0].on_raw_frame(RawFrame(odd.at, NAME, dialect, Sender.CLIENT, odd))
             await agent.hosts[NAME].camera.trigger()
-        assert recorder.accounts[NAME].lost == 1
+        assert recorder.counts[NAME].lost == 1
     assert all_runs(tmp_path) == [1]
 
 
@@ -416,10 +416,10 @@ def test_disk_that_is_really_full(tmp_path: Path) -> None:
         f"{found['told']}; nothing is recorded until the disk works again",
         f"recordings {tmp_path / 'rec'}: records are written again",
     ]
-    account, runs_seen = found["account"], found["runs"]
-    assert account["waiting"] == 0
-    assert sum(found["gaps"]) == account["lost"] > 600
-    assert found["counts"] == account["written"] + len(found["gaps"])
+    counts, runs_seen = found["recorder_counts"], found["runs"]
+    assert counts["waiting"] == 0
+    assert sum(found["gaps"]) == counts["lost"] > 600
+    assert found["counts"] == counts["written"] + len(found["gaps"])
     missing = set(range(runs_seen[0], runs_seen[-1] + 1)) - set(runs_seen)
     assert runs_seen == sorted(set(runs_seen))
     assert len(missing) > 600  # all of them in one piece
@@ -467,7 +467,7 @@ async def test_only_the_chosen_cameras_and_no_frames_if_so_said(tmp_path: Path) 
             for host in agent.hosts.values():
                 for _ in range(3):
                     await host.camera.trigger()
-        assert [*recorder.accounts] == ["line1/cam2"]
+        assert [*recorder.counts] == ["line1/cam2"]
     found = load_recording(tmp_path / "rec")
     assert (found.counts.frames, found.counts.results) == (0, 3)
     plan = plan_replay(found)

@@ -253,8 +253,8 @@ def test_picture_that_nobody_could_read_is_refused_and_the_file_stays_good(
     with RotatingRecorder(tmp_path / "folder") as folder:
         for picture in (shot(1), wrong, shot(3)):
             folder.add_picture(picture)
-    account = folder.accounts["left"]
-    assert (account.written, account.waiting, account.lost) == (2, 0, 1)
+    counts = folder.counts["left"]
+    assert (counts.written, counts.waiting, counts.lost) == (2, 0, 1)
     again = load_recording(tmp_path / "folder")
     assert again.remark == ""
     assert [one.sequence for one in again.pictures()] == [1, 3]
@@ -310,8 +310,8 @@ async def test_every_frame_of_a_burst_is_recorded(tmp_path: Path) -> None:
     driver = _Burst(frames)
     with Recorder(tmp_path / "run.mcap") as recorder:
         async with FrameSource(driver) as source:
-            account = await recorder.record(source, count=20)
-    assert (account.offered, account.skipped) == (20, 0)
+            counts = await recorder.record(source, count=20)
+    assert (counts.offered, counts.skipped) == (20, 0)
     found = [*load_recording(tmp_path / "run.mcap").pictures()]
     assert [one.sequence for one in found] == [one.sequence for one in frames]
 
@@ -334,8 +334,8 @@ async def test_end_of_a_source_ends_its_recording(tmp_path: Path) -> None:
     again = tmp_path / "two.mcap"
     with Recorder(again) as recorder:
         async with smartcam.frames.open(f"{path}#pace=none") as source:
-            account = await recorder.record(source, camera="left")
-    assert account.delivered == 30
+            counts = await recorder.record(source, camera="left")
+    assert counts.delivered == 30
     written = [*load_recording(path).pictures()]
     found = [*load_recording(again).pictures()]
     assert [one.sequence for one in found] == [one.sequence for one in written]
@@ -350,8 +350,8 @@ async def test_source_that_can_wait_waits_for_the_disk(
     monkeypatch.setattr("smartcam.recording._recorder.MAX_WAITING_PICTURE_BYTES", 20_000)
     with Recorder(tmp_path / "two.mcap") as recorder:
         async with smartcam.frames.open(f"{path}#pace=none") as source:
-            account = await recorder.record(source)
-    assert (account.delivered, recorder.counts.left_out) == (50, 0)
+            counts = await recorder.record(source)
+    assert (counts.delivered, recorder.counts.left_out) == (50, 0)
 
 
 @pytest.mark.long
@@ -366,9 +366,9 @@ def test_full_disk_costs_counted_pictures_until_there_is_room(tmp_path: Path) ->
     found = json.loads(done.stdout)
     assert found["told"][0].endswith("No space left on device")
     assert found["told"][1] == "None"
-    account, seen = found["account"], found["seen"]
-    assert (account["written"], account["waiting"]) == (len(seen), 0)
-    assert sum(lost for _, lost in seen) >= account["lost"] > 20
+    counts, seen = found["counts"], found["seen"]
+    assert (counts["written"], counts["waiting"]) == (len(seen), 0)
+    assert sum(lost for _, lost in seen) >= counts["lost"] > 20
     # each number is there, or counted before the next one that is
     for (before, _), (number, lost) in itertools.pairwise(seen):
         assert number == before + lost + 1
@@ -445,7 +445,7 @@ async def test_folder_of_recordings_is_one_source(
     with folder:
         for picture in written:
             assert folder.add_picture(picture)
-            await until(lambda: not folder.accounts["left"].waiting)
+            await until(lambda: not folder.counts["left"].waiting)
     files = sorted((tmp_path / "rec").glob("left_*.mcap"))
     assert len(files) > 3
     found = await played(f"{tmp_path / 'rec'}#pace=none")
@@ -460,7 +460,7 @@ async def test_folder_keeps_no_more_than_it_may(
     with RotatingRecorder(tmp_path / "rec", size=1e5, keep=3e5) as folder:
         for n in range(40):
             folder.add_picture(shot(n, width=256, height=256))
-            await until(lambda: not folder.accounts["left"].waiting)
+            await until(lambda: not folder.counts["left"].waiting)
     left = [*(tmp_path / "rec").glob("left_*.mcap")]
     assert sum(one.stat().st_size for one in left) < 3e5 + 2e5
     found = await played(f"{tmp_path / 'rec'}#pace=none")

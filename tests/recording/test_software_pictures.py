@@ -67,7 +67,7 @@ async def test_each_triggered_result_has_its_picture_and_is_played_with_it(
     server = smartcam.fleet.serve(plant_of(tmp_path, desk, pictures))
     async with FleetRecorder(server) as recorder, server:
         await triggered(server, desk, 10, 10, 220, 10)
-        assert recorder.accounts[NAME].lost == 0
+        assert recorder.counts[NAME].lost == 0
     found = load_recording(tmp_path / "rec")
     assert checked(found, 4) == [10, 10, 220, 10]
     async with FleetReplay(found) as played, smartcam.connect(played.server.urls[NAME]) as camera:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
     from smartcam.observers import RawFrame
     from smartcam.recording._folders.pictures import FleetPictures
-    from smartcam.recording._folders.track import CameraTrack, RecordingAccount
+    from smartcam.recording._folders.track import CameraTrack, RecordingCounts
     from smartcam.recording._mcap.form import Item
 
 
@@ -53,7 +53,7 @@ class FleetRecorder(Server):
 
     Start the recorder before the server, and stop it after the server. The disk never delays the
     agent: if the disk is full, missing or too slow, records are left out and counted in
-    :attr:`accounts` and in the files, and the disk is tried again until it works.
+    :attr:`counts` and in the files, and the disk is tried again until it works.
 
     Args:
         server: server whose cameras are recorded; not started yet.
@@ -158,9 +158,9 @@ class FleetRecorder(Server):
                 await _run_to_end(writer.stop)
 
     @property
-    def accounts(self) -> dict[str, RecordingAccount]:
-        """Account of each camera with records."""
-        return {} if self._writer is None else self._writer.accounts
+    def counts(self) -> dict[str, RecordingCounts]:
+        """Counts of each camera's records, by the camera's name."""
+        return {} if self._writer is None else self._writer.counts
 
     @property
     def trouble(self) -> RecordingError | None:

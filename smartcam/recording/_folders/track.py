@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.recording._recorder import RecordingFile
 
 
-class RecordingAccount(NamedTuple):
+class RecordingCounts(NamedTuple):
     """Counts of a camera's records: frames, results, events, errors and pictures together.
 
     Attributes:
@@ -93,10 +93,10 @@ class CameraTrack:
         self.synced_bytes = 0  # bytes of the file that are on the disk
 
     @property
-    def account(self) -> RecordingAccount:
+    def counts(self) -> RecordingCounts:
         """Counts of the camera's records."""
         written, lost = self.written, self.lost + self.left_out
-        return RecordingAccount(written, self.offered + self.extra_records - written - lost, lost)
+        return RecordingCounts(written, self.offered + self.extra_records - written - lost, lost)
 
     def count_lost(self, entries: list[Any], reason: str) -> None:
         """Count entries that are not written; update the camera's state from them."""

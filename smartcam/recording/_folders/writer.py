@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from smartcam.recording._folder import RecordingFolder
-    from smartcam.recording._folders.track import RecordingAccount
+    from smartcam.recording._folders.track import RecordingCounts
     from smartcam.recording._mcap.form import Item
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
@@ -115,10 +115,10 @@ class FolderWriter:
         return None if trouble is None else trouble.error
 
     @property
-    def accounts(self) -> dict[str, RecordingAccount]:
+    def counts(self) -> dict[str, RecordingCounts]:
         """Counts of each camera's records, by the camera's name."""
         with self._condition:
-            return {name: track.account for name, track in self._tracks.items()}
+            return {name: track.counts for name, track in self._tracks.items()}
 
     def new_track(self, camera: str, make_items: Callable[[Any], Iterator[Item]]) -> CameraTrack:
         """Return a new track of a camera."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import RecordingError
     from smartcam.frames import FrameSource
     from smartcam.frames._inside import ReaderStatistics
-    from smartcam.recording._folders.track import RecordingAccount
+    from smartcam.recording._folders.track import RecordingCounts
 
 MIN_FILE_BYTES: Final = 1e5
 MAX_FILE_BYTES: Final = 1e15
@@ -113,9 +113,9 @@ class RotatingRecorder:
         self.close()
 
     @property
-    def accounts(self) -> dict[str, RecordingAccount]:
+    def counts(self) -> dict[str, RecordingCounts]:
         """Counts of each camera's pictures: written, waiting and lost."""
-        return {} if self._writer is None else self._writer.accounts
+        return {} if self._writer is None else self._writer.counts
 
     @property
     def trouble(self) -> RecordingError | None:
