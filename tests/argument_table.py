@@ -251,7 +251,7 @@ FrameFeatures.names  timeout: seconds
 FrameFeatures.describe  timeout: seconds
 FrameFeatures.load  user_set: any text, timeout: seconds
 FrameFeatures.save  user_set: any text, timeout: seconds
-FrameFeatures.start_with  user_set: any text, timeout: seconds
+FrameFeatures.load_at_power_on  user_set: any text, timeout: seconds
 FrameFeature.get  timeout: seconds
 FrameFeature.describe  timeout: seconds
 FrameFeature.set  value: feature value, timeout: seconds
@@ -397,7 +397,7 @@ NOT_HERE: dict[str, str] = {
     """,
     "what a driver, an observer, a client or another make of camera does or is told": """
         Observer FrameDriver FrameSink FrameSource.attach FrameSource.ended
-        FrameSource.frame FrameSource.lost FrameSource.skipped RateControl.sent
+        FrameSource.frame FrameSource.lost FrameSource.skipped RateControl.record_arrival
         DeviceFeatures FrameSource.trigger_failed FrameSource.watch_events
         FrameSource.wait_until_streaming Outlet OutletContext Outlets.offer_result
         Outlets.offer_error Outlets.state_changed Device.handle Device.watch LineClient

@@ -389,7 +389,10 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "FrameFeatures.describe": (source.features.describe, {}),
             "FrameFeatures.load": (source.features.load, {"user_set": "Default"}),
             "FrameFeatures.save": (source.features.save, {"user_set": "Default"}),
-            "FrameFeatures.start_with": (source.features.start_with, {"user_set": "Default"}),
+            "FrameFeatures.load_at_power_on": (
+                source.features.load_at_power_on,
+                {"user_set": "Default"},
+            ),
             "FrameFeature.get": (source.features["Gain"].get, {}),
             "FrameFeature.describe": (source.features["Gain"].describe, {}),
             "FrameFeature.set": (source.features["Gain"].set, {"value": 1}),

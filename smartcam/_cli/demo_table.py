@@ -224,7 +224,7 @@ class DrawnTable:
 class TableDriver(TaskDriver):
     """The pictures of a :class:`DrawnTable`, by its address."""
 
-    times_frames = True
+    sets_captured = True
     tables: ClassVar[dict[str, DrawnTable]] = {}
 
     def __init__(self, address: FrameAddress) -> None:

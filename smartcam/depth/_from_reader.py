@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class ReaderDriver(FrameDriver):
     """Driver that passes on the frames of a reader; it enters and leaves this reader."""
 
-    times_frames: ClassVar[bool] = True  # the reader's source sets the times
+    sets_captured: ClassVar[bool] = True  # the reader's source sets ``captured``
 
     def __init__(self, frames: AbstractAsyncContextManager[FrameReader], name: str) -> None:
         super().__init__(FrameAddress.parse("synthetic://"))

@@ -21,8 +21,8 @@ from smartcam.frames._inside import (
     ControlChannel,
     GigESession,
     Register,
+    camera_url,
     discovery,
-    places,
 )
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ async def examine_gige(
     Cancellation: the camera is given back.
     """
     address = FrameAddress.parse(url)
-    places.read_wanted_stream(address)  # checks the URL
+    camera_url.read_wanted_stream(address)  # checks the URL
     exam = _GigEExamination(address, seconds, timeout or 5.0)
     checks: tuple[tuple[str, Callable[[_GigEExamination], Awaitable[None]]], ...] = (
         ("address", _find_address),
@@ -150,8 +150,8 @@ async def examine_gige(
 async def _find_address(exam: _GigEExamination) -> None:
     """Check ``address``: find the address that the URL means."""
     try:
-        host, exam.port = await places.find_camera(
-            exam.address, places.read_wanted_stream(exam.address)
+        host, exam.port = await camera_url.find_camera(
+            exam.address, camera_url.read_wanted_stream(exam.address)
         )
         addresses = await asyncio.get_running_loop().getaddrinfo(host, None, family=socket.AF_INET)
     except FrameSourceError as exc:

@@ -13,11 +13,12 @@ INTERVAL_DURATION: Final = 0.5
 """Seconds of one interval; only the frame with the shortest delay in it is kept."""
 
 MIN_EARLY_JUMP_SECONDS: Final = 0.05
-"""Least number of seconds by which a frame must arrive before the time on its clock to show that
-the clock jumped."""
+"""A frame that arrives at least this many seconds before its own time stamp shows that the
+camera's clock jumped."""
 
 MIN_INTERVALS_FOR_JUMP: Final = 4
-"""Number of intervals after which an early frame proves a jump: before, all frames may be late."""
+"""Number of intervals after which an early frame proves a jump; until then, all frames that have
+come may have been late."""
 
 MIN_DRIFT_DURATION: Final = 4.0
 """Least duration of frames, seconds, to measure a drift."""
@@ -56,7 +57,7 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._interval_minima = collections.deque[tuple[float, float]](maxlen=MAX_INTERVALS)
-        self._drift: float | None = None
+        self._edge_slope: float | None = None  # slope of the lower edge; None: not known yet
         self._edge_point = (0.0, 0.0)  # point on the lower edge
         self._last_device_time: float | None = None
         self._interval_start = 0.0
@@ -67,7 +68,7 @@ class DeviceClock:
     def statistics(self) -> ClockStatistics:
         """Return the drift and the jumps of the device's clock known so far."""
         # device time = (arrival - offset) / (1 + slope): with a slope above 0 the clock is too slow
-        drift = None if self._drift is None else -self._drift / (1 + self._drift)
+        drift = None if self._edge_slope is None else -self._edge_slope / (1 + self._edge_slope)
         return ClockStatistics(drift, self.jumps)
 
     def host_time(self, device_time: float, arrival: float) -> float:
@@ -80,7 +81,7 @@ class DeviceClock:
         if self._has_jumped(device_time, arrival):
             self.jumps += 1
             self._interval_minima.clear()
-            self._drift = self._last_offset = self._offset_before_queue = None
+            self._edge_slope = self._last_offset = self._offset_before_queue = None
         self._add_point(device_time, arrival - device_time)
         offset = self._offset(device_time)
         if self._last_offset is not None and self._last_device_time is not None:
@@ -114,10 +115,10 @@ class DeviceClock:
             self._interval_minima[-1] = (device_time, offset)
         else:
             return
-        self._drift = self._slope()
-        self._edge_point = _lowest_point(list(self._interval_minima), self._drift or 0.0)
+        self._edge_slope = self._estimate_slope()
+        self._edge_point = _lowest_point(list(self._interval_minima), self._edge_slope or 0.0)
 
-    def _slope(self) -> float | None:
+    def _estimate_slope(self) -> float | None:
         """Return the slope of the lower edge; None if too little is known."""
         points = list(self._interval_minima)
         if points[-1][0] - points[0][0] < MIN_DRIFT_DURATION:
@@ -133,7 +134,7 @@ class DeviceClock:
 
     def _offset(self, device_time: float) -> float:
         edge_time, offset = self._edge_point
-        return offset + (self._drift or 0.0) * (device_time - edge_time)
+        return offset + (self._edge_slope or 0.0) * (device_time - edge_time)
 
 
 def _slope(first: tuple[float, float], second: tuple[float, float]) -> float:

@@ -99,26 +99,27 @@ class FrameDriver(ABC):
             that names the known ones.
 
     Attributes:
-        times_frames: whether the driver sets ``captured`` on the host's clock for all its frames;
+        sets_captured: whether the driver sets ``captured`` on the host's clock for all its frames;
             else the source computes ``captured`` of frames with a ``device_time``.
         lists_features: whether the device can list its features.
-        form: format of the stream after a feature changed it; None: as :meth:`open` returned it.
-        waits_for: condition that the device awaits before each picture, for error texts, such as
-            ``TriggerSource is Line1``; ``""``: the device streams freely. A device that awaits a
-            condition is never considered stuck.
+        changed_format: format of the stream after a feature changed it; None: as :meth:`open`
+            returned it.
+        awaited_condition: condition that the device awaits before each picture, for error texts,
+            such as ``TriggerSource is Line1``; ``""``: the device streams freely. A device that
+            awaits a condition is never considered stuck.
     """
 
-    times_frames: ClassVar[bool] = False
+    sets_captured: ClassVar[bool] = False
     lists_features: ClassVar[bool] = True
-    form: StreamFormat | None = None
-    waits_for: str = ""
+    changed_format: StreamFormat | None = None
+    awaited_condition: str = ""
 
     def __init__(self, address: FrameAddress) -> None:
         self.address = address
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
-        """Return the sources found; a device is open at most during the search."""
+        """Return the sources found; a device opened for the search is closed again."""
         return []
 
     @property
@@ -167,8 +168,8 @@ class FrameDriver(ABC):
         this method while the device streams, and again only after :meth:`disarm`.
 
         Args:
-            pending: the trigger; ``pending.fire_begins()`` is called right before it is sent, and
-                ``pending.refused()`` if the device certainly did not accept it.
+            pending: the trigger; ``pending.record_fire()`` is called right before it is sent, and
+                ``pending.record_refusal()`` if the device certainly did not accept it.
             fire: coroutine function that sets the trigger's line; None: a software trigger.
 
         Raises:
@@ -181,7 +182,7 @@ class FrameDriver(ABC):
             "after(time.monotonic()) is the first picture that is exposed from now on"
         )
 
-    async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame | None:
+    async def trigger_by_owner(self, timeout: float, *, refuse: bool) -> Frame | None:
         """Let the process that owns the device trigger it, and return the picture.
 
         Args:
@@ -240,7 +241,7 @@ class TaskDriver(FrameDriver):
         self._task = asyncio.create_task(self.deliver(sink), name=f"frames of {self.name}")
 
     async def stop(self) -> None:
-        """End the task, which must be running."""
+        """End the task if it is running."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()

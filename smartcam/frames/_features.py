@@ -212,7 +212,7 @@ class FrameFeatures:
         """
         await self._execute_with_set(user_set, "UserSetSave", timeout)
 
-    async def start_with(self, user_set: str, *, timeout: float = FEATURE_TIMEOUT) -> None:
+    async def load_at_power_on(self, user_set: str, *, timeout: float = FEATURE_TIMEOUT) -> None:
         """Set the user set that the device loads when it is switched on (``UserSetDefault``).
 
         Raises:
@@ -220,7 +220,7 @@ class FrameFeatures:
 
         Cancellation: the device may have set it.
         """
-        checked = check_text(user_set, "user_set", "start_with", most=MAX_VALUE_LENGTH)
+        checked = check_text(user_set, "user_set", "load_at_power_on", most=MAX_VALUE_LENGTH)
         features = {spelling_key(name): name for name in await self.names(timeout=timeout)}
         name = features.get(
             "usersetdefault", features.get("usersetdefaultselector", "UserSetDefault")

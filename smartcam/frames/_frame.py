@@ -157,7 +157,7 @@ class Frame:
         return self.format.rgb(self.data, self.width, self.height, self.stride)
 
 
-_data: Final = JoinedPlanes(vars(Frame)["data"])
+_data: Final = JoinedPlanes(vars(Frame)["data"])  # `Frame.data` joins planes, grey() does not
 setattr(Frame, "data", _data)  # noqa: B010 - type checkers use the field
 _NAMES: Final = tuple(attribute.name for attribute in fields(Frame))
 _NAMES_WITHOUT_DATA: Final = tuple(name for name in _NAMES if name != "data")

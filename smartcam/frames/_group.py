@@ -234,9 +234,9 @@ class FrameGroup:
             f"{name} {reader.statistics().offered}" for name, reader in self._readers.items()
         )
         return (
-            f"frames of {' and '.join(self._sources)}: expected a set within "
-            f"{self.within * 1e3:.3g} ms of each other in {self._timeout:g} s, got none; frames "
-            f"that came in all: {counts}"
+            f"frames of {' and '.join(self._sources)}: expected one of each, "
+            f"at most {self.within * 1e3:.3g} ms apart, in {self._timeout:g} s, got none; frames "
+            f"received in total: {counts}"
         )
 
     def _add_frame(self, name: str, frame: Frame) -> None:

@@ -9,13 +9,13 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.frames._clocks import MAX_DRIFT, MIN_DRIFT_DURATION, ClockStatistics
     from smartcam.frames._codecs.bitmap import read_bitmap
-    from smartcam.frames._codecs.h264 import H264Encoder, entry_point
+    from smartcam.frames._codecs.h264 import H264Encoder, random_access_point
     from smartcam.frames._codecs.jpeg import jpeg_header
     from smartcam.frames._codecs.pictures import convert_frame, decode_frame, to_jpeg, with_pixels
     from smartcam.frames._driver import TaskDriver
     from smartcam.frames._features import FEATURE_TIMEOUT, FeatureValue
     from smartcam.frames._frame import copy_with
-    from smartcam.frames._gige import discovery, places
+    from smartcam.frames._gige import camera_url, discovery
     from smartcam.frames._gige.assembler import PacketCounts
     from smartcam.frames._gige.control import ControlChannel
     from smartcam.frames._gige.driver import GigEDriver
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.frames._source import SourceStatistics
     from smartcam.frames._streaming.rate import RateStatistics
     from smartcam.frames._synthetic import read_stamp
-    from smartcam.frames._video.frames import colour_properties, format_of, to_lossless_video
+    from smartcam.frames._video.frames import colour_properties, format_of, to_lossless_av_frame
 
 __all__ = [
     "COLOURS",
@@ -60,22 +60,22 @@ __all__ = [
     "SourceStatistics",
     "TaskDriver",
     "YuvPairs",
+    "camera_url",
     "checked_mac",
     "colour_properties",
     "convert_frame",
     "copy_with",
     "decode_frame",
     "discovery",
-    "entry_point",
     "force_address",
     "format_of",
     "jpeg_header",
-    "places",
+    "random_access_point",
     "read_bitmap",
     "read_stamp",
     "stroke_width",
     "to_jpeg",
-    "to_lossless_video",
+    "to_lossless_av_frame",
     "with_pixels",
 ]
 
@@ -89,14 +89,14 @@ if not TYPE_CHECKING:
             "_group": "GroupStatistics",
             "_clocks": "ClockStatistics MIN_DRIFT_DURATION MAX_DRIFT",
             "_codecs.bitmap": "read_bitmap",
-            "_codecs.h264": "H264Encoder entry_point",
+            "_codecs.h264": "H264Encoder random_access_point",
             "_codecs.jpeg": "jpeg_header",
             "_codecs.pictures": "convert_frame decode_frame to_jpeg with_pixels",
             "_driver": "TaskDriver",
             "_features": "FeatureValue FEATURE_TIMEOUT",
             "_frame": "copy_with",
             "_gige.force_address": "checked_mac force_address",
-            "_gige.": "discovery places",
+            "_gige.": "camera_url discovery",
             "_gige.assembler": "PacketCounts",
             "_gige.control": "ControlChannel",
             "_gige.driver": "GigEDriver",
@@ -107,6 +107,6 @@ if not TYPE_CHECKING:
             "_pixels.layouts": "Planes YuvPairs",
             "_reader": "ReaderStatistics FRAME_TIMEOUT FrameTap",
             "_synthetic": "read_stamp",
-            "_video.frames": "colour_properties format_of to_lossless_video",
+            "_video.frames": "colour_properties format_of to_lossless_av_frame",
         },
     )

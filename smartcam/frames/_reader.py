@@ -127,7 +127,7 @@ class FrameReader:
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the first frame whose exposure began after a moment.
 
-        The frame may be one that already waits for the reader.
+        The frame may be one that already waits for the reader, or the last one that it returned.
 
         If the start of the exposure is not known exactly, the frame is the first one that certainly
         was exposed after the moment: see :attr:`Frame.began`.
@@ -186,7 +186,7 @@ class FrameReader:
 
     def _trigger_hint(self) -> str:
         """Return the condition that the device awaits, for an error's text; "": none."""
-        condition = "" if self._source is None else self._source.driver.waits_for
+        condition = "" if self._source is None else self._source.driver.awaited_condition
         return f": {condition}, and nothing triggered it" if condition else ""
 
     async def _first_matching(
@@ -277,7 +277,7 @@ class FrameTap(FrameReader):
     """A reader that passes on every frame as it comes.
 
     While ``busy`` returns True, the last frame is held back. A source that can wait, such as a
-    file, waits then; another source's next frame releases the frame that was held back.
+    file, waits then; if the source cannot wait, its next frame releases the one held back.
 
     Args:
         source: open source; the device streams from now on.
@@ -293,7 +293,7 @@ class FrameTap(FrameReader):
         self._take_frame, self._busy = take, busy
         source.attach(self)
 
-    async def ended(self) -> None:
+    async def pass_until_end(self) -> None:
         """Pass on all frames until the source has ended.
 
         Raises:

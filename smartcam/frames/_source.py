@@ -64,7 +64,7 @@ class SourceStatistics:
         streaming: whether the device streams now.
         readers: number of current readers.
         started: number of starts of the device's stream.
-        frames: number of received frames, with or without a reader.
+        frames: number of frames that came, with or without a reader, or were skipped on the way.
         lost: number of frames lost in the camera or on the way.
         ahead: number of frames whose time was later than their arrival; the arrival replaced it.
         clock: drift and jumps of the camera's own clock; None: no clock.
@@ -188,8 +188,8 @@ class FrameSource(FrameSink):
 
     async def _feature_changed(self) -> None:
         """Update the stream's format after a feature was set."""
-        if self._loop is not None and self._driver.form is not None:
-            self._format = self._driver.form
+        if self._loop is not None and self._driver.changed_format is not None:
+            self._format = self._driver.changed_format
         self._state_changed.set()
 
     @property
@@ -250,16 +250,16 @@ class FrameSource(FrameSink):
         elif self._readers:
             self._start_task(self._loop)
 
-    def _checked_format(self, form: StreamFormat) -> StreamFormat:
-        size = (form.width, form.height)
+    def _checked_format(self, stream_format: StreamFormat) -> StreamFormat:
+        size = (stream_format.width, stream_format.height)
         if self._camera_info is not None and tuple(self._camera_info.size) != size:
             raise FrameFormatError(
                 f"{self.name}: expected frames of camera_info's size, "
-                f"{self._camera_info.size[0]}x{self._camera_info.size[1]}, got {form}",
+                f"{self._camera_info.size[0]}x{self._camera_info.size[1]}, got {stream_format}",
                 source=self.name,
-                available=(str(form),),
+                available=(str(stream_format),),
             )
-        return form
+        return stream_format
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
@@ -432,7 +432,7 @@ class FrameSource(FrameSink):
     def _with_host_time(self, frame: Frame, now: float) -> Frame:
         """Return a frame with its time on the host's clock, not later than now."""
         captured = frame.captured
-        if frame.device_time is not None and not self._driver.times_frames:
+        if frame.device_time is not None and not self._driver.sets_captured:
             if self._clock is None:
                 self._clock = DeviceClock()
             jumps = self._clock.jumps
@@ -538,8 +538,10 @@ class FrameSource(FrameSink):
                     and remaining <= 0
                 ):
                     return
-            elif self._stall is None or self._driver.waits_for:
-                await self._wait_until(partial(self._must_check_again, self._driver.waits_for))
+            elif self._stall is None or self._driver.awaited_condition:
+                await self._wait_until(
+                    partial(self._must_check_again, self._driver.awaited_condition)
+                )
                 self._last_arrival = asyncio.get_running_loop().time()
             else:
                 remaining = self._last_arrival + self._stall - asyncio.get_running_loop().time()
@@ -552,9 +554,9 @@ class FrameSource(FrameSink):
                     )
                 await self._reached_within(remaining, lambda: not self._readers)
 
-    def _must_check_again(self, waits_for: str) -> bool:
+    def _must_check_again(self, condition: str) -> bool:
         """Return True if the readers are gone, or the device no longer awaits this condition."""
-        return not self._readers or self._driver.waits_for != waits_for
+        return not self._readers or self._driver.awaited_condition != condition
 
     async def _reached_within(self, seconds: float, condition: Callable[[], bool]) -> bool:
         """Wait for a condition; return whether it was reached in time."""

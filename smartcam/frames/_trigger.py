@@ -40,11 +40,11 @@ class AwaitedTrigger:
         self.outcome: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
         self.notes: list[str] = []
 
-    def fire_begins(self) -> None:
+    def record_fire(self) -> None:
         """Record the time right before the trigger is sent."""
         self.fired = time.monotonic()
 
-    def refused(self) -> None:
+    def record_refusal(self) -> None:
         """Record that the device did not accept the trigger, so no picture will come."""
         self.fired = None
 
@@ -72,7 +72,7 @@ class TriggerQueue:
         """Trigger once, as :meth:`FrameSource.trigger` does."""
         name = self._source.name
         driver = self._source.driver
-        if fire is None and (frame := await driver.trigger_elsewhere(seconds, refuse=refuse)):
+        if fire is None and (frame := await driver.trigger_by_owner(seconds, refuse=refuse)):
             return frame
         if refuse and self._lock.locked():
             raise CameraBusyError(f"{name}: another trigger is pending, and when_busy is 'refuse'")
@@ -91,7 +91,7 @@ class TriggerQueue:
             raise
         except TimeoutError as exc:
             notes = "".join(f"; {note}" for note in pending.notes[:MAX_NOTES])
-            condition = self._source.driver.waits_for
+            condition = self._source.driver.awaited_condition
             raise TriggerTimeoutError(
                 f"{name}: no picture of the trigger within {seconds:g} s, which ran out while "
                 f"{steps[-1]}{notes}{f'; {condition}' if condition else ''}",

@@ -13,7 +13,7 @@ from smartcam import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.fleet import FleetFrame
 from smartcam.fleet._frames.video import MAX_LAG, MIN_KEY_INTERVAL, SharedVideo, VideoUnit
 from smartcam.frames import Codecs, Frame, FrameSource, find_format
-from smartcam.frames._inside import entry_point, read_stamp
+from smartcam.frames._inside import random_access_point, read_stamp
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.framekit import FramePlant, looking
@@ -104,7 +104,7 @@ async def test_encoded_frames_are_there_for_who_wants_them() -> None:
                 number = await film.next()
                 got = await anext(frames)
                 assert got.format.name == "H264"
-                assert entry_point(bytes(got.data))[0] == (count == 0)
+                assert random_access_point(bytes(got.data))[0] == (count == 0)
                 picture = await decoder.decode(got)
                 assert picture is not None
                 assert number_in(picture) == number

@@ -13,7 +13,7 @@ import zipfile
 from urllib.parse import urlsplit
 
 from smartcam.exceptions import SmartCamError
-from smartcam.frames._inside import GenicamFeatures, entry_point, jpeg_header, read_bitmap
+from smartcam.frames._inside import GenicamFeatures, jpeg_header, random_access_point, read_bitmap
 from tests.budgets.inputs import UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, fill_text, grown, streamed
 from tests.frames.inside import (
@@ -726,7 +726,7 @@ PARSERS: tuple[Parser, ...] = (
     ),
     Parser(
         "GenICam: formulas",
-        lambda text: _expressions.evaluate(text, {}, integral=True),
+        lambda text: _expressions.evaluate(text, {}, as_integers=True),
         _FORMULAS,
         _expressions.MAX_FORMULA_CHARACTERS,
         "frames._gige.expressions.MAX_FORMULA_CHARACTERS",
@@ -763,7 +763,7 @@ PARSERS: tuple[Parser, ...] = (
     ),
     Parser(
         "H.264: entry points",
-        entry_point,
+        random_access_point,
         {
             "small units": fill(b"\0\0\1\x09"),
             "start codes": fill(b"\0\0\1"),

@@ -14,7 +14,7 @@ from smartcam import frames
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, find_format
 from smartcam.frames._pixels.layouts import SampleLayout
-from smartcam.frames._video.frames import from_video
+from smartcam.frames._video.frames import from_av_frame
 from tests.frames.inside import MATRICES, PIXEL_FORMATS, to_jpegxl, to_png, yuv_to_rgb
 from tests.frames.pictures import frame_of
 
@@ -43,13 +43,13 @@ def filled(name: str, bits: int = 8, seed: int = 7) -> tuple[Any, list[Any]]:
 
 def pixels(video: Any) -> tuple[Any, Any]:
     """Return the resulting format, and the samples."""
-    came = from_video(video)
+    came = from_av_frame(video)
     return came.format, came.format.array(came.data, came.width, came.height, came.stride)
 
 
 def planes_of(video: Any) -> tuple[Any, list[Any]]:
     """Return the resulting format, and its Y, U and V."""
-    came = from_video(video)
+    came = from_av_frame(video)
     return came.format, list(came.format.planes(came.data, came.width, came.height, came.stride))
 
 
@@ -200,7 +200,7 @@ def test_deep_rows_of_an_odd_width_are_those_of_a_wider_picture(name: str) -> No
 @pytest.mark.skipif(av.__version__ < "18", reason="older versions crash")
 def test_format_that_ffmpeg_cannot_convert_is_an_error_of_ours() -> None:
     with pytest.raises(FrameFormatError, match="rgb4: no conversion to rgb24"):
-        from_video(av.VideoFrame(16, 16, "rgb4"))
+        from_av_frame(av.VideoFrame(16, 16, "rgb4"))
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_matrix_and_range_are_those_of_the_stream(
 ) -> None:
     video, _ = filled(name, 16 if "10" in name else 8)
     video.color_range, video.colorspace = told, space
-    found = from_video(video).format
+    found = from_av_frame(video).format
     assert found.name.endswith(end + full)
     assert ("709" in found.name, "2020" in found.name) == ("709" in end, "2020" in end)
     assert ("full" in found.name) == bool(full)
@@ -253,14 +253,14 @@ def test_alpha_after_y_u_and_v(alpha: int) -> None:
 @pytest.mark.parametrize("name", ["grayf32le", "gbrpf32le", "xyz12le", "yuva444p10le"])
 def test_formats_that_would_lose_values_are_refused_by_name(name: str) -> None:
     with pytest.raises(FrameFormatError, match=f"{name}: expected one that converts without loss"):
-        from_video(av.VideoFrame(WIDTH, HEIGHT, name))
+        from_av_frame(av.VideoFrame(WIDTH, HEIGHT, name))
 
 
 def test_other_matrix_is_refused() -> None:
     video, _ = filled("yuv420p")
     video.colorspace = 7
     with pytest.raises(FrameFormatError, match="AVColorSpace 7"):
-        from_video(video)
+        from_av_frame(video)
 
 
 # ------------------------------------------------------------------ files
@@ -352,7 +352,7 @@ async def test_webp_with_alpha(tmp_path: Path, file: str, name: str) -> None:
 
 
 def from_rgb(video: Any) -> Any:
-    came = from_video(video)
+    came = from_av_frame(video)
     return came.format.rgb(came.data, came.width, came.height, came.stride)
 
 
@@ -368,7 +368,7 @@ async def test_written_pictures_are_read_back(tmp_path: Path, name: str) -> None
         channels = layout.channels
         shape = (HEIGHT, WIDTH, channels) if channels > 1 else (HEIGHT, WIDTH)
         samples = np.random.default_rng(5).integers(0, top, shape)
-        frame = frame_of(samples.astype(f"<u{layout.size_of}"), name)
+        frame = frame_of(samples.astype(f"<u{layout.sample_bytes}"), name)
     else:
         data = np.random.default_rng(5).bytes(found.size(WIDTH, HEIGHT))
         frame = replace(

@@ -108,7 +108,7 @@ async def test_camera_that_falls_silent_is_named() -> None:
     async with group:
         waiting = await started(group, found)
         found[0].give(*(frame(number) for number in range(20)))
-        with pytest.raises(FrameTimeoutError, match="came in all: cam0 20, cam1 0"):
+        with pytest.raises(FrameTimeoutError, match="received in total: cam0 20, cam1 0"):
             await waiting
         assert group.statistics().alone == {"cam0": 12, "cam1": 0}
 

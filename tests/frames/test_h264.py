@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames import Codecs, find_format
-from smartcam.frames._inside import entry_point, read_stamp
+from smartcam.frames._inside import random_access_point, read_stamp
 from tests.frames.pictures import HEIGHT, WIDTH, fill, frame_of, known_of, stamped
 
 if TYPE_CHECKING:
@@ -182,14 +182,16 @@ async def test_key_frame_on_request_ends_the_wait(codecs: Codecs) -> None:
         ("000001 06", (False, None)),
     ],
 )
-def test_entry_points_are_read_from_the_units(data: str, found: tuple[bool, int | None]) -> None:
-    assert entry_point(bytes.fromhex(data)) == found
+def test_random_access_points_are_read_from_the_units(
+    data: str, found: tuple[bool, int | None]
+) -> None:
+    assert random_access_point(bytes.fromhex(data)) == found
 
 
 @given(st.binary(max_size=60))
-def test_any_bytes_have_an_entry_point_or_none(data: bytes) -> None:
+def test_any_bytes_have_a_random_access_point_or_none(data: bytes) -> None:
     for given_data in (data, b"\0\0\1\6" + data, b"\0\0\1\6\6" + data):
-        key, refresh = entry_point(given_data)
+        key, refresh = random_access_point(given_data)
         assert isinstance(key, bool)
         assert refresh is None or refresh >= 0
 

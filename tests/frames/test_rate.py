@@ -70,7 +70,7 @@ class Link:
             size = self.content(went) * self.chance.lognormvariate(0, self.noise)
             size = max(600, int(size / steps**self.steep))
             took = self.base + self._through(size, went + self.base)
-            self.control.sent(size, went, took, age=0.001)
+            self.control.record_arrival(size, went, took, age=0.001)
             self.now = went + took
             self.sent.append(Sent(self.now, size, took + 0.001, quality, fps))
             self.due = max(self.due, went - self.control.pause) + self.control.pause

@@ -466,12 +466,12 @@ async def test_thread_that_exceeds_its_limits_is_abandoned_and_logged(
     gate = threading.Event()
     driver = video.VideoDriver(frames.FrameAddress.parse(f"{path}#timeout=0.1"))
     monkeypatch.setattr(video, "THREAD_GRACE", -0.05)
-    monkeypatch.setattr(driver, "_open_reading", lambda: gate.wait(60))
+    monkeypatch.setattr(driver, "_open_reader", lambda: gate.wait(60))
     task = asyncio.create_task(driver.open())
     await asyncio.sleep(0)
     task.cancel()
     await asyncio.wait([task])
-    assert "the reading thread hangs, and is abandoned" in caplog.text
+    assert "the reader thread hangs, and is abandoned" in caplog.text
     monkeypatch.undo()
     assert (await driver.open()).width == WIDTH
     gate.set()

@@ -57,7 +57,7 @@ class SharedFrameDriver(FrameDriver):
         request: form and rate of the frames.
     """
 
-    times_frames = True
+    sets_captured = True
 
     def __init__(self, address: FrameAddress, frames: FrameCaller, request: StreamForm) -> None:
         super().__init__(address)
@@ -92,7 +92,7 @@ class SharedFrameDriver(FrameDriver):
         """The features of the device, through the camera's agent."""
         return self._frames.features
 
-    async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame:
+    async def trigger_by_owner(self, timeout: float, *, refuse: bool) -> Frame:
         """Trigger the device through the camera's agent, and return the picture.
 
         Raises:
@@ -206,6 +206,6 @@ class SharedFrameDriver(FrameDriver):
         frame, rate = frames[-1], self._request.rate
         if rate is not None:
             age_here, age = frame.age, float(answer["frame"]["age"])
-            rate.sent(len(frame.data), frame.captured + age, age_here - age, age=age)
+            rate.record_arrival(len(frame.data), frame.captured + age, age_here - age, age=age)
             frame = replace(frame, rate=rate.statistics())
         sink.frame(frame)

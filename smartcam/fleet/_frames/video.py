@@ -156,7 +156,7 @@ class SharedVideo:
             self._end_cause = (error,)
 
     async def _encode(self, frame: Frame, offered_count: int, lost_count: int) -> None:
-        from smartcam.frames._inside import entry_point
+        from smartcam.frames._inside import random_access_point
 
         loop = asyncio.get_running_loop()
         if self._needs_key_frame and loop.time() - self._last_key_at >= MIN_KEY_INTERVAL:
@@ -164,7 +164,7 @@ class SharedVideo:
         started_at = time.perf_counter()
         encoded = await self._encoder.encode(frame)
         encoding_time = time.perf_counter() - started_at
-        is_key_frame, _ = entry_point(bytes(encoded.data))
+        is_key_frame, _ = random_access_point(bytes(encoded.data))
         if is_key_frame:
             self._last_key_at, self._needs_key_frame = loop.time(), False
         number = self._units[-1].number + 1 if self._units else secrets.randbits(31) + 1

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-FILE: Final = struct.Struct("<2sIHHI")
-INFO: Final = struct.Struct("<IiiHHIIiiII")
+FILE_HEADER: Final = struct.Struct("<2sIHHI")
+INFO_HEADER: Final = struct.Struct("<IiiHHIIiiII")
 MAX_PIXEL_BYTES: Final = 1 << 28
 """Largest number of bytes of a bitmap's pixels; no camera sends more."""
 
@@ -29,16 +29,16 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
         FrameFormatError: the file is cut off, compressed, has other numbers of bits, or is no
             bitmap.
     """
-    if len(data) < FILE.size + INFO.size or data[:2] != b"BM":
+    if len(data) < FILE_HEADER.size + INFO_HEADER.size or data[:2] != b"BM":
         raise FrameFormatError(
             f"expected a bitmap file, got {len(data)} bytes that begin with {data[:8].hex(' ')}"
         )
-    offset = FILE.unpack_from(data)[4]
-    header_size, width, rows, _, bits, compression, _, _, _, palette_size, _ = INFO.unpack_from(
-        data, FILE.size
+    offset = FILE_HEADER.unpack_from(data)[4]
+    header_size, width, rows, _, bits, compression, _, _, _, palette_size, _ = (
+        INFO_HEADER.unpack_from(data, FILE_HEADER.size)
     )
     height = abs(rows)
-    if header_size < INFO.size or compression or bits not in (8, 24, 32):
+    if header_size < INFO_HEADER.size or compression or bits not in (8, 24, 32):
         raise FrameFormatError(
             f"expected an uncompressed bitmap of 8, 24 or 32 bits, got one of {bits} bits, "
             f"compression {compression}, with a head of {header_size} bytes"
@@ -55,7 +55,7 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
         pixels = pixels[::-1]
     if bits == 8:
         return _apply_palette(
-            pixels[..., 0], data[FILE.size + header_size :][: 4 * (palette_size or 256)]
+            pixels[..., 0], data[FILE_HEADER.size + header_size :][: 4 * (palette_size or 256)]
         )
     return np.ascontiguousarray(pixels[..., 2::-1])
 

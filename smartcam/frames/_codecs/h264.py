@@ -14,7 +14,7 @@ from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.pictures import decode_frame
 from smartcam.frames._frame import copy_with
 from smartcam.frames._pixels.formats import find_format
-from smartcam.frames._video.frames import from_video, reformatted, to_video
+from smartcam.frames._video.frames import from_av_frame, reformatted, to_av_frame
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -105,7 +105,7 @@ class H264Encoder:
         with self._codec_lock:
             if frame.format.name == "MJPEG":
                 frame = decode_frame(frame, "RGB8")
-            video = to_video(frame, self._grey)
+            video = to_av_frame(frame, self._grey)
             self._grey = video if frame.format.name == "Mono8" else None
             stream_key = (
                 restarts,
@@ -142,8 +142,8 @@ class H264Decoder:
     It returns only whole pictures. The first one follows a key frame, or the end of a refresh that
     began after the decoder had decoded something: FFmpeg may take a refresh for complete although
     its first frame had no reference. A decoder that starts in the middle of a stream returns its
-    first picture after at most three times the encoder's ``keyint`` frames, after a loss two times,
-    and after :meth:`H264Encoder.request_key_frame` at once.
+    first picture after at most 3 * ``keyint`` frames of the encoder, a decoder that lost frames
+    after at most 2 * ``keyint``, and each at once after :meth:`H264Encoder.request_key_frame`.
 
     Args:
         run: function that runs the work.
@@ -242,7 +242,7 @@ class H264Decoder:
         """Return the number of frames until the picture is whole; None if that is not known."""
         if self._frames_until_whole == 0:
             return 0
-        is_key_frame, refresh = self._entry_point(data)
+        is_key_frame, refresh = self._random_access_point(data)
         if is_key_frame:
             self._frames_until_whole = 0
         elif self._frames_until_whole is not None:
@@ -251,8 +251,8 @@ class H264Decoder:
             self._frames_until_whole = refresh
         return self._frames_until_whole
 
-    def _entry_point(self, data: bytes) -> tuple[bool, int | None]:
-        return entry_point(data)
+    def _random_access_point(self, data: bytes) -> tuple[bool, int | None]:
+        return random_access_point(data)
 
     def _packet(self, frame: Frame) -> Any:
         packet = load("av").Packet(frame.data)
@@ -266,7 +266,7 @@ class H264Decoder:
     def _to_frame(self, picture: Any) -> Frame:
         frame = self._pending_frames.pop(picture.pts)
         picture = reformatted(picture, self._pixel_format) if self._pixel_format else picture
-        pixels = from_video(picture, keep_planes=True)
+        pixels = from_av_frame(picture, keep_planes=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise self._damaged_error(frame, f"a picture of {pixels.width}x{pixels.height}")
         return copy_with(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
@@ -283,7 +283,7 @@ SLICES, KEY_SLICE, SEI, RECOVERY_POINT = (1, 2, 3, 4), 5, 6, 6
 """Types of NAL units (ITU-T H.264, table 7-1), and one type of message in an SEI unit (annex D)."""
 
 
-def entry_point(data: bytes) -> tuple[bool, int | None]:
+def random_access_point(data: bytes) -> tuple[bool, int | None]:
     """Return True for a key frame, and the number of frames until a refresh is complete.
 
     The number is None if no refresh begins with the frame.

@@ -22,8 +22,8 @@ DAMAGE_WARNINGS: Final = (
     "too many scanlines",
 )
 """Texts in libjpeg's warnings (``jerror.h``) that mean that a part of the picture is grey or wrong.
-Other warnings, such as surplus bytes or an unknown revision, concern whole pictures. Common webcams
-send such pictures, and other decoders show them."""
+After other warnings, such as surplus bytes or an unknown revision, the picture is intact. Common
+webcams send such pictures, and other decoders show them."""
 
 _JFIF: Final = (b"JFIF\0\x01", b"JFXX\0\x10", b"JFXX\0\x11", b"JFXX\0\x13")
 

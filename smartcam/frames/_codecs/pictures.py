@@ -24,35 +24,35 @@ if TYPE_CHECKING:
     from smartcam.frames._pixels.formats import PixelFormat
 
 
-def with_pixels(frame: Frame, pixels: NDArray[Any], name: str) -> Frame:
+def with_pixels(frame: Frame, pixels: NDArray[Any], format_name: str) -> Frame:
     """Return the frame with other pixels and the same other attributes."""
     height, width = pixels.shape[:2]
     contiguous = np.ascontiguousarray(pixels)
     return replace(
         frame,
         data=contiguous.data.toreadonly().cast("B"),
-        format=find_format(name),
+        format=find_format(format_name),
         width=width,
         height=height,
         stride=contiguous.nbytes // height,
     )
 
 
-def _with_bytes(frame: Frame, data: bytes, name: str) -> Frame:
-    return replace(frame, data=data, format=find_format(name), stride=0)
+def _with_bytes(frame: Frame, data: bytes, format_name: str) -> Frame:
+    return replace(frame, data=data, format=find_format(format_name), stride=0)
 
 
-def convert_frame(frame: Frame, name: str) -> Frame:
+def convert_frame(frame: Frame, format_name: str) -> Frame:
     """Return the frame in grey or in colours: ``Mono8``, ``Mono16``, ``RGB8`` or ``RGB16``."""
-    pixels = frame.rgb() if name.startswith("RGB") else frame.grey()
-    wanted = find_format(name)
+    pixels = frame.rgb() if format_name.startswith("RGB") else frame.grey()
+    wanted = find_format(format_name)
     if pixels.dtype.itemsize * 8 != wanted.depth:
         depth = frame.format.depth
         if wanted.depth == 8:
             pixels = (pixels >> (depth - wanted.depth)).astype(np.uint8)
         else:
             pixels = pixels.astype(np.uint16)
-    return with_pixels(frame, pixels, name)
+    return with_pixels(frame, pixels, format_name)
 
 
 # JPEG
@@ -155,7 +155,7 @@ def _no_conversion_error(frame: Frame, to: str, instead: str) -> FrameFormatErro
 # decoding
 
 
-def decode_frame(frame: Frame, name: str) -> Frame:
+def decode_frame(frame: Frame, format_name: str) -> Frame:
     """Decode a JPEG, PNG or JPEG XL to pixels of a format; "": the format of its contents."""
     if frame.format.name not in _DECODERS:
         readable = ", ".join(_DECODERS)
@@ -164,34 +164,34 @@ def decode_frame(frame: Frame, name: str) -> Frame:
             source=frame.source,
             available=tuple(_DECODERS),
         )
-    return _DECODERS[frame.format.name](frame, name)
+    return _DECODERS[frame.format.name](frame, format_name)
 
 
-def _from_jpeg(frame: Frame, name: str) -> Frame:
+def _from_jpeg(frame: Frame, format_name: str) -> Frame:
     *_, has_colours = jpeg_header(frame.data, "MJPEG")
-    name = find_format(name or ("RGB8" if has_colours else "Mono8")).name
+    format_name = find_format(format_name or ("RGB8" if has_colours else "Mono8")).name
     colours = {"Mono8": "GRAY", "RGB8": "RGB", "BGR8": "BGR"}
-    if name not in colours:
-        raise _mismatch_error(frame, "Mono8, RGB8 or BGR8", name)
+    if format_name not in colours:
+        raise _mismatch_error(frame, "Mono8, RGB8 or BGR8", format_name)
     size = (frame.width, frame.height)
-    pixels, remark = decode_jpeg(frame.data, colours[name], size, "MJPEG")
-    picture = with_pixels(frame, pixels[..., 0] if name == "Mono8" else pixels, name)
+    pixels, remark = decode_jpeg(frame.data, colours[format_name], size, "MJPEG")
+    picture = with_pixels(frame, pixels[..., 0] if format_name == "Mono8" else pixels, format_name)
     return replace(picture, remark=remark) if remark else picture
 
 
-def _from_png(frame: Frame, name: str) -> Frame:
+def _from_png(frame: Frame, format_name: str) -> Frame:
     head = bytes(frame.data[:24])
     if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
         raise _mismatch_error(frame, "a PNG", f"bytes that begin with {head[:8].hex(' ')}")
     size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
-    return _decode_lossless(frame, name, size, "png_decode")
+    return _decode_lossless(frame, format_name, size, "png_decode")
 
 
-def _from_jpegxl(frame: Frame, name: str) -> Frame:
-    return _decode_lossless(frame, name, jpegxl_size(frame), "jpegxl_decode")
+def _from_jpegxl(frame: Frame, format_name: str) -> Frame:
+    return _decode_lossless(frame, format_name, jpegxl_size(frame), "jpegxl_decode")
 
 
-def _decode_lossless(frame: Frame, name: str, size: tuple[int, int], decoder: str) -> Frame:
+def _decode_lossless(frame: Frame, format_name: str, size: tuple[int, int], decoder: str) -> Frame:
     """Decode a picture if it has the stated size; no memory is allocated for another size."""
     if size != (frame.width, frame.height):
         raise _mismatch_error(frame, f"{frame.width}x{frame.height}", f"{size[0]}x{size[1]}")
@@ -201,22 +201,24 @@ def _decode_lossless(frame: Frame, name: str, size: tuple[int, int], decoder: st
         raise _mismatch_error(frame, "a whole picture", f"{len(frame.data)} bytes: {exc}") from exc
     if pixels.ndim == 3 and pixels.shape[2] == 2:  # grey with alpha is returned with colours
         pixels = pixels[..., [0, 0, 0, 1]]
-    wanted = _format_of_samples(name, pixels)
+    wanted = _format_of_samples(format_name, pixels)
     if wanted is None:
         raise _mismatch_error(
-            frame, name or "grey or RGB", f"{pixels.dtype} of shape {pixels.shape}"
+            frame, format_name or "grey or RGB", f"{pixels.dtype} of shape {pixels.shape}"
         )
     return with_pixels(frame, pixels[..., ::-1] if wanted.name == "BGR8" else pixels, wanted.name)
 
 
-def _format_of_samples(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
-    """Return the format of a name, or the default one; None if the pixels do not fit the format."""
+def _format_of_samples(format_name: str, pixels: NDArray[Any]) -> PixelFormat | None:
+    """Return the named format, or the default one; None if the pixels do not fit it."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    wanted = find_format(name or _DEFAULT_FORMATS.get((channels, pixels.dtype.itemsize), "RGB8"))
+    wanted = find_format(
+        format_name or _DEFAULT_FORMATS.get((channels, pixels.dtype.itemsize), "RGB8")
+    )
     layout = wanted.layout
     if not isinstance(layout, SampleLayout) or layout.packing is not None:
         return None
-    fits = (layout.size_of, layout.channels) == (pixels.dtype.itemsize, channels)
+    fits = (layout.sample_bytes, layout.channels) == (pixels.dtype.itemsize, channels)
     return wanted if fits and pixels.dtype.kind == "u" else None
 
 

@@ -202,10 +202,10 @@ class Codecs:
 
     async def _run(self, work: Callable[[], T]) -> T:
         """Run work in a thread as soon as one is free."""
-        self._open_pool()
+        self._require_pool()
         await self._free_threads.acquire()
         try:
-            future = asyncio.get_running_loop().run_in_executor(self._open_pool(), work)
+            future = asyncio.get_running_loop().run_in_executor(self._require_pool(), work)
         except BaseException:
             self._free_threads.release()
             raise
@@ -213,7 +213,7 @@ class Codecs:
         future.add_done_callback(self._on_work_done)
         return await asyncio.shield(future)
 
-    def _open_pool(self) -> ThreadPoolExecutor:
+    def _require_pool(self) -> ThreadPoolExecutor:
         if self._pool is None:
             raise LocalProtocolError(
                 "Codecs: they are closed"
@@ -252,7 +252,7 @@ class StreamRunner:
         """Run the work, and return its result."""
         if not self.runs_in_loop:
             return await self._codecs._run(partial(self._run_timed, work))  # noqa: SLF001
-        self._codecs._open_pool()  # noqa: SLF001 - closed codecs run nothing
+        self._codecs._require_pool()  # noqa: SLF001 - closed codecs run nothing
         return self._run_timed(work)
 
     def _run_timed(self, work: Callable[[], T]) -> T:

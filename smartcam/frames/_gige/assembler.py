@@ -194,7 +194,7 @@ class Assembler:
         return min(map(self._deadline, self._open_blocks()), default=None)
 
     def handle_timeout(self, now: float) -> list[Resend]:
-        """Drop overdue packets; return the requests to send."""
+        """Give up overdue blocks, or request their packets; return the requests to send."""
         requests: list[Resend] = []
         for block in self._open_blocks():
             if self._deadline(block) <= now:
@@ -238,13 +238,13 @@ class Assembler:
         if block.request_count >= MAX_REQUESTS or too_many:
             block.is_lost = True
             return
-        is_past = (
+        is_fully_sent = (
             block.has_ended
             or block.trailer_packet is not None
             or block.progress_at + SILENCE_TIMEOUT <= now
         )
         # while other packets of the block come, a request does not count
-        block.request_count += is_past
+        block.request_count += is_fully_sent
         block.requested_at = now
         requests += [Resend(block.block_id, *gap, block.extended) for gap in gaps]
 

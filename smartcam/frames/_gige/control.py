@@ -23,11 +23,11 @@ from smartcam.frames._gige.gvcp import (
     decode_ack,
     encode,
     encode_resend,
-    read_memory,
-    read_registers,
+    readmem_payload,
+    readreg_payload,
     status_text,
-    write_memory,
-    write_registers,
+    writemem_payload,
+    writereg_payload,
 )
 
 if TYPE_CHECKING:
@@ -109,20 +109,20 @@ class ControlChannel(asyncio.DatagramProtocol):
             self._transport = None
 
     async def read_register(self, address: int) -> int:
-        """Return a register's number.
+        """Return the value of a register.
 
         Raises:
             FrameSourceError: the camera refuses, or does not answer.
         """
         payload = await self.request(
-            GvcpCommand.READREG, read_registers(address), 4, f"{address:#06x}"
+            GvcpCommand.READREG, readreg_payload(address), 4, f"{address:#06x}"
         )
         return int.from_bytes(payload[:4], "big")
 
     async def write_register(self, address: int, value: int) -> None:
         """Write a register; errors as in :meth:`read_register`."""
         subject = f"{address:#06x} = {value:#x}"
-        await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, subject)
+        await self.request(GvcpCommand.WRITEREG, writereg_payload((address, value)), 0, subject)
 
     async def read(self, address: int, length: int) -> bytes:
         """Return bytes of the camera's memory; errors as in :meth:`read_register`."""
@@ -135,7 +135,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             count = min(MAX_BYTES_PER_REQUEST, end - offset)
             payload = await self.request(
                 GvcpCommand.READMEM,
-                read_memory(offset, count),
+                readmem_payload(offset, count),
                 4 + count,
                 f"{offset:#06x}, {count}",
             )
@@ -155,7 +155,10 @@ class ControlChannel(asyncio.DatagramProtocol):
         for offset in range(begin, end, MAX_BYTES_PER_REQUEST):
             chunk = data[offset - begin :][:MAX_BYTES_PER_REQUEST]
             await self.request(
-                GvcpCommand.WRITEMEM, write_memory(offset, chunk), 0, f"{offset:#06x}, {len(chunk)}"
+                GvcpCommand.WRITEMEM,
+                writemem_payload(offset, chunk),
+                0,
+                f"{offset:#06x}, {len(chunk)}",
             )
 
     def request_resend(self, packets: Resend) -> None:

@@ -22,7 +22,7 @@ class GigEFeatures(DeviceFeatures):
     Args:
         get_features: coroutine function that returns the features of the open session.
         on_change: coroutine function that is called after a feature was set.
-        lock: lock held while several related features are set.
+        lock: lock that is held while features are set or a command runs.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class GigEFeatures(DeviceFeatures):
         """Set a feature; return the camera's new value."""
         async with self._lock:
             features = await self._get_features()
-            features.check_command(name, expected=False)
+            features.check_command(name, is_command=False)
             await features.set(name, value)
             await self._on_change()
         feature = await features.describe(name)

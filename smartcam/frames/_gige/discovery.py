@@ -72,7 +72,7 @@ def networks() -> list[Network]:
     try:
         import fcntl
     except ImportError:
-        return [Network("0.0.0.0", ("255.255.255.255",))]  # noqa: S104 - any address of its own
+        return [Network("0.0.0.0", ("255.255.255.255",))]  # noqa: S104 - every address of this machine
     found = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         for _, name in socket.if_nameindex():

@@ -18,13 +18,13 @@ from smartcam.exceptions import (
 from smartcam.frames._driver import FoundSource, FrameDriver
 from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._gige.assembler import Assembler
+from smartcam.frames._gige.camera_url import as_source, find_camera, read_wanted_stream
 from smartcam.frames._gige.control import RequestRefusedError
 from smartcam.frames._gige.device_features import GigEFeatures
 from smartcam.frames._gige.discovery import find_cameras, networks
 from smartcam.frames._gige.gvcp import GvcpStatus, Register
 from smartcam.frames._gige.gvsp import IP_UDP_BYTES, ImpliedPicture, PayloadType
 from smartcam.frames._gige.messages import doubt_about_size
-from smartcam.frames._gige.places import as_source, find_camera, read_wanted_stream
 from smartcam.frames._gige.session import GigESession
 from smartcam.frames._gige.setup import (
     MAX_NUMBER,
@@ -142,14 +142,14 @@ class GigEDriver(FrameDriver):
             FrameSourceError: the session cannot be opened, or was closed meanwhile.
         """
         async with self._open_lock:
-            if self._session is not None and self._session.lost is not None:
+            if self._session is not None and self._session.loss_error is not None:
                 await self._close_session()
             if self._session is None or self._shape is None:
                 host, port = await find_camera(self.address, self._options)
                 session = await GigESession.open(host, port, self.address.shown)
                 try:
                     self._shape = await set_up(session, self._options)
-                    self.form = self._shape.format
+                    self.changed_format = self._shape.format
                     await self._read_triggers(session)
                     if not self._is_open:
                         raise FrameSourceError(f"{self.name}: closed meanwhile", source=self.name)
@@ -181,14 +181,14 @@ class GigEDriver(FrameDriver):
         """Stop the stream; the camera stays open."""
         was_streaming, session = self._stream is not None, self._session
         self._close_stream()
-        if not was_streaming or session is None or session.lost is not None:
+        if not was_streaming or session is None or session.loss_error is not None:
             return
         try:
             await session.features.execute("AcquisitionStop")
             await set_locked(session.features, False)
             await session.control.write_register(Register.STREAM_PORT, 0)
         except FrameSourceError as exc:  # the camera is gone; the next start opens it again
-            session.lost = exc
+            session.loss_error = exc
 
     async def close(self) -> None:
         """Stop the stream and give up control of the camera."""
@@ -235,12 +235,12 @@ class GigEDriver(FrameDriver):
 
     async def _read_shape(self, session: GigESession) -> StreamShape:
         shape = self._shape = await read_shape(session)
-        self.form, self._has_changed_features = shape.format, False
+        self.changed_format, self._has_changed_features = shape.format, False
         return shape
 
     async def _read_triggers(self, session: GigESession) -> None:
         self._triggers = await read_settings(session.features)
-        self.waits_for = "; ".join(map(str, self._triggers))
+        self.awaited_condition = "; ".join(map(str, self._triggers))
 
     async def trigger(
         self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
@@ -265,7 +265,7 @@ class GigEDriver(FrameDriver):
 
                 def begin() -> None:
                     self._armed = armed
-                    pending.fire_begins()
+                    pending.record_fire()
 
                 if fire is None:
                     await self._send_software_trigger(session, pending, begin)
@@ -279,7 +279,7 @@ class GigEDriver(FrameDriver):
         try:
             await session.features.execute("TriggerSoftware", before_write=begin)
         except RequestRefusedError as exc:
-            pending.refused()
+            pending.record_refusal()
             if exc.status != GvcpStatus.BUSY:
                 raise
             raise CameraBusyError(f"{self.name}: the camera accepts no trigger now: {exc}") from exc
@@ -299,13 +299,13 @@ class GigEDriver(FrameDriver):
         armed = self._armed
         if armed is None or armed.is_older(picture):
             return None
-        if doubt := armed.reason_for_doubt(picture, ids_agree=session.ids_agree):
+        if doubt := armed.reason_for_doubt(picture, event_ids_match=session.event_ids_match):
             self.disarm()
             return FrameLostError(
                 f"{self.name}: the trigger of block {picture.block_id} is uncertain: {doubt}"
             )
         self._armed = None
-        session.ids_agree = session.ids_agree or picture.block_id in armed.exposed
+        session.event_ids_match = session.event_ids_match or picture.block_id in armed.exposed
         return armed.to_frame_trigger(picture, session.ticks_per_second)
 
     async def watch_events(
@@ -369,7 +369,7 @@ class GigEDriver(FrameDriver):
                 resend=resend,
                 starts_at_one=not self._triggers and not session.has_streamed,
                 implied_picture=ImpliedPicture(
-                    shape.number, shape.format.width, shape.format.height
+                    shape.format_code, shape.format.width, shape.format.height
                 ),
             )
             session.has_streamed = True
@@ -414,7 +414,7 @@ class GigEDriver(FrameDriver):
             if self._sink is None or self._shape is None or self._session is None:
                 return
             shape, leader = self._shape, picture.leader
-            if (leader.pixel_format, leader.width) != (shape.number, shape.format.width):
+            if (leader.pixel_format, leader.width) != (shape.format_code, shape.format.width):
                 self._end_stream(self._changed_format_error(picture, shape))
                 return
             chunks, remark = self._session.read_chunks(picture)
@@ -439,7 +439,7 @@ class GigEDriver(FrameDriver):
     def _changed_format_error(self, picture: WholePicture, shape: StreamShape) -> FrameFormatError:
         leader = picture.leader
         return FrameFormatError(
-            f"{self.name}: it streams {shape.format} ({shape.number:#010x}), then came "
+            f"{self.name}: it streams {shape.format} ({shape.format_code:#010x}), then came "
             f"{leader.width}x{leader.height} of {leader.pixel_format:#010x}",
             source=self.name,
             available=(str(shape.format),),

@@ -154,7 +154,7 @@ class EventChannel(asyncio.DatagramProtocol):
         self._watchers: list[_EventWatcher] = []
         self._names_by_number: dict[int, str] = {}
         self._numbers_by_name: dict[str, int] = {}
-        self._messages: MessageFeatures | None = None
+        self._event_features: MessageFeatures | None = None
         self._recent_requests: collections.deque[int] = collections.deque(maxlen=MAX_KEPT_REQUESTS)
         self.dropped = 0
         """Number of datagrams that were no events, or came from other hosts."""
@@ -212,7 +212,7 @@ class EventChannel(asyncio.DatagramProtocol):
             if watcher in self._watchers:
                 self._watchers.remove(watcher)
             still_watched = {name for other in self._watchers for name in other.names}
-            if self._session.lost is None and self._transport is not None:
+            if self._session.loss_error is None and self._transport is not None:
                 for name in watcher.names:
                     if name not in still_watched:
                         with contextlib.suppress(FrameSourceError):
@@ -244,18 +244,18 @@ class EventChannel(asyncio.DatagramProtocol):
             ):
                 with contextlib.suppress(RequestRefusedError):  # not all cameras resend events
                     await control.write_register(register, value)
-            if self._messages is None:
-                self._messages = MessageFeatures(self._session.features, "EventID")
+            if self._event_features is None:
+                self._event_features = MessageFeatures(self._session.features, "EventID")
         except BaseException:
             transport.abort()
             raise
         self._transport = transport
 
     async def _learn_number(self, name: str) -> None:
-        """Store the number of an event, from its port or its feature."""
-        if self._messages is None or name in self._numbers_by_name:
+        """Store an event's number, from its port in the description or from its feature."""
+        if self._event_features is None or name in self._numbers_by_name:
             return
-        number: float | None = self._messages.number_of(f"Event{name}")
+        number: float | None = self._event_features.find_number(f"Event{name}")
         if number is None:
             number = await self._session.features.number(f"Event{name}")
         if number is None:
@@ -286,7 +286,7 @@ class EventChannel(asyncio.DatagramProtocol):
         self.end_watchers(None)
         if transport is not None:
             transport.abort()
-            if self._session.lost is None:
+            if self._session.loss_error is None:
                 with contextlib.suppress(FrameSourceError):
                     await self._session.control.write_register(Register.MESSAGE_PORT, 0)
 
@@ -316,9 +316,9 @@ class EventChannel(asyncio.DatagramProtocol):
 
     def _report(self, item: EventItem) -> None:
         name = self._names_by_number.get(item.number)
-        if name is None or self._messages is None:
+        if name is None or self._event_features is None:
             return
-        values, problems = self._messages.read({item.number: memoryview(item.data)})
+        values, problems = self._event_features.read({item.number: memoryview(item.data)})
         ticks = self._session.ticks_per_second
         event = FrameEvent(
             name,

@@ -104,7 +104,7 @@ class GenicamFeatures:
         self._selectors: dict[str, tuple[str, ...]] | None = None
 
     def share_description(self, other: GenicamFeatures) -> None:
-        """Share the description and the set values of another object."""
+        """Share another object's description, and the values that were set in it."""
         GenicamFeatures.__init__(self, other._nodes, other._port, other._source)
         self._own_values = other._own_values
 
@@ -202,19 +202,19 @@ class GenicamFeatures:
         """
         await self.set(name, 1, before_write=before_write)
 
-    def check_command(self, name: str, *, expected: bool = True) -> None:
-        """Raise unless a name belongs to a command; with ``expected`` False, raise if it does.
+    def check_command(self, name: str, *, is_command: bool = True) -> None:
+        """Raise unless a name belongs to a command; with ``is_command`` False, raise if it does.
 
         Raises:
-            FrameSourceError: the feature is no command, or there is no such feature.
+            FrameSourceError: the feature is of the other kind, or there is no such feature.
         """
         node = self._find_node(name)
-        if (node.kind == "Command") != expected:
-            is_not = "a command: it is executed" if not expected else "no command: it is set"
-            raise self._feature_error(node.name, f"it is {is_not}")
+        if (node.kind == "Command") != is_command:
+            text = "it is no command: set it" if is_command else "it is a command: execute it"
+            raise self._feature_error(node.name, text)
 
     async def is_done(self, name: str) -> bool:
-        """Return True if a command is done, so that its register has changed.
+        """Return True if a command is done: its register no longer has the command's value.
 
         A command with an unreadable register is done when the camera answers the write.
 
@@ -225,7 +225,7 @@ class GenicamFeatures:
             node = await self._available_node(name)
             try:
                 command = await self._number_field(node, "CommandValue", 0, 1)
-                return await self._get_own_value(node, 0) != command
+                return await self._get_value_field(node, 0) != command
             except MessageError:
                 return True
 
@@ -369,7 +369,9 @@ class GenicamFeatures:
         """Count a visited node; raise MessageError beyond the limits of depth and number."""
         self._visited_nodes += 1
         if depth > MAX_LINKED_NODES or self._visited_nodes > MAX_NODES_VISITED:
-            raise MessageError(f"node {node.name}: its description goes in a circle")
+            raise MessageError(
+                f"node {node.name}: its value depends on itself, or on too many nodes"
+            )
         self._count_elements(node, len(node.children))
 
     def _count_elements(self, node: Element, work: int) -> None:
@@ -392,7 +394,7 @@ class GenicamFeatures:
             raw = await self._number_field(node, "Value", depth)
             return await self._evaluate(node, node.text_of("FormulaFrom"), {"TO": raw}, depth)
         if node.kind in _VALUE_NODES:
-            return await self._get_own_value(node, depth)
+            return await self._get_value_field(node, depth)
         data = await self._read_register(node, *await self._register_location(node, depth))
         if node.kind == "StringReg":
             return text(data)
@@ -400,7 +402,7 @@ class GenicamFeatures:
             return _float(node, data)
         return _bits(node, data)
 
-    async def _get_own_value(self, node: Element, depth: int) -> FeatureValue:
+    async def _get_value_field(self, node: Element, depth: int) -> FeatureValue:
         if node.name in self._own_values:
             return self._own_values[node.name]
         target = await self._value_node(node, depth)
@@ -456,7 +458,7 @@ class GenicamFeatures:
         self, node: Element, formula: str, variables: dict[str, int | float], depth: int
     ) -> int | float:
         """Evaluate a formula with the node's variables."""
-        integral = node.kind.startswith("Int")
+        as_integers = node.kind.startswith("Int")
         self._count_elements(node, len(formula))
         for child in node.children:
             if child.kind == "pVariable":
@@ -465,8 +467,8 @@ class GenicamFeatures:
                 variables[child.name] = _number(child.text)
             elif child.kind == "Expression":
                 self._count_elements(node, len(child.text))
-                variables[child.name] = evaluate(child.text, variables, integral=integral)
-        return evaluate(formula, variables, integral=integral)
+                variables[child.name] = evaluate(child.text, variables, as_integers=as_integers)
+        return evaluate(formula, variables, as_integers=as_integers)
 
     async def _variable(self, variable: Element, depth: int) -> int | float:
         """Return the value of a formula's variable: of its node, or of the node's ``.NAME``."""
@@ -501,8 +503,8 @@ class GenicamFeatures:
         self._count_node(node, depth)
         if node.first(bound, "p" + bound) is not None:
             return await self._number_field(node, bound, depth)
-        has_own_value = node.kind in ("Integer", "Float", "Enumeration")
-        target = await self._value_node(node, depth) if has_own_value else None
+        can_link = node.kind in ("Integer", "Float", "Enumeration")
+        target = await self._value_node(node, depth) if can_link else None
         if target is not None:
             return await self._limit(target, bound, depth + 1)
         if bound == "Inc" and node.kind in _INTEGER_NODES:

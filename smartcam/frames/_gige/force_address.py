@@ -23,6 +23,7 @@ from smartcam.exceptions import (
     FrameTimeoutError,
     MessageError,
 )
+from smartcam.frames._gige.camera_url import as_source
 from smartcam.frames._gige.discovery import find_cameras, networks
 from smartcam.frames._gige.gvcp import (
     ACK_REQUIRED,
@@ -32,7 +33,6 @@ from smartcam.frames._gige.gvcp import (
     encode,
     status_text,
 )
-from smartcam.frames._gige.places import as_source
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,7 +57,7 @@ async def force_address(
     address: str,
     *,
     gateway: str = "0.0.0.0",  # noqa: S104 - no gateway
-    places: Sequence[Network] | None = None,
+    in_networks: Sequence[Network] | None = None,
     port: int = PORT,
 ) -> FoundSource:
     """Set a camera's IP address until it is switched off; return the camera at its new address.
@@ -66,7 +66,7 @@ async def force_address(
         mac: hardware address of the camera, ``00:11:22:33:44:55``.
         address: IP address with its prefix length, ``192.168.0.20/24``.
         gateway: default gateway of the camera; ``0.0.0.0``: none.
-        places: networks to search; None: all networks of this machine.
+        in_networks: networks to search; None: all networks of this machine.
         port: UDP port that cameras listen at.
 
     Raises:
@@ -77,25 +77,25 @@ async def force_address(
     Cancellation: the camera may have the new address.
     """
     checked = checked_mac(mac)
-    interface = _interface(address)
+    new_address = _parse_address(address)
     gateway_address = _ip(gateway, "gateway")
-    interfaces = networks() if places is None else places
-    cameras = await find_cameras(interfaces, port=port)
+    in_networks = networks() if in_networks is None else in_networks
+    cameras = await find_cameras(in_networks, port=port)
     camera = _camera_with_mac(cameras, checked)
-    holders = [other for other in cameras if other.info.address == str(interface.ip)]
+    holders = [other for other in cameras if other.info.address == str(new_address.ip)]
     if holders and holders[0].info.mac != checked:
         raise ConfigurationError(
-            f"address: {interface.ip} is the address of {holders[0].info.label} "
+            f"address: {new_address.ip} is the address of {holders[0].info.label} "
             f"({holders[0].info.mac}) already"
         )
     payload = _REQUEST.pack(
         bytes.fromhex(checked.replace(":", "")),
-        interface.ip.packed,
-        interface.netmask.packed,
+        new_address.ip.packed,
+        new_address.netmask.packed,
         gateway_address.packed,
     )
-    await _send_request(payload, interfaces, port, camera)
-    return await _wait_for_camera(checked, str(interface.ip), interfaces, port)
+    await _send_request(payload, in_networks, port, camera)
+    return await _wait_for_camera(checked, str(new_address.ip), in_networks, port)
 
 
 def checked_mac(mac: str) -> str:
@@ -113,7 +113,7 @@ def checked_mac(mac: str) -> str:
     return bytes.fromhex(digits).hex(":")
 
 
-def _interface(address: str) -> ipaddress.IPv4Interface:
+def _parse_address(address: str) -> ipaddress.IPv4Interface:
     given = check_text(address, "address", "force_address", most=100)
     expected = f"address: expected an IPv4 address such as 192.168.0.20/24, got {given[:60]!r}"
     if "/" not in given:
@@ -154,7 +154,7 @@ def _camera_with_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamer
 
 
 async def _send_request(
-    payload: bytes, interfaces: Sequence[Network], port: int, camera: AnsweringCamera
+    payload: bytes, in_networks: Sequence[Network], port: int, camera: AnsweringCamera
 ) -> None:
     """Broadcast the request in all networks until it is answered.
 
@@ -167,17 +167,17 @@ async def _send_request(
     transports: list[tuple[asyncio.DatagramTransport, Network]] = []
     datagram = encode(GvcpCommand.FORCEIP, _REQUEST_ID, payload, flags=ACK_REQUIRED)
     try:
-        for interface in interfaces:
+        for network in in_networks:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, _ = await loop.create_datagram_endpoint(
                     functools.partial(_ForceAnswers, status_future),
-                    local_addr=(interface.address, 0),
+                    local_addr=(network.address, 0),
                     allow_broadcast=True,
                 )
-                transports.append((transport, interface))
+                transports.append((transport, network))
         for _ in range(MAX_ATTEMPTS):
-            for transport, interface in transports:
-                for target in interface.targets:
+            for transport, network in transports:
+                for target in network.targets:
                     transport.sendto(datagram, (target, port))
             done, _ = await asyncio.wait([status_future], timeout=ANSWER_TIMEOUT)
             if done:
@@ -196,12 +196,12 @@ async def _send_request(
 
 
 async def _wait_for_camera(
-    mac: str, address: str, interfaces: Sequence[Network], port: int
+    mac: str, address: str, in_networks: Sequence[Network], port: int
 ) -> FoundSource:
     loop = asyncio.get_running_loop()
     end = loop.time() + APPEAR_TIMEOUT
     while True:
-        for camera in await find_cameras(interfaces, port=port):
+        for camera in await find_cameras(in_networks, port=port):
             if camera.info.mac == mac and camera.info.address == address:
                 return as_source(camera._replace(address=address))
         if loop.time() >= end:

@@ -225,22 +225,22 @@ def decode_ack(datagram: bytes) -> Ack:
     return Ack(status, command, request_id, payload[:length])
 
 
-def read_registers(*addresses: int) -> bytes:
+def readreg_payload(*addresses: int) -> bytes:
     """Return the payload of a READREG of some addresses."""
     return b"".join(_WORD.pack(address) for address in addresses)
 
 
-def write_registers(*pairs: tuple[int, int]) -> bytes:
+def writereg_payload(*pairs: tuple[int, int]) -> bytes:
     """Return the payload of a WRITEREG of (address, value)."""
     return b"".join(struct.pack(">II", *pair) for pair in pairs)
 
 
-def read_memory(address: int, count: int) -> bytes:
+def readmem_payload(address: int, count: int) -> bytes:
     """Return the payload of a READMEM of ``count`` bytes, a multiple of four."""
     return struct.pack(">IHH", address, 0, count)
 
 
-def write_memory(address: int, data: bytes) -> bytes:
+def writemem_payload(address: int, data: bytes) -> bytes:
     """Return the payload of a WRITEMEM; the length is a multiple of four."""
     return _WORD.pack(address) + data
 

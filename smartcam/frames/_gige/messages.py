@@ -56,8 +56,8 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
         begin = end - _CHUNK_TAIL.size - length
         if begin < 0 or number in chunks:
             raise MessageError(
-                f"chunk data: chunk {number:#x} of {length} bytes, which is there "
-                f"{'twice' if number in chunks else f'before byte {end}'}"
+                f"chunk data: chunk {number:#x} of {length} bytes "
+                f"{'comes twice' if number in chunks else f'does not fit before byte {end}'}"
             )
         chunks[number] = payload[begin : end - _CHUNK_TAIL.size]
         end = begin
@@ -65,10 +65,10 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
 
 
 def doubt_about_size(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
-    """Return why a picture may not have the size in the features; "": no reason for doubt.
+    """Return why a picture may not have the size of the features; "": no reason for doubt.
 
     Args:
-        picture: picture with the size in the camera's features.
+        picture: picture whose size was taken from the camera's features.
         chunks: values that came with the picture.
     """
     leader = picture.leader
@@ -81,7 +81,7 @@ def doubt_about_size(picture: WholePicture, chunks: Mapping[str, FeatureValue]) 
         return f"a picture of {size} has {need} bytes, the chunk that came has {len(first)}"
     for name, expected in (("ChunkWidth", leader.width), ("ChunkHeight", leader.height)):
         if chunks.get(name, expected) != expected:
-            return f"its picture is {size} by its features, {name} is {chunks[name]}"
+            return f"its picture is {size} according to its features, but {name} is {chunks[name]}"
     return ""
 
 
@@ -104,8 +104,8 @@ class MessageFeatures(GenicamFeatures):
             if number is not None:
                 self._by_number.setdefault(number, []).append(name)
 
-    def number_of(self, beginning: str) -> int | None:
-        """Return the number of the message whose features begin with ``beginning``."""
+    def find_number(self, beginning: str) -> int | None:
+        """Return the number of the message with a feature whose name begins so; None: none."""
         for number, names in self._by_number.items():
             if any(name.startswith(beginning) for name in names):
                 return number

@@ -35,7 +35,7 @@ MAX_REMARK_LENGTH: Final = 1000
 CAPABILITIES: Final = 0x0934
 URL_SIZE: Final = 512
 HEARTBEAT_TIMEOUTS: Final = (0.5, 60.0)
-"""Least and largest heartbeat timeout of a camera that is used unchanged, seconds."""
+"""Least and largest heartbeat timeout, seconds; a camera's timeout beyond them is not believed."""
 
 
 class GigESession:
@@ -49,7 +49,7 @@ class GigESession:
     def __init__(self, control: ControlChannel, label: str) -> None:
         self.control = control
         self.label = label
-        self.lost: FrameSourceError | None = None
+        self.loss_error: FrameSourceError | None = None
         self.on_lost: Callable[[FrameSourceError], None] = lambda _: None
         self.ticks_per_second = 0
         self.can_resend = False
@@ -57,7 +57,7 @@ class GigESession:
         """Whether the camera has streamed before."""
         self.watches_exposures = False
         """Whether events about triggers are switched on."""
-        self.ids_agree = False
+        self.event_ids_match = False
         """Whether an event has named the block of a received picture."""
         self.events = EventChannel(self)
         self._features: GenicamFeatures | None = None
@@ -123,7 +123,7 @@ class GigESession:
             if heartbeat_task is not None:
                 heartbeat_task.cancel()
                 await asyncio.wait([heartbeat_task])
-            if has_control and self.lost is None:
+            if has_control and self.loss_error is None:
                 with contextlib.suppress(FrameSourceError):
                     await self.control.write_register(Register.CONTROL_PRIVILEGE, 0)
         finally:
@@ -179,7 +179,7 @@ class GigESession:
             return 0
 
     def _on_lost(self, error: FrameSourceError) -> None:
-        self.lost = error
+        self.loss_error = error
         self.on_lost(error)
         self.events.end_watchers(error)
 

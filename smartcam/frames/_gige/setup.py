@@ -87,13 +87,13 @@ class StreamShape(NamedTuple):
 
     Attributes:
         format: format of the frames.
-        number: PFNC's number of the pixel format.
+        format_code: PFNC's number of the pixel format.
         payload: largest number of bytes of a frame.
         exposure: longest time of a frame.
     """
 
     format: StreamFormat
-    number: int
+    format_code: int
     payload: int
     exposure: Exposure
 

@@ -148,7 +148,7 @@ class Stream:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer_at = deadline  # uvloop's timers do not report cancellation
+        self._timer_at = deadline  # stored: uvloop's timers do not tell whether they are cancelled
         self._timer = self._loop.call_at(deadline, self._on_timer)
 
     def _on_timer(self) -> None:

@@ -1,9 +1,9 @@
 """Trigger a GigE Vision camera, and find the picture that a trigger caused.
 
-The next picture belongs to the pending trigger, with three exceptions. The picture was exposed
-before the trigger, by the camera's clock, which is read right before it; a picture was lost
-meanwhile; or an event of the camera names another block. If the clock cannot be read, the only
-evidence is that all earlier pictures of the stream have come.
+The next picture belongs to the pending trigger, with three exceptions: the camera's clock, read
+right before the trigger, shows that the picture was exposed earlier; a picture was lost meanwhile;
+or an event of the camera names another block. If the clock cannot be read, the only evidence is
+that all earlier pictures of the stream have come.
 
 Source: SFNC 2.7, chapter 5 (``TriggerSelector``, ``TriggerMode``, ``TriggerSource``,
 ``TriggerSoftware``); GigE Vision 2.0, chapter 28 (timestamp latch).
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam.exceptions import FrameSourceError, NotRunningError, UnsupportedError
 from smartcam.frames._frame import FrameTrigger
+from smartcam.frames._trigger import MAX_NOTES
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -145,7 +146,7 @@ async def usable_setting(
     if not by_line and not is_software:
         raise NotRunningError(
             f"{name}: {setting}: set TriggerSource to {SOFTWARE}, or pass `fire`, a function that "
-            "sets that line; after(time.monotonic()) waits for a picture that others trigger"
+            "sets that line; for a picture that others trigger, use source.after(time.monotonic())"
         )
     return setting
 
@@ -154,7 +155,7 @@ async def usable_setting(
 async def selected_trigger(
     features: GenicamFeatures, setting: TriggerSetting
 ) -> AsyncIterator[None]:
-    """Set TriggerSelector to a trigger for the block, then restore it.
+    """Set TriggerSelector to a trigger within the ``with`` statement, then restore it.
 
     Raises:
         FrameSourceError: the camera does not answer.
@@ -193,26 +194,26 @@ class ArmedTrigger:
         self.pending, self.delay = pending, delay
         self._latched_ticks, self._setting, self._is_first = latched_ticks, setting, is_first
         self.exposed: list[int] = []
-        """Blocks exposed since the trigger, by the camera's events."""
+        """Blocks exposed since the trigger, according to the camera's events."""
 
     def is_older(self, picture: WholePicture) -> bool:
-        """Return True if a picture was exposed before the trigger, by the camera's clock."""
+        """Return True if a picture was exposed before the trigger, on the camera's clock."""
         ticks = picture.leader.ticks
         is_earlier = self._latched_ticks is not None and 0 < ticks < self._latched_ticks
         if is_earlier:
             self._add_note(f"block {picture.block_id} came, which was exposed before the trigger")
         return is_earlier
 
-    def reason_for_doubt(self, picture: WholePicture, *, ids_agree: bool) -> str:
+    def reason_for_doubt(self, picture: WholePicture, *, event_ids_match: bool) -> str:
         """Return the reason why a picture may belong to another trigger, or ``""``.
 
         Args:
             picture: picture that came first.
-            ids_agree: whether this camera's events and pictures are known to have the same ids.
+            event_ids_match: whether this camera's events are known to name blocks as pictures do.
         """
         if picture.lost > 0 and not self._is_first:
             return f"{picture.lost} pictures right before it came incomplete, or not at all"
-        if ids_agree and self.exposed and picture.block_id not in self.exposed:
+        if event_ids_match and self.exposed and picture.block_id not in self.exposed:
             return f"the camera exposed block {self.exposed[0]} for it, which did not come"
         return ""
 
@@ -233,7 +234,7 @@ class ArmedTrigger:
         return False
 
     def _add_note(self, text: str) -> None:
-        if len(self.pending.notes) < MAX_EXPOSURES:
+        if len(self.pending.notes) < MAX_NOTES:
             self.pending.notes.append(text)
 
     def to_frame_trigger(self, picture: WholePicture, ticks_per_second: int) -> FrameTrigger:
@@ -246,8 +247,8 @@ class ArmedTrigger:
         if self._latched_ticks is not None and picture.leader.ticks:
             delay = (picture.leader.ticks - self._latched_ticks) / ticks_per_second
             evidence.append(
-                f"by the camera's clock exposed {1e3 * delay:.3f} ms after its clock was read, "
-                "right before the trigger"
+                f"it was exposed {1e3 * delay:.3f} ms after the camera's clock was read, right "
+                "before the trigger"
             )
         if self._setting.source == SOFTWARE:
             evidence.append(

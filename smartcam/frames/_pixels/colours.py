@@ -202,27 +202,27 @@ def _without_alpha(samples: NDArray[Any]) -> NDArray[Any]:
     return samples[..., :3]
 
 
-def _to_rgb(order: str, by_numpy: _Conversion) -> _Conversion:
-    """Return a function that converts samples to colours by OpenCV's conversion ``order``."""
+def _to_rgb(kind: str, by_numpy: _Conversion) -> _Conversion:
+    """Return a function that converts samples to colours by OpenCV's ``COLOR_<kind>2RGB``."""
 
     def convert(samples: NDArray[Any]) -> NDArray[Any]:
         cv2 = opencv()
         if cv2 is None:
             return by_numpy(samples)
-        result: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{order}2RGB"))
+        result: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{kind}2RGB"))
         return result
 
     return convert
 
 
-def _to_grey(order: str, by_numpy: _Conversion) -> _Conversion:
-    """Return a function that converts samples to brightness by OpenCV's conversion ``order``."""
+def _to_grey(kind: str, by_numpy: _Conversion) -> _Conversion:
+    """Return a function that converts samples to brightness by OpenCV's ``COLOR_<kind>2GRAY``."""
 
     def convert(samples: NDArray[Any]) -> NDArray[Any]:
         cv2 = opencv()
-        if cv2 is None or samples.dtype != np.uint8:  # OpenCV's result may differ by two levels
+        if cv2 is None or samples.dtype != np.uint8:  # of 16 bits, OpenCV may err by two levels
             return _brightness(by_numpy(samples))
-        result: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{order}2GRAY"))
+        result: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{kind}2GRAY"))
         return result
 
     return convert

@@ -138,11 +138,16 @@ def _pairs(name: str, fourcc: str, code: int, y: int, matrix: str) -> PixelForma
 
 
 def _planes(
-    name: str, fourcc: str, across: int, down: int, matrix: str, depth: int = 8
+    name: str, fourcc: str, chroma_columns: int, chroma_rows: int, matrix: str, depth: int = 8
 ) -> PixelFormat:
     """Return a format of planes; U and V are interleaved if its name begins with NV."""
-    layout = Planes(across, down, name.startswith("NV"), matrix, depth)
-    bits = 8 * layout.size_of * (across * down + 2) // (across * down)
+    layout = Planes(chroma_columns, chroma_rows, name.startswith("NV"), matrix, depth)
+    bits = (
+        8
+        * layout.sample_bytes
+        * (chroma_columns * chroma_rows + 2)
+        // (chroma_columns * chroma_rows)
+    )
     return PixelFormat(name, fourcc, bits, 0, depth, layout=layout)
 
 
@@ -218,8 +223,8 @@ PIXEL_FORMATS: Final = (
         for suffix, matrix in _MATRIX_SUFFIXES[3:]
     ),
     *(
-        _planes(f"{name}{suffix}", "" if suffix else fourcc, across, down, matrix)
-        for name, fourcc, across, down in (
+        _planes(f"{name}{suffix}", "" if suffix else fourcc, chroma_columns, chroma_rows, matrix)
+        for name, fourcc, chroma_columns, chroma_rows in (
             ("NV12", "NV12", 2, 2),
             ("I420", "YU12", 2, 2),
             ("I422", "422P", 2, 1),
@@ -228,8 +233,8 @@ PIXEL_FORMATS: Final = (
         for suffix, matrix in _MATRIX_SUFFIXES
     ),
     *(
-        _planes(f"{name}_{depth}{suffix}", "", across, down, matrix, depth)
-        for name, across, down in (("I420", 2, 2), ("I422", 2, 1), ("I444", 1, 1))
+        _planes(f"{name}_{depth}{suffix}", "", chroma_columns, chroma_rows, matrix, depth)
+        for name, chroma_columns, chroma_rows in (("I420", 2, 2), ("I422", 2, 1), ("I444", 1, 1))
         for depth in (10, 12, 16)
         for suffix, matrix in _MATRIX_SUFFIXES
     ),

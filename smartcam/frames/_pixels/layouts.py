@@ -27,7 +27,7 @@ class RawPicture(NamedTuple):
 
     Attributes:
         format: name of the format, for errors.
-        data: bytes of the picture; for brightness only, also :class:`SeparatePlanes`.
+        data: bytes of the picture; the brightness is also read from :class:`SeparatePlanes`.
         width: pixels.
         height: pixels.
         stride: bytes from one row to the next.
@@ -112,13 +112,13 @@ class SampleLayout(PixelLayout):
 
     Attributes:
         colours: conversions of the samples.
-        size_of: number of bytes of a sample, after unpacking if it is packed.
+        sample_bytes: number of bytes of a sample, after unpacking if it is packed.
         channels: samples of a pixel.
         packing: positions of packed samples in shared bytes; None: the samples are not packed.
     """
 
     colours: Colours
-    size_of: int = 1
+    sample_bytes: int = 1
     channels: int = 1
     packing: Packing | None = None
 
@@ -130,7 +130,7 @@ class SampleLayout(PixelLayout):
     def least_stride(self, width: int) -> int:
         """Return the bytes of a row."""
         if self.packing is None:
-            return width * self.channels * self.size_of
+            return width * self.channels * self.sample_bytes
         return -(-width * self.packing.size // len(self.packing.pixels))
 
     def size(self, width: int, height: int, stride: int) -> int:
@@ -152,8 +152,8 @@ class SampleLayout(PixelLayout):
         _, _, width, height, stride = picture
         if self.packing is None:
             shape = (height, width, self.channels)
-            strides = (stride, self.channels * self.size_of, self.size_of)
-            view = _view(picture, f"<u{self.size_of}", shape, strides)
+            strides = (stride, self.channels * self.sample_bytes, self.sample_bytes)
+            view = _view(picture, f"<u{self.sample_bytes}", shape, strides)
             return view if self.channels > 1 else view[..., 0]
         row_count, row_width = (height, width) if stride else (1, width * height)
         packed = _view(picture, "u1", (row_count, self.least_stride(row_width)), (stride, 1))
@@ -232,37 +232,45 @@ class Planes(PixelLayout):
     """Planes of Y, U and V; up to four pixels share U and V. All strides follow from Y's stride.
 
     Attributes:
-        across: pixels along a row that share a U and a V.
-        down: rows that share a U and a V.
+        chroma_columns: pixels along a row that share a U and a V.
+        chroma_rows: rows that share a U and a V.
         interleaved: whether U and V alternate in one plane with the stride of Y; else they have
             separate planes.
         matrix: name of the matrix in ``MATRICES``.
         depth: bits of a sample; a sample of more than 8 bits takes two bytes, the low byte first.
     """
 
-    across: int
-    down: int
+    chroma_columns: int
+    chroma_rows: int
     interleaved: bool
     matrix: str
     depth: int = 8
 
     @property
-    def size_of(self) -> int:
+    def sample_bytes(self) -> int:
         """Bytes of a sample."""
         return 1 if self.depth == 8 else 2
 
     def least_stride(self, width: int) -> int:
         """Return the number of bytes of a row of Y, or of U and V if that is larger."""
-        return self.size_of * (-(-width // self.across) * 2 if self.interleaved else width)
+        return self.sample_bytes * (
+            -(-width // self.chroma_columns) * 2 if self.interleaved else width
+        )
 
     def _chroma_shape(self, width: int, height: int, stride: int) -> tuple[int, int, int]:
         """Return the width, height and stride of U and V."""
-        return -(-width // self.across), -(-height // self.down), self.chroma_stride(stride)
+        return (
+            -(-width // self.chroma_columns),
+            -(-height // self.chroma_rows),
+            self.chroma_stride(stride),
+        )
 
     def chroma_stride(self, stride: int) -> int:
         """Return the bytes from row to row of U and V."""
-        samples = stride // self.size_of
-        return stride if self.interleaved else self.size_of * -(-samples // self.across)
+        samples = stride // self.sample_bytes
+        return (
+            stride if self.interleaved else self.sample_bytes * -(-samples // self.chroma_columns)
+        )
 
     def size(self, width: int, height: int, stride: int) -> int:
         """Return the bytes of all planes."""
@@ -280,7 +288,7 @@ class Planes(PixelLayout):
         self.check(picture)
         _, _, width, height, stride = picture
         columns, rows, chroma_stride = self._chroma_shape(width, height, stride)
-        size, dtype = self.size_of, f"<u{self.size_of}"
+        size, dtype = self.sample_bytes, f"<u{self.sample_bytes}"
         y = _view(picture, dtype, (height, width), (stride, size))
         begin, step = stride * height, size * (2 if self.interleaved else 1)
         v_offset = size if self.interleaved else chroma_stride * rows
@@ -297,15 +305,17 @@ class Planes(PixelLayout):
         else:
             self.check(picture)
         _, _, width, height, stride = picture
-        return _view(picture, f"<u{self.size_of}", (height, width), (stride, self.size_of))
+        return _view(
+            picture, f"<u{self.sample_bytes}", (height, width), (stride, self.sample_bytes)
+        )
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
         y, *chroma = self.planes(picture)
         if self.interleaved:
-            shape, strides = (*chroma[0].shape, 2), (*chroma[0].strides, self.size_of)
+            shape, strides = (*chroma[0].shape, 2), (*chroma[0].strides, self.sample_bytes)
             begin = picture.stride * picture.height
-            chroma = [_view(picture, f"<u{self.size_of}", shape, strides, begin)]
+            chroma = [_view(picture, f"<u{self.sample_bytes}", shape, strides, begin)]
         return yuv_to_rgb(y, chroma, MATRICES[self.matrix], self.depth)
 
 

@@ -109,11 +109,11 @@ class RateControl:
 
         control = RateControl(bitrate=4e6)
         ...  # send a frame of control.quality, control.pause seconds after the last one at least
-        control.sent(size, sent_at, transit_time)
+        control.record_arrival(size, sent_at, transit_time)
 
     The control lowers the quality to its limit, and only then the frame rate; it raises the frame
-    rate first. It follows a drop within a second, and rises by at most 30 % per second to avoid
-    oscillation. Of a bit rate and a latency, the stricter one is kept.
+    rate first. It follows a drop within a second. After the first drop it rises by at most
+    30 % per second, to avoid oscillation. Of a bit rate and a latency, the stricter one is kept.
 
     Args:
         bitrate: bits per second on average.
@@ -173,7 +173,7 @@ class RateControl:
             self._age.value + self._transit_time.value,
         )
 
-    def sent(
+    def record_arrival(
         self,
         size: int,
         sent_at: float,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError, SmartCamError
-from smartcam.frames._codecs.h264 import entry_point
+from smartcam.frames._codecs.h264 import random_access_point
 
 if TYPE_CHECKING:
     from smartcam.frames._codecs.h264 import H264Encoder
@@ -129,7 +129,7 @@ class SharedH264:
     async def close(self) -> None:
         """Stop reading, without informing viewers. Idempotent.
 
-        Cancellation: takes effect after the task has ended, without delay.
+        Cancellation: ends the wait at once; the reading stops nevertheless.
         """
         self._viewers.clear()
         error = FrameSourceError(f"{self.source.name}: its stream was closed")
@@ -225,7 +225,7 @@ class SharedH264:
                     raise
                 continue
             failures = 0
-            await self._send_to_viewers(unit, entry_point(bytes(unit.data))[0])
+            await self._send_to_viewers(unit, random_access_point(bytes(unit.data))[0])
 
     async def _send_to_viewers(self, unit: Frame, is_key_frame: bool) -> None:
         if is_key_frame:

@@ -37,10 +37,10 @@ class DeviceControl:
 
     Attributes:
         name: label in lower case with underscores: ``white_balance_automatic``.
-        number: id of the control in V4L2.
+        id: id of the control in V4L2.
         kind: integer, boolean, menu, button or bitmask.
-        least: smallest value.
-        most: largest value.
+        minimum: smallest value.
+        maximum: largest value.
         step: difference between two values.
         default: the driver's initial value.
         value: present value; None: the value cannot be read.
@@ -49,10 +49,10 @@ class DeviceControl:
     """
 
     name: str
-    number: int
+    id: int
     kind: str
-    least: int
-    most: int
+    minimum: int
+    maximum: int
     step: int
     default: int
     value: int | None
@@ -69,9 +69,9 @@ class DeviceControl:
         if self.kind == "boolean":
             return "0 (off), 1 (on)"
         if self.kind == "bitmask":
-            return f"bits of {self.most & 0xFFFFFFFF:#x}"
+            return f"bits of {self.maximum & 0xFFFFFFFF:#x}"
         step = f" in steps of {self.step}" if self.step > 1 else ""
-        return f"{self.least} to {self.most}{step}"
+        return f"{self.minimum} to {self.maximum}{step}"
 
     def __str__(self) -> str:
         """Return the control as a line of lists and error texts."""
@@ -86,9 +86,9 @@ class DeviceControl:
         if self.menu:
             return number if number in self.menu else None
         if self.kind == "bitmask":
-            return number if 0 <= number <= self.most & 0xFFFFFFFF else None
-        is_in_range = self.least <= number <= self.most
-        is_on_step = (number - self.least) % max(1, self.step) == 0
+            return number if 0 <= number <= self.maximum & 0xFFFFFFFF else None
+        is_in_range = self.minimum <= number <= self.maximum
+        is_on_step = (number - self.minimum) % max(1, self.step) == 0
         return number if is_in_range and is_on_step else None
 
     def _parse(self, value: int | str) -> int | None:
@@ -135,10 +135,10 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
         expected = control.range if number is None else "nothing, since it is read-only"
         raise _refused_error(device, control, f"expected {expected}, got {value!r}")
     try:
-        device.ioctl(abi.S_CTRL, control.number, number & 0xFFFFFFFF)
+        device.ioctl(abi.S_CTRL, control.id, number & 0xFFFFFFFF)
     except OSError as exc:
         raise device_error(device.path, f"setting {control.name} to {value!r}", exc) from exc
-    actual = _read_value(device, control.number, control.flags)
+    actual = _read_value(device, control.id, control.flags)
     if actual is None or control.kind == "button":
         return number
     if actual != number and not control.flags & (abi.CTRL_VOLATILE | abi.CTRL_EXECUTE_ON_WRITE):
@@ -183,16 +183,16 @@ def _refused_error(device: CaptureDevice, control: DeviceControl, text: str) -> 
 
 
 def _read_control(device: CaptureDevice, answer: tuple[Any, ...]) -> DeviceControl:
-    number, kind, label, least, most, step, default, flags = answer[:8]
+    number, kind, label, minimum, maximum, step, default, flags = answer[:8]
     menu: dict[int, str] = {}
     if CONTROL_TYPES[kind] == "menu":
-        menu = _read_menu(device, number, kind, range(least, min(most, least + 255) + 1))
+        menu = _read_menu(device, number, kind, range(minimum, min(maximum, minimum + 255) + 1))
     return DeviceControl(
         normalized_name(abi.decode_text(label)),
         number,
         CONTROL_TYPES[kind],
-        least,
-        most,
+        minimum,
+        maximum,
         step,
         default,
         _read_value(device, number, flags),

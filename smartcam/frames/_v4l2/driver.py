@@ -104,7 +104,7 @@ class V4L2Driver(FrameDriver):
     async def open(self) -> StreamFormat:
         """Open the device, check the URL's settings, and close it again."""
         self._thread = ThreadPoolExecutor(1, f"v4l2 {self._path}")
-        return await self._run_in_thread(self._check_device, "be opened")
+        return await self._run_in_thread(self._check_device, "open")
 
     async def start(self, sink: FrameSink) -> None:
         """Open the device and start its stream."""

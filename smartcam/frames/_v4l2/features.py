@@ -77,7 +77,7 @@ class ControlFeature:
 
     def __init__(self, control: DeviceControl) -> None:
         self.control = control
-        self._sfnc = SFNC.get(control.number) or SfncFeature(control.name)
+        self._sfnc = SFNC.get(control.id) or SfncFeature(control.name)
         entries = dict(self._sfnc.entries)
         if self.name == "ExposureAuto" and 0 not in control.menu:
             entries[APERTURE_PRIORITY] = entries.pop(0)
@@ -118,8 +118,8 @@ class ControlFeature:
             number = round(float(value) / self._sfnc.factor)
         except (ValueError, OverflowError):
             return None
-        least, step = self.control.least, max(1, self.control.step)
-        if not least <= number <= self.control.most:
+        least, step = self.control.minimum, max(1, self.control.step)
+        if not least <= number <= self.control.maximum:
             return None
         return least + (number - least) // step * step
 
@@ -141,8 +141,8 @@ class ControlFeature:
             kind,
             access,
             value=self.to_value(control.value),
-            minimum=control.least * factor if has_range else None,
-            maximum=control.most * factor if has_range else None,
+            minimum=control.minimum * factor if has_range else None,
+            maximum=control.maximum * factor if has_range else None,
             step=max(1, control.step) * factor if has_range else None,
             unit=self._sfnc.unit,
             entries=tuple(self._entries.values()),
@@ -187,7 +187,7 @@ class V4L2Features(DeviceFeatures):
         """Set a feature; return the device's new value."""
         feature = await self._feature_named(name)
         if feature.control.kind == "button":
-            raise self._feature_error(feature, "it is a command: it is executed")
+            raise self._feature_error(feature, "it is a command: execute it")
         number = feature.to_number(value)
         if number is None:
             raise self._feature_error(
@@ -201,7 +201,7 @@ class V4L2Features(DeviceFeatures):
         """Execute a command."""
         feature = await self._feature_named(name)
         if feature.control.kind != "button":
-            raise self._feature_error(feature, "it is no command: it is set")
+            raise self._feature_error(feature, "it is no command: set it")
         await self._driver.set_control(feature.control.name, 1)
 
     async def _feature_named(self, name: str) -> ControlFeature:

@@ -47,10 +47,10 @@ class BufferStamps:
         self._last_empty_at = started_at  # when the queue of filled buffers was last empty
         # time stamp and number of the last frame; before the first frame, a time before the stream
         self._last: tuple[float, int | None] = (started_at - 2 * (period or DEFAULT_DURATION), None)
-        self.is_queue_empty = False  # whether the last frame is so new that none waits after it
+        self.is_newest = False  # whether the last frame is so new that no newer one waits
         self._has_warned = False
 
-    def set_queue_empty(self, now: float) -> None:
+    def record_empty_queue(self, now: float) -> None:
         """Record that no filled buffer waits now."""
         self._last_empty_at = now
 
@@ -63,7 +63,7 @@ class BufferStamps:
             number: number of the frame, lost frames included.
             now: present time, seconds of ``time.monotonic()``.
         """
-        self.is_queue_empty = False
+        self.is_newest = False
         clock = flags & abi.TIMESTAMP_MASK
         if clock != abi.TIMESTAMP_MONOTONIC:
             return self._arrival_stamp(now, seconds if clock == abi.TIMESTAMP_COPY else None)
@@ -74,8 +74,8 @@ class BufferStamps:
             self._warn_implausible(seconds, now)
             return self._arrival_stamp(now, seconds)
         self._last = (seconds, number)
-        self.is_queue_empty = now - seconds < (self._nominal_period or 0.0)
-        if self.is_queue_empty:
+        self.is_newest = now - seconds < (self._nominal_period or 0.0)
+        if self.is_newest:
             self._last_empty_at = now
         if is_start:
             return BufferStamp(seconds, Moment.EXPOSURE_START, 0.0, None)

@@ -21,7 +21,7 @@ MAX_CONSECUTIVE_BAD: Final = 30
 """Number of consecutive buffers without a whole picture after which the stream fails."""
 
 MAX_CONSECUTIVE_EMPTY: Final = 1000
-"""Largest number of consecutive reports of a filled buffer by the system although there is none."""
+"""Number of times in a row that the system may report a filled buffer although there is none."""
 
 HALF_SEQUENCE_RANGE: Final = 1 << 31
 """Half of the range of 32-bit frame numbers; a larger step forwards counts as a step backwards."""
@@ -74,7 +74,7 @@ class CaptureStream:
             try:
                 filled = self._buffers.take_picture()
             except BlockingIOError:
-                self._stamps.set_queue_empty(system.now())
+                self._stamps.record_empty_queue(system.now())
                 self._count_empty()
                 return
             except OSError as exc:
@@ -83,7 +83,7 @@ class CaptureStream:
             frame = self._to_frame(filled, sink)
             if frame is not None:
                 sink.frame(frame)
-                if self._stamps.is_queue_empty:
+                if self._stamps.is_newest:
                     return
 
     def _to_frame(self, filled: FilledBuffer, sink: FrameSink) -> Frame | None:

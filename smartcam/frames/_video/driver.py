@@ -17,9 +17,9 @@ from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._video.files import (
     PictureFiles,
-    PictureReading,
+    PictureReader,
     VideoPlan,
-    VideoReading,
+    VideoReader,
     is_pictures,
 )
 from smartcam.frames._video.frames import CONVERTIBLE
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
     from smartcam.frames._pixels.formats import PixelFormat
-    from smartcam.frames._video.files import ReadPicture
+    from smartcam.frames._video.files import TimedPicture
 
 
 T = TypeVar("T")
@@ -63,8 +63,8 @@ _PARAMETERS: Final = {
 class VideoDriver(FrameDriver):
     """A camera or file that FFmpeg reads: ``http:``, ``https:``, a path, or ``rtsp:``.
 
-    RTSP cameras are read by FFmpeg only with codecs that smartcam's own receiver lacks, web cameras
-    with everything except multipart JPEG.
+    FFmpeg reads RTSP cameras only with codecs that smartcam's own receiver lacks, and web addresses
+    unless they send multipart JPEG.
 
     A query belongs to the server, so smartcam's parameters follow ``#``, also after a path:
     ``rtsp://admin:PASSWORD@camera/stream?channel=1#transport=udp&timeout=3``,
@@ -77,7 +77,7 @@ class VideoDriver(FrameDriver):
                       5
     ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
                       passes such bytes on unchanged; default: the decoder's format
-    ``delay``         of a live stream: longest time from exposure to arrival, seconds; default 1
+    ``delay``         of a live stream: assumed longest time from exposure to arrival; default 1
     ``pace``          of a recording: ``real`` (default) by its time stamps, or ``none``: each
                       picture as soon as the readers have taken the last one, without skips
     ``fps``           of a recording: pictures per second instead of its time stamps; default 10 of
@@ -110,9 +110,9 @@ class VideoDriver(FrameDriver):
         self._format = wanted_format(address, parameters.get("format"))
         self._options = _options(address, parameters)
         self._allows_mixed = one_of(address, "mixed", parameters, ("no", "yes")) == "yes"
-        self._allows_elsewhere = one_of(address, "elsewhere", parameters, ("no", "yes")) == "yes"
+        self._allows_other_hosts = one_of(address, "elsewhere", parameters, ("no", "yes")) == "yes"
         self._tls = tls_context(address, parameters)
-        self._thread: _ReadingThread | None = None
+        self._thread: _ReaderThread | None = None
         self._task: asyncio.Task[None] | None = None
         self._stream: StreamFormat | None = None
         self._sequence = 0
@@ -131,10 +131,10 @@ class VideoDriver(FrameDriver):
             MissingExtraError: the extra ``video`` is not installed.
         """
         try:
-            reading, first = await self._open_and_read()
+            reader, first = await self._open_and_read()
         finally:
             await self.stop()
-        rate, pixels = self._fps or reading.rate, first.pixels
+        rate, pixels = self._fps or reader.rate, first.pixels
         rates = (rate,) if rate else ()
         self._stream = StreamFormat(pixels.format, pixels.width, pixels.height, rates)
         return self._stream
@@ -146,12 +146,12 @@ class VideoDriver(FrameDriver):
             FrameSourceError: the source is gone, or does not answer.
         """
         try:
-            reading, first = await self._open_and_read()
+            reader, first = await self._open_and_read()
         except BaseException:
             await self.stop()
             raise
         name = f"frames of {self.name}"
-        self._task = asyncio.create_task(self._pass_frames(sink, reading, first), name=name)
+        self._task = asyncio.create_task(self._pass_frames(sink, reader, first), name=name)
 
     async def stop(self) -> None:
         """Stop reading; wait for a hanging read at most until its timeout."""
@@ -163,25 +163,27 @@ class VideoDriver(FrameDriver):
             task.cancel()
             await asyncio.wait([task])
         if thread is not None and not await thread.close(self._timeout + THREAD_GRACE):
-            _log.warning("! %s: the reading thread hangs, and is abandoned", self.name)
+            _log.warning("! %s: the reader thread hangs, and is abandoned", self.name)
 
     async def close(self) -> None:
         """Release everything. Idempotent."""
         await self.stop()
 
-    async def _open_and_read(self) -> tuple[PictureReading, ReadPicture]:
+    async def _open_and_read(self) -> tuple[PictureReader, TimedPicture]:
         """Open the video and read the first picture."""
         await self.stop()
-        thread = self._thread = _ReadingThread(self.name)
-        reading = await thread.open(self._open_reading)
-        first = await thread.run(reading.read)
+        thread = self._thread = _ReaderThread(self.name)
+        reader = await thread.open(self._open_reader)
+        first = await thread.run(reader.read)
         if first is None:
             raise FrameFormatError(f"{self.name}: expected a picture, got none", source=self.name)
-        if self._fps and reading.is_live:
-            raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
-        return reading, first
+        if self._fps and reader.is_live:
+            raise self.address.wrong(
+                "fps", "a recording, as live streams have no fps", "a live stream"
+            )
+        return reader, first
 
-    def _open_reading(self) -> PictureReading:
+    def _open_reader(self) -> PictureReader:
         address = self.address
         is_network = address.scheme != "file"
         url = address.url.partition("#")[0] if is_network else f"file:{self._path}"
@@ -193,18 +195,18 @@ class VideoDriver(FrameDriver):
             timeout=self._timeout,
             format=self._format,
             is_network=is_network,
-            allows_elsewhere=self._allows_elsewhere,
+            allows_other_hosts=self._allows_other_hosts,
             tls=self._tls,
             skips_damaged=self._allows_mixed,
         )
-        return PictureFiles(plan) if pictures else VideoReading(plan)
+        return PictureFiles(plan) if pictures else VideoReader(plan)
 
     async def _pass_frames(
-        self, sink: FrameSink, reading: PictureReading, first: ReadPicture
+        self, sink: FrameSink, reader: PictureReader, first: TimedPicture
     ) -> None:
-        rate, is_live, thread = reading.rate, reading.is_live, self._thread
+        rate, is_live, thread = reader.rate, reader.is_live, self._thread
         playback = _Playback(self._fps or (None if rate else PICTURE_RATE), rate)
-        picture: ReadPicture | None = first
+        picture: TimedPicture | None = first
         try:
             while picture is not None and thread is not None:
                 if self._keeps_pace and not is_live:
@@ -212,7 +214,7 @@ class VideoDriver(FrameDriver):
                 sink.frame(self._to_frame(picture, is_live))
                 if not self._keeps_pace and not is_live:
                     await sink.wait_taken()
-                picture = await thread.run(reading.read)
+                picture = await thread.run(reader.read)
         except FrameSourceError as exc:
             sink.ended(exc)
         except Exception as exc:  # noqa: BLE001 - passed on to readers
@@ -222,7 +224,7 @@ class VideoDriver(FrameDriver):
         else:
             sink.ended(None)
 
-    def _to_frame(self, picture: ReadPicture, is_live: bool) -> Frame:
+    def _to_frame(self, picture: TimedPicture, is_live: bool) -> Frame:
         pixels, now = picture.pixels, time.monotonic()
         actual = (pixels.format, pixels.width, pixels.height)
         if self._stream is not None and actual != self._stream[:3] and not self._allows_mixed:
@@ -251,21 +253,21 @@ class VideoDriver(FrameDriver):
         )
 
 
-class _ReadingThread:
+class _ReaderThread:
     """A thread that opens, reads and closes a source."""
 
     def __init__(self, name: str) -> None:
         self._pool = ThreadPoolExecutor(1, f"frames of {name}")
-        self._reading: PictureReading | None = None
+        self._reader: PictureReader | None = None
 
-    async def open(self, make: Callable[[], PictureReading]) -> PictureReading:
-        """Return the opened reading; the thread keeps it even if the caller is cancelled."""
+    async def open(self, make: Callable[[], PictureReader]) -> PictureReader:
+        """Return the opened reader; the thread keeps it even if the caller is cancelled."""
 
-        def open_reading() -> PictureReading:
-            self._reading = reading = make()
-            return reading
+        def open_reader() -> PictureReader:
+            self._reader = reader = make()
+            return reader
 
-        return await self.run(open_reading)
+        return await self.run(open_reader)
 
     async def run(self, work: Callable[[], T]) -> T:
         """Run a function in the thread; cancelled calls run nevertheless."""
@@ -275,21 +277,21 @@ class _ReadingThread:
 
     def stop(self) -> None:
         """Abort the search for the next picture."""
-        if self._reading is not None:
-            self._reading.stopped.set()
+        if self._reader is not None:
+            self._reader.stopped.set()
 
     async def close(self, timeout: float) -> bool:
         """Close the source in the thread; return False if the thread did not do so in time."""
-        closing = asyncio.get_running_loop().run_in_executor(self._pool, self._close_reading)
+        closing = asyncio.get_running_loop().run_in_executor(self._pool, self._close_reader)
         closing.add_done_callback(_retrieve_error)
         self._pool.shutdown(wait=False)
         _, pending = await asyncio.wait([closing], timeout=timeout)
         return not pending
 
-    def _close_reading(self) -> None:
-        reading, self._reading = self._reading, None
-        if reading is not None:
-            reading.close()
+    def _close_reader(self) -> None:
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.close()
 
 
 def _retrieve_error(done: asyncio.Future[Any]) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from smartcam._extras import load
 from smartcam._natural import natural
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames._video.frames import CONVERTIBLE, Pixels, from_video, reformatted
+from smartcam.frames._video.frames import CONVERTIBLE, Pixels, from_av_frame, reformatted
 from smartcam.frames._video.jpegxl import is_jpegxl, read_jpegxl
 from smartcam.frames._video.redirects import follow_redirects
 
@@ -38,7 +38,8 @@ MIN_REDIRECT_VERSION: Final = (62, 0, 0)
 """First version of libavformat with an option against redirects."""
 
 UNBUFFERED_WAIT_TIME: Final = 0.01
-"""Least waiting time, seconds, for a packet that has just arrived and was not buffered."""
+"""A read that waited at least this many seconds got a packet that had just arrived, not a buffered
+one."""
 
 _PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
 """Codecs whose bytes can be passed on unchanged, with smartcam's formats."""
@@ -49,8 +50,8 @@ _INDEPENDENT_PICTURES: Final = frozenset(
 """Codecs whose pictures are independent, so a damaged picture does not affect later ones."""
 
 _STRICT_ABOUT_TAGS: Final = frozenset({"tiff"})
-"""Codecs that report unknown tags as damage in FFmpeg's strict mode; other modes, too, report cut
-pictures."""
+"""Codecs that report unknown tags as damage in FFmpeg's strict mode, which is therefore not used
+for them; they report cut pictures without it, too."""
 
 FORMATS: Final = (
     "asf,avi,dv,flv,gif,h264,hevc,ivf,m4v,matroska,mjpeg,mov,mpeg,mpegts,mpegvideo,mpjpeg,mxf,nut,"
@@ -85,7 +86,7 @@ class VideoPlan:
         format: pixel format to convert to, or format of encoded bytes that are passed on; None: the
             decoder's format.
         is_network: whether the video comes from a server; if its length is unknown, it is live.
-        allows_elsewhere: whether FFmpeg may follow redirects and playlists to other hosts.
+        allows_other_hosts: whether FFmpeg may follow redirects and playlists to other hosts.
         tls: context that checks the server's certificate; None: the default check.
         skips_damaged: whether damaged files of a folder are left out and counted as lost.
     """
@@ -96,7 +97,7 @@ class VideoPlan:
     timeout: float = 5.0
     format: PixelFormat | None = None
     is_network: bool = False
-    allows_elsewhere: bool = False
+    allows_other_hosts: bool = False
     tls: ssl.SSLContext | None = None
     skips_damaged: bool = False
 
@@ -105,8 +106,8 @@ class VideoPlan:
         return FrameFormatError(f"{self.name}: {text}", source=self.name)
 
 
-class ReadPicture(NamedTuple):
-    """A picture read from a source.
+class TimedPicture(NamedTuple):
+    """A picture that was read from a source, with its times.
 
     Attributes:
         pixels: pixels of the picture.
@@ -124,7 +125,7 @@ class ReadPicture(NamedTuple):
     is_device_time: bool = False
 
 
-class PictureReading(ABC):
+class PictureReader(ABC):
     """A reader of pictures; its methods block, and one thread calls them.
 
     Attributes:
@@ -146,7 +147,7 @@ class PictureReading(ABC):
         """Pictures per second; None: unknown."""
 
     @abstractmethod
-    def read(self) -> ReadPicture | None:
+    def read(self) -> TimedPicture | None:
         """Return the next picture; None at the end, or when stopped.
 
         Raises:
@@ -158,7 +159,7 @@ class PictureReading(ABC):
         """Close the source. Idempotent."""
 
 
-class VideoReading(PictureReading):
+class VideoReader(PictureReader):
     """A reader of an open stream or file.
 
     Raises:
@@ -169,8 +170,8 @@ class VideoReading(PictureReading):
 
     def __init__(self, plan: VideoPlan) -> None:
         super().__init__(plan)
-        self._has_returned = False
-        self._start_codes: Any = None
+        self._has_returned_picture = False
+        self._start_code_filter: Any = None
         self._started_at = time.monotonic()
         self._container = self._open_container()
         self._opened_at = time.monotonic()
@@ -191,7 +192,7 @@ class VideoReading(PictureReading):
     def _open_container(self) -> Any:
         """Return FFmpeg's container for the URL, without access to other places."""
         plan, scheme = self.plan, self.plan.url.partition(":")[0]
-        if plan.allows_elsewhere:
+        if plan.allows_other_hosts:
             return self._open(plan.url, {"protocol_whitelist": REMOTE_PROTOCOLS})
         formats = {"file": f"{FORMATS},image2", "rtsp": "rtsp", "rtsps": "rtsp"}
         bounds = {
@@ -244,7 +245,7 @@ class VideoReading(PictureReading):
             failure: Exception = exc
         except load("av").FFmpegError as exc:
             failure = exc
-        if isinstance(failure, EOFError) and self._has_returned:
+        if isinstance(failure, EOFError) and self._has_returned_picture:
             return None
         # raised outside of the handler, since FFmpeg's error text has the URL with the password
         raise self._error(failure, time.monotonic() - started_at) from _plain_error(failure)
@@ -267,7 +268,7 @@ class VideoReading(PictureReading):
                 raise self.plan.format_error(f"expected {wanted.name}, got {actual}")
             if actual == "H264":  # files have lengths in place of start codes
                 bitstream = load("av.bitstream").BitStreamFilterContext
-                self._start_codes = bitstream("h264_mp4toannexb", stream)
+                self._start_code_filter = bitstream("h264_mp4toannexb", stream)
         return stream
 
     @property
@@ -280,7 +281,7 @@ class VideoReading(PictureReading):
         """Pictures per second of the stream; None: unknown."""
         return self._rate
 
-    def read(self) -> ReadPicture | None:
+    def read(self) -> TimedPicture | None:
         """Return the next picture."""
         started_at = time.monotonic()
         while not self._pictures and not self.stopped.is_set():
@@ -299,7 +300,7 @@ class VideoReading(PictureReading):
             return None
         picture, arrived_at = self._pictures.popleft()
         lost, self._lost = self._lost, 0
-        self._has_returned = True
+        self._has_returned_picture = True
         base = picture.time_base or self._stream.time_base
         at = None if picture.pts is None else float(picture.pts * base)
         is_device_time = (
@@ -307,7 +308,7 @@ class VideoReading(PictureReading):
             and self._container.format.name == "rtsp"
             and arrived_at > self._started_at
         )
-        return ReadPicture(self._pixels(picture), at, arrived_at, lost, is_device_time)
+        return TimedPicture(self._pixels(picture), at, arrived_at, lost, is_device_time)
 
     def _arrival_time(self, asked_at: float, now: float) -> float:
         """Return a packet's arrival, or the earliest possible time if FFmpeg buffered it."""
@@ -322,7 +323,7 @@ class VideoReading(PictureReading):
             raise FrameSourceError(
                 f"{self.plan.name}: the server ended the stream", source=self.plan.name
             )
-        if not self._has_returned:
+        if not self._has_returned_picture:
             cause = f": {self._decode_error}" if self._decode_error else ""
             raise self.plan.format_error(f"expected pictures, the video ended without one{cause}")
 
@@ -330,9 +331,11 @@ class VideoReading(PictureReading):
         """Decode a packet, or pass it on."""
         if self.plan.format is not None and self.plan.format.compressed:
             if packet.is_corrupt:
-                self._lost += self._has_returned
+                self._lost += self._has_returned_picture
             elif packet.size:
-                filtered = self._start_codes.filter(packet) if self._start_codes else [packet]
+                filtered = (
+                    self._start_code_filter.filter(packet) if self._start_code_filter else [packet]
+                )
                 self._pictures.extend((picture, arrived_at) for picture in filtered)
             return
         is_damaged = bool(packet.is_corrupt)
@@ -342,7 +345,7 @@ class VideoReading(PictureReading):
             is_damaged, pictures, self._decode_error = True, [], _reason(exc)
         intact = [picture for picture in pictures if not picture.is_corrupt]
         if is_damaged or len(intact) < len(pictures):
-            self._lost += self._has_returned  # a stream may begin midway
+            self._lost += self._has_returned_picture  # a stream may begin midway
             if self._stream.codec_context.name not in _INDEPENDENT_PICTURES:
                 intact = []
                 self._stream.codec_context.flush_buffers()  # dependent pictures are dropped
@@ -356,7 +359,7 @@ class VideoReading(PictureReading):
         try:
             if wanted is not None:
                 picture = reformatted(picture, CONVERTIBLE[wanted.name])
-            return from_video(picture)
+            return from_av_frame(picture)
         except FrameFormatError as exc:
             raise self.plan.format_error(f"{exc}; #format=RGB8 converts") from exc
 
@@ -384,7 +387,7 @@ def _plain_error(failure: Exception) -> OSError:
     return OSError(getattr(failure, "errno", None) or errno.EIO, _reason(failure))
 
 
-class PictureFiles(PictureReading):
+class PictureFiles(PictureReader):
     """A reader of picture files in the order of their names."""
 
     def __init__(self, plan: VideoPlan) -> None:
@@ -403,7 +406,7 @@ class PictureFiles(PictureReading):
         """Always None: files have no rate."""
         return None
 
-    def read(self) -> ReadPicture | None:
+    def read(self) -> TimedPicture | None:
         """Return the next picture."""
         lost = 0
         while self._files and not self.stopped.is_set():
@@ -419,15 +422,15 @@ class PictureFiles(PictureReading):
                 return None if picture is None else picture._replace(lost=lost)
         return None
 
-    def _read_file(self, path: str) -> ReadPicture | None:
+    def _read_file(self, path: str) -> TimedPicture | None:
         if is_jpegxl(path):
-            return ReadPicture(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
+            return TimedPicture(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
         plan = VideoPlan(name=path, url=f"file:{path}", format=self.plan.format)
-        reading = VideoReading(plan)
+        reader = VideoReader(plan)
         try:
-            picture = reading.read()
+            picture = reader.read()
         finally:
-            reading.close()
+            reader.close()
         return None if picture is None else picture._replace(time=None)
 
     def close(self) -> None:

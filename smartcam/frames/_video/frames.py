@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.frames._pixels.formats import PixelFormat
 
 
-_SAMPLES: Final = {
+_GREY_RGB_BAYER: Final = {
     "gray": "Mono8",
     "gray10le": "Mono10",
     "gray12le": "Mono12",
@@ -42,6 +42,8 @@ _SAMPLES: Final = {
     "bayer_gbrg16le": "BayerGB16",
     "bayer_grbg16le": "BayerGR16",
 }
+"""FFmpeg's other formats with the same bytes as a format of smartcam."""
+
 _SUBSAMPLING: Final = {(2, 2): "420", (2, 1): "422", (1, 1): "444"}
 """Names of chroma subsampling, by the numbers of columns and rows that share U and V."""
 
@@ -103,10 +105,10 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
     Raises:
         FrameFormatError: there is no such format, or the colour space is not supported.
     """
-    if name in _SAMPLES:
-        return find_format(_SAMPLES[name])
+    if name in _GREY_RGB_BAYER:
+        return find_format(_GREY_RGB_BAYER[name])
     if name not in _YUV:
-        known = (*_SAMPLES, *_YUV)
+        known = (*_GREY_RGB_BAYER, *_YUV)
         raise FrameFormatError(
             f"FFmpeg's pixel format {name}: expected one that converts without loss to one of "
             f"{', '.join(known)}",
@@ -123,129 +125,131 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
     return with_matrix(base, f"{matrix} full" if full else matrix)
 
 
-def from_video(video: Any, *, keep_planes: bool = False) -> Pixels:
+def from_av_frame(av_frame: Any, *, keep_planes: bool = False) -> Pixels:
     """Return a decoded frame's pixels in their own format, or in one without loss.
 
     A palette is converted to colours, planes of red, green and blue to samples, and unsupported
     chroma subsampling is expanded.
 
     Args:
-        video: frame of FFmpeg.
+        av_frame: frame of FFmpeg.
         keep_planes: whether the planes may stay in the decoder's buffers without a copy, as
             :class:`SeparatePlanes`.
 
     Raises:
         FrameFormatError: no format holds the pixels without loss; the text names the loss.
     """
-    name = video.format.name
-    if name in _TRANSPARENT and not _is_opaque(video):
-        return _to_rgba(video)
-    if name not in _SAMPLES and name not in _YUV:
-        video = _with_supported_format(video)
-    pixel_format = format_of(video.format.name, video.color_range, video.colorspace)
-    planes = video.planes
+    name = av_frame.format.name
+    if name in _TRANSPARENT and not _is_opaque(av_frame):
+        return _to_rgba(av_frame)
+    if name not in _GREY_RGB_BAYER and name not in _YUV:
+        av_frame = _with_supported_format(av_frame)
+    pixel_format = format_of(av_frame.format.name, av_frame.color_range, av_frame.colorspace)
+    planes = av_frame.planes
     stride = planes[0].line_size
     if len(planes) == 1:
         data = memoryview(planes[0]).toreadonly()
-        return Pixels(pixel_format, video.width, video.height, stride, data)
+        return Pixels(pixel_format, av_frame.width, av_frame.height, stride, data)
     layout = pixel_format.layout
     fits = isinstance(layout, Planes) and all(
         plane.line_size == layout.chroma_stride(stride) for plane in planes[1:]
     )
     if fits:
         joined: Any = SeparatePlanes(planes) if keep_planes else b"".join(planes)
-        return Pixels(pixel_format, video.width, video.height, stride, joined)
+        return Pixels(pixel_format, av_frame.width, av_frame.height, stride, joined)
     joined = b"".join(_without_padding(plane, pixel_format) for plane in planes)
-    return Pixels(pixel_format, video.width, video.height, pixel_format.stride(video.width), joined)
+    return Pixels(
+        pixel_format, av_frame.width, av_frame.height, pixel_format.stride(av_frame.width), joined
+    )
 
 
-def _with_supported_format(video: Any) -> Any:
+def _with_supported_format(av_frame: Any) -> Any:
     """Return the frame in a supported format without loss, or unchanged if there is none."""
-    kind = video.format
+    kind = av_frame.format
     components = kind.components
     depth = max(component.bits for component in components)
     has_alpha = any(component.is_alpha for component in components)
     if depth > 16 or kind.name.startswith(("xyz", "bayer")):
-        return video
+        return av_frame
     if kind.has_palette or kind.is_rgb or len(components) == 2:
         if depth > 8:
-            return reformatted(video, "rgba64le" if has_alpha else "rgb48le")
-        return reformatted(video, "rgba" if has_alpha or kind.has_palette else "rgb24")
+            return reformatted(av_frame, "rgba64le" if has_alpha else "rgb48le")
+        return reformatted(av_frame, "rgba" if has_alpha or kind.has_palette else "rgb24")
     if len(components) == 1:
-        return reformatted(video, _supported_grey(kind.name, depth))
-    return _with_supported_subsampling(video, depth, has_alpha=has_alpha)
+        return reformatted(av_frame, _supported_grey(kind.name, depth))
+    return _with_supported_subsampling(av_frame, depth, has_alpha=has_alpha)
 
 
 def _supported_grey(name: str, depth: int) -> str:
     little_endian = f"{name.removesuffix('be')}le"
     if depth <= 8:
         return "gray"
-    return little_endian if little_endian in _SAMPLES else "gray16le"
+    return little_endian if little_endian in _GREY_RGB_BAYER else "gray16le"
 
 
-def _with_supported_subsampling(video: Any, depth: int, *, has_alpha: bool) -> Any:
+def _with_supported_subsampling(av_frame: Any, depth: int, *, has_alpha: bool) -> Any:
     """Return the frame with a supported chroma subsampling."""
-    kind, size = video.format, (video.width, video.height)
+    kind, size = av_frame.format, (av_frame.width, av_frame.height)
     across, down = (
         round(length / chroma_length)
-        for length, chroma_length in zip(size, _chroma_size(video), strict=True)
+        for length, chroma_length in zip(size, _chroma_size(av_frame), strict=True)
     )
     bits = next(bits for bits in (8, 10, 12, 16) if depth <= bits)
     suffix = "" if bits == 8 else f"{bits}le"
     digits = _SUBSAMPLING.get((across, down))
     if has_alpha and kind.name not in _TRANSPARENT:
-        return video
+        return av_frame
     if digits is not None:
-        return _reformatted_yuv(video, f"yuv{digits}p{suffix}")
-    if bits > 8 or not kind.is_planar or len(video.planes) < 3:
-        return video
-    expanded = _new_video(*size, "yuv444p")
-    for target, plane in zip(expanded.planes, video.planes, strict=False):
+        return _reformatted_yuv(av_frame, f"yuv{digits}p{suffix}")
+    if bits > 8 or not kind.is_planar or len(av_frame.planes) < 3:
+        return av_frame
+    expanded = _new_av_frame(*size, "yuv444p")
+    for target, plane in zip(expanded.planes, av_frame.planes, strict=False):
         rows = _rows(plane)
         for axis, times in enumerate((-(-size[1] // plane.height), -(-size[0] // plane.width))):
             rows = np.repeat(rows, times, axis=axis)
         _fill_plane(target, rows[: size[1], : size[0]])
-    return _with_colour_properties(expanded, video, full=kind.name.startswith("yuvj"))
+    return _with_colour_properties(expanded, av_frame, full=kind.name.startswith("yuvj"))
 
 
-def _chroma_size(video: Any) -> tuple[float, float]:
+def _chroma_size(av_frame: Any) -> tuple[float, float]:
     """Return width and height of U and V without rounding, from the ratios in a large picture."""
-    kind, side = video.format, 1 << 10
+    kind, side = av_frame.format, 1 << 10
     return (
-        video.width * kind.chroma_width(side) / side,
-        video.height * kind.chroma_height(side) / side,
+        av_frame.width * kind.chroma_width(side) / side,
+        av_frame.height * kind.chroma_height(side) / side,
     )
 
 
-def _reformatted_yuv(video: Any, name: str) -> Any:
+def _reformatted_yuv(av_frame: Any, name: str) -> Any:
     """Return a frame of Y, U and V with the same samples in another layout."""
-    full = video.format.name.startswith("yuvj")
-    return _with_colour_properties(reformatted(video, name), video, full=full)
+    full = av_frame.format.name.startswith("yuvj")
+    return _with_colour_properties(reformatted(av_frame, name), av_frame, full=full)
 
 
-def _with_colour_properties(target: Any, video: Any, *, full: bool) -> Any:
+def _with_colour_properties(target: Any, av_frame: Any, *, full: bool) -> Any:
     """Copy range and colour space of a frame to another, which is returned."""
-    target.color_range = FULL if full else video.color_range
-    target.colorspace = video.colorspace
+    target.color_range = FULL if full else av_frame.color_range
+    target.colorspace = av_frame.colorspace
     return target
 
 
-def reformatted(video: Any, name: str) -> Any:
+def reformatted(av_frame: Any, name: str) -> Any:
     """Return a frame in another pixel format of FFmpeg.
 
     Args:
-        video: frame of FFmpeg.
+        av_frame: frame of FFmpeg.
         name: name of the format, such as ``rgb24``.
 
     Raises:
         FrameFormatError: FFmpeg does not convert between these formats.
     """
-    kind, width = video.format, video.width
+    kind, width = av_frame.format, av_frame.width
     padded_width = -(-width // CORRECT_WIDTH_MULTIPLE) * CORRECT_WIDTH_MULTIPLE
     depth = max(component.bits for component in kind.components)
     must_pad = padded_width != width and not kind.has_palette and depth > 8
     try:
-        result = (_resized(video, padded_width) if must_pad else video).reformat(format=name)
+        result = (_resized(av_frame, padded_width) if must_pad else av_frame).reformat(format=name)
     except (OSError, ValueError) as exc:
         raise FrameFormatError(
             f"FFmpeg's pixel format {kind.name}: no conversion to {name}: {exc}"
@@ -259,27 +263,29 @@ of pixels. In other widths it writes 8 samples of colour into Y, as measured wit
 481 in FFmpeg 8 (PyAV 18)."""
 
 
-def _resized(video: Any, width: int) -> Any:
+def _resized(av_frame: Any, width: int) -> Any:
     """Return a copy with the rows cut off or filled up with zeros on the right."""
-    resized = _new_video(width, video.height, video.format.name)
-    for target, plane in zip(resized.planes, video.planes, strict=True):
+    resized = _new_av_frame(width, av_frame.height, av_frame.format.name)
+    for target, plane in zip(resized.planes, av_frame.planes, strict=True):
         rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
         _fill_plane(target, rows[:, : min(target.line_size, plane.line_size)])
-    return _with_colour_properties(resized, video, full=False)
+    return _with_colour_properties(resized, av_frame, full=False)
 
 
-def _is_opaque(video: Any) -> bool:
+def _is_opaque(av_frame: Any) -> bool:
     """Return True if the last plane, alpha, is fully opaque."""
-    return bool((_rows(video.planes[3]) == 255).all())
+    return bool((_rows(av_frame.planes[3]) == 255).all())
 
 
-def _to_rgba(video: Any) -> Pixels:
+def _to_rgba(av_frame: Any) -> Pixels:
     """Return Y, U, V and alpha as red, green, blue and alpha."""
-    without_alpha = format_of(_TRANSPARENT[video.format.name], video.color_range, video.colorspace)
+    without_alpha = format_of(
+        _TRANSPARENT[av_frame.format.name], av_frame.color_range, av_frame.colorspace
+    )
     matrix = MATRICES[cast("Planes", without_alpha.layout).matrix]
-    y, u, v, alpha = (_rows(plane) for plane in video.planes)
+    y, u, v, alpha = (_rows(plane) for plane in av_frame.planes)
     data = np.dstack([yuv_to_rgb(y, (u, v), matrix), alpha]).tobytes()
-    return Pixels(find_format("RGBa8"), video.width, video.height, 4 * video.width, data)
+    return Pixels(find_format("RGBa8"), av_frame.width, av_frame.height, 4 * av_frame.width, data)
 
 
 def _rows(plane: Any) -> NDArray[np.uint8]:
@@ -291,7 +297,7 @@ def _rows(plane: Any) -> NDArray[np.uint8]:
 def _without_padding(plane: Any, pixel_format: PixelFormat) -> bytes:
     """Return the rows of a plane without padding."""
     layout: Any = pixel_format.layout
-    size = layout.size_of * (2 if layout.interleaved and plane.index else 1)
+    size = layout.sample_bytes * (2 if layout.interleaved and plane.index else 1)
     rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
     return rows[:, : plane.width * size].tobytes()
 
@@ -304,7 +310,7 @@ def colour_properties(pixel_format: PixelFormat) -> tuple[int, int]:
     return FULL if matrix.endswith("full") else LIMITED, space
 
 
-def to_video(frame: Frame, reusable: Any = None) -> Any:
+def to_av_frame(frame: Frame, reusable: Any = None) -> Any:
     """Return a frame for an encoder of 4:2:0, with Y unchanged and U and V averaged.
 
     Grey gets neutral U and V. RGB is converted to BT.601 with limited range.
@@ -337,20 +343,20 @@ def to_video(frame: Frame, reusable: Any = None) -> Any:
             source=frame.source,
         )
     if name == "gray":
-        return _video_from_grey(frame, reusable)
-    video = _to_video_frame(frame, name)
+        return _grey_av_frame(frame, reusable)
+    av_frame = _filled_av_frame(frame, name)
     if name in ("yuv420p", "nv12"):
-        return video
+        return av_frame
     range_, space = colour_properties(frame.format)
     new_range = LIMITED if name in ("rgb24", "bgr24") else range_
-    result = video.reformat(
+    result = av_frame.reformat(
         format="yuv420p", src_color_range=_RANGES[range_], dst_color_range=_RANGES[new_range]
     )
     result.color_range, result.colorspace = new_range, space
     return result
 
 
-def to_lossless_video(frame: Frame) -> Any:
+def to_lossless_av_frame(frame: Frame) -> Any:
     """Return a frame for the lossless encoder FFV1, with each value unchanged.
 
     Packed samples are unpacked, Y, U and V are separated, and RGB is reordered.
@@ -372,11 +378,11 @@ def to_lossless_video(frame: Frame) -> Any:
             source=frame.source,
             available=known,
         )
-    video = _to_video_frame(frame, name)
+    av_frame = _filled_av_frame(frame, name)
     ffv1_name = _FFV1_FORMATS.get(name, name)
     if ffv1_name == name:
-        return video
-    result = video.reformat(format=ffv1_name)
+        return av_frame
+    result = av_frame.reformat(format=ffv1_name)
     result.color_range, result.colorspace = colour_properties(frame.format)
     return result
 
@@ -398,7 +404,7 @@ def _lossless_name(pixel_format: PixelFormat) -> str | None:
     if pixel_format.name.startswith("Mono"):
         return "gray" if pixel_format.depth == 8 else f"gray{_DEPTHS[pixel_format.depth]}le"
     if isinstance(layout, Planes) and layout.depth > 8:
-        digits = _SUBSAMPLING[layout.across, layout.down]
+        digits = _SUBSAMPLING[layout.chroma_columns, layout.chroma_rows]
         return f"yuv{digits}p{layout.depth}le"
     if pixel_format.name in ("RGBa8", "BGRa8"):
         return "rgba" if pixel_format.name == "RGBa8" else "bgra"
@@ -415,17 +421,21 @@ def _encodable_name(pixel_format: PixelFormat) -> str | None:
     if isinstance(layout, YuvPairs):
         return "uyvy422" if layout.y else "yuyv422"
     if isinstance(layout, Planes) and layout.depth == 8:
-        return "nv12" if layout.interleaved else f"yuv{_SUBSAMPLING[layout.across, layout.down]}p"
+        return (
+            "nv12"
+            if layout.interleaved
+            else f"yuv{_SUBSAMPLING[layout.chroma_columns, layout.chroma_rows]}p"
+        )
     return {"Mono8": "gray", "RGB8": "rgb24", "BGR8": "bgr24"}.get(pixel_format.name)
 
 
-def _new_video(width: int, height: int, name: str) -> Any:
+def _new_av_frame(width: int, height: int, name: str) -> Any:
     return load("av").VideoFrame(width, height, name)
 
 
-def _video_from_grey(frame: Frame, reusable: Any) -> Any:
-    size = frame.width, frame.height, *colour_properties(frame.format)
-    if reusable is not None and size == (
+def _grey_av_frame(frame: Frame, reusable: Any) -> Any:
+    properties = frame.width, frame.height, *colour_properties(frame.format)
+    if reusable is not None and properties == (
         *(reusable.width, reusable.height),
         *(reusable.color_range, reusable.colorspace),
     ):
@@ -433,12 +443,12 @@ def _video_from_grey(frame: Frame, reusable: Any) -> Any:
             reusable.planes[0], frame.array()
         )  # a new array would cost a page fault per 4 kB
         return reusable
-    video = _new_video(frame.width, frame.height, "yuv420p")
-    _fill_plane(video.planes[0], frame.array())
-    for plane in video.planes[1:]:
+    av_frame = _new_av_frame(frame.width, frame.height, "yuv420p")
+    _fill_plane(av_frame.planes[0], frame.array())
+    for plane in av_frame.planes[1:]:
         plane.update(_neutral_chroma(plane.buffer_size))
-    video.color_range, video.colorspace = colour_properties(frame.format)
-    return video
+    av_frame.color_range, av_frame.colorspace = colour_properties(frame.format)
+    return av_frame
 
 
 @lru_cache(maxsize=16)
@@ -446,21 +456,21 @@ def _neutral_chroma(size: int) -> bytes:
     return b"\x80" * size
 
 
-def _to_video_frame(frame: Frame, name: str) -> Any:
-    video = _new_video(frame.width, frame.height, name)
+def _filled_av_frame(frame: Frame, name: str) -> Any:
+    av_frame = _new_av_frame(frame.width, frame.height, name)
     layout = frame.format.layout
     if isinstance(layout, Planes):
         y, u, v = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
         arrays = [y, np.stack((u, v), axis=-1)] if layout.interleaved else [y, u, v]
     else:
         arrays = [frame.array()]
-    for plane, array in zip(video.planes, arrays, strict=True):
+    for plane, array in zip(av_frame.planes, arrays, strict=True):
         rows = array.reshape(array.shape[0], -1)
         _fill_plane(
             plane, rows if rows.itemsize == 1 else np.ascontiguousarray(rows).view(np.uint8)
         )
-    video.color_range, video.colorspace = colour_properties(frame.format)
-    return video
+    av_frame.color_range, av_frame.colorspace = colour_properties(frame.format)
+    return av_frame
 
 
 def _fill_plane(plane: Any, rows: Any) -> None:

@@ -141,7 +141,7 @@ class PictureCutter:
             offset += 1
         if len(data) > offset + 1 and (
             data[offset] != 0xFF or not data[offset + 1]
-        ):  # as some webcams send
+        ):  # some webcams send stray bytes between segments
             if data.find(PICTURE_START, len(START), offset + len(PICTURE_START) - 1) >= 0:
                 return -offset  # a cut segment ran into another picture
             match = _NEXT_MARKER.search(data, offset, offset + MAX_STRAY_BYTES)

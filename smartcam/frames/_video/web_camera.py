@@ -12,9 +12,9 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError, MessageError
 from smartcam.frames._codecs.jpeg import jpeg_header
 from smartcam.frames._driver import StreamFormat
 from smartcam.frames._streaming.rtp.assembling import AccessUnit
-from smartcam.frames._streaming.rtp.codings import JPEG
 from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
 from smartcam.frames._streaming.rtp.driver import FirstPicture
+from smartcam.frames._streaming.rtp.stream_codecs import JPEG
 from smartcam.frames._video.driver import VideoDriver
 from smartcam.frames._video.frames import CONVERTIBLE
 from smartcam.frames._video.multipart import PictureCutter
@@ -32,8 +32,8 @@ STREAM_STATUSES: Final = (200, 203, 206)
 class WebDriver(VideoDriver):
     """A web camera or a recording on a web server; parameters as in :class:`VideoDriver`.
 
-    A multipart stream of JPEGs is read without FFmpeg, so that each picture comes with its last
-    byte.
+    A multipart stream of JPEGs is read without FFmpeg, so that each picture is delivered when
+    its last byte comes.
     """
 
     _multipart_stream: _MultipartStream | None = None
@@ -55,7 +55,9 @@ class WebDriver(VideoDriver):
             if not self._is_multipart:
                 return await super().open()
             if self._fps:
-                raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
+                raise self.address.wrong(
+                    "fps", "a recording, as live streams have no fps", "a live stream"
+                )
             frame = await first.outcome
         finally:
             await self.stop()
@@ -72,7 +74,8 @@ class WebDriver(VideoDriver):
             await super().start(sink)
         elif not await self._start_multipart(sink):
             raise FrameFormatError(
-                f"{self.name}: expected parts as at the opening, got another answer: open it again",
+                f"{self.name}: expected a multipart stream as when it was opened, got another "
+                "answer; open the source again",
                 source=self.name,
             )
 
@@ -85,7 +88,7 @@ class WebDriver(VideoDriver):
 
     async def _start_multipart(self, sink: FrameSink) -> bool:
         """Start reading a multipart stream; return False for other streams, or with a proxy."""
-        if self._allows_elsewhere or _needs_proxy(self.address.scheme, self.address.host):
+        if self._allows_other_hosts or _needs_proxy(self.address.scheme, self.address.host):
             return False
         url = self.address.url.partition("#")[0]
         stream = WebStream(self.name, url, self._tls)

@@ -131,7 +131,7 @@ class FleetPictures:
         if not self._records_all:
             self._matchers[track.camera] = matcher
         try:
-            await tap.ended()
+            await tap.pass_until_end()
         finally:
             self._matchers.pop(track.camera, None)
             tap.close()

@@ -61,7 +61,7 @@ class RecordedDriver(TaskDriver):
     silent for longer than a source allows, open the source with ``stall=None``.
     """
 
-    times_frames: ClassVar[bool] = True
+    sets_captured: ClassVar[bool] = True
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)

@@ -67,7 +67,7 @@ class JudgedPictures(Observer):
 
         tap = FrameTap(source, on_frame, lambda: not self._recorder.has_room)
         try:
-            await tap.ended()
+            await tap.pass_until_end()
         finally:
             tap.close()
 

@@ -70,7 +70,7 @@ async def record_frames(
         return True
 
     tap = FrameTap(source, on_frame, lambda: not recorder.has_room)
-    ended = asyncio.ensure_future(tap.ended())
+    ended = asyncio.ensure_future(tap.pass_until_end())
     failed = asyncio.ensure_future(recorder.wait_failed())
     try:
         await asyncio.wait({ended, failed}, return_when=asyncio.FIRST_COMPLETED)

@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 from smartcam._extras import load
 from smartcam.exceptions import ConfigurationError, FrameFormatError
-from smartcam.frames._inside import colour_properties, to_lossless_video
+from smartcam.frames._inside import colour_properties, to_lossless_av_frame
 from smartcam.recording._exclusive_files import open_exclusively
 from smartcam.recording._mcap.form import RecordedPicture
 
@@ -29,7 +29,7 @@ def check_writable(frame: Frame) -> None:
     """Raise FrameFormatError if a video cannot hold a frame without loss."""
     if frame.format.name != "MJPEG":
         try:
-            to_lossless_video(frame)
+            to_lossless_av_frame(frame)
         except FrameFormatError as exc:
             raise FrameFormatError(
                 f"{exc}; a recording in MCAP (.mcap) takes any format",
@@ -151,7 +151,7 @@ class VideoFile:
         if is_jpeg:
             video.pix_fmt = "yuvj420p"  # the JPEGs are not encoded again, and have this format
         else:
-            video.pix_fmt = to_lossless_video(frame).format.name
+            video.pix_fmt = to_lossless_av_frame(frame).format.name
             video.codec_context.color_range, video.codec_context.colorspace = colour_properties(
                 frame.format
             )
@@ -167,7 +167,7 @@ class VideoFile:
             packet.is_keyframe = True
             self._container.mux(packet)
             return
-        video = to_lossless_video(frame)
-        video.pts, video.time_base = ticks, TICK_DURATION
-        for packet in self._video.encode(video):
+        av_frame = to_lossless_av_frame(frame)
+        av_frame.pts, av_frame.time_base = ticks, TICK_DURATION
+        for packet in self._video.encode(av_frame):
             self._container.mux(packet)

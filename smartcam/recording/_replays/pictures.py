@@ -145,7 +145,7 @@ def _counts_in_certain_order(
 class _ResultPictures(FrameDriver):
     """Delivers the picture of each result that a replay sends, beginning with the last one."""
 
-    times_frames: ClassVar[bool] = True  # the frames already have their times of capture
+    sets_captured: ClassVar[bool] = True  # the frames already have their times of capture
 
     def __init__(self, pictures: ReplayedPictures) -> None:
         super().__init__(FrameAddress.parse("replayed://"))

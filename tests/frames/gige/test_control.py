@@ -11,9 +11,9 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, FrameSourceError, FrameTimeoutError
 from smartcam.frames import FrameAddress
+from smartcam.frames._gige import camera_url as _camera_url
 from smartcam.frames._gige import driver
 from smartcam.frames._gige import force_address as force
-from smartcam.frames._gige import places as _places
 from smartcam.frames._gige.control import RequestRefusedError
 from smartcam.frames._inside import ControlChannel, GigEDriver, checked_mac, force_address
 from tests.frames.gige.camera import camera
@@ -169,10 +169,10 @@ async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.Monke
     async def found(_: object) -> list[Found]:
         return [info("10.0.0.8", "A"), info("10.0.0.9", "B")]
 
-    monkeypatch.setattr(_places, "find_cameras", found)
+    monkeypatch.setattr(_camera_url, "find_cameras", found)
     monkeypatch.setattr(driver, "find_cameras", found)
     address = FrameAddress.parse("gige://?serial=B")
-    assert await _places.find_camera(address, _places.read_wanted_stream(address)) == (
+    assert await _camera_url.find_camera(address, _camera_url.read_wanted_stream(address)) == (
         "10.0.0.9",
         3956,
     )
@@ -204,7 +204,7 @@ async def test_a_camera_gets_an_address() -> None:
             "02-00-00-00-00-01",
             "127.0.5.6/16",
             gateway="127.0.0.2",
-            places=HERE,
+            in_networks=HERE,
             port=there.port,
         )
         assert there.forced == ("127.0.5.6", "255.255.0.0", "127.0.0.2")
@@ -215,7 +215,9 @@ async def test_a_camera_gets_an_address() -> None:
 async def test_missing_camera_is_reported() -> None:
     async with camera() as there:
         with pytest.raises(FrameSourceError, match="answers; there are 02:00:00:00:00:01 Maker"):
-            await force_address("02:00:00:00:00:02", "127.0.5.6/8", places=HERE, port=there.port)
+            await force_address(
+                "02:00:00:00:00:02", "127.0.5.6/8", in_networks=HERE, port=there.port
+            )
         assert not there.forced
 
 
@@ -223,7 +225,7 @@ async def test_camera_under_other_control_refuses() -> None:
     async with camera() as there:
         there.owner = ("127.0.0.1", 1)
         with pytest.raises(FrameSourceError, match="ACCESS_DENIED"):
-            await force_address(MAC, "127.0.5.6/8", places=HERE, port=there.port)
+            await force_address(MAC, "127.0.5.6/8", in_networks=HERE, port=there.port)
 
 
 async def test_camera_that_ignores_its_address_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,7 +233,7 @@ async def test_camera_that_ignores_its_address_is_reported(monkeypatch: pytest.M
     async with camera() as there:
         there.answer_forceip_only = True
         with pytest.raises(FrameTimeoutError, match="does not answer at it within"):
-            await force_address(MAC, "127.0.5.6/8", places=HERE, port=there.port)
+            await force_address(MAC, "127.0.5.6/8", in_networks=HERE, port=there.port)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +255,7 @@ async def test_invalid_addresses_are_refused(
     mac: Any, address: str, more: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=text):
-        await force_address(mac, address, places=[], **more)
+        await force_address(mac, address, in_networks=[], **more)
 
 
 def test_a_hardware_address_may_be_written_in_many_ways() -> None:

@@ -88,7 +88,7 @@ async def test_a_feature_is_described_with_range_unit_entries_and_access() -> No
         ("Width", 64.5, "expected a whole number"),
         ("TriggerSource", "Line7", "expected Software, Line1, got 'Line7'"),
         ("Gain", 1, "can only be read"),
-        ("TriggerSoftware", 1, "it is a command: it is executed"),
+        ("TriggerSoftware", 1, "it is a command: execute it"),
         ("Nothing", 1, "not available now"),
     ],
 )
@@ -118,7 +118,7 @@ async def test_commands_are_executed_to_their_end() -> None:
         assert await source.features["BlackLevel"].get() == 0
         await source.features.load("UserSet1")
         assert await source.features["BlackLevel"].get() == 5.0
-        await source.features.start_with("UserSet1")
+        await source.features.load_at_power_on("UserSet1")
         assert there.words[cameras.USER_DEFAULT] == 1
         with pytest.raises(FrameSourceError, match="expected Default, UserSet1, got 'UserSet9'"):
             await source.features.save("UserSet9")

@@ -49,7 +49,7 @@ async def test_each_trigger_returns_the_picture_that_it_caused() -> None:
     assert there.triggers == 30
     assert frame.trigger is not None
     assert f"event ExposureEnd names its block {frame.sequence}" in frame.trigger.evidence[0]
-    assert "by the camera's clock exposed" in frame.trigger.evidence[1]
+    assert "it was exposed" in frame.trigger.evidence[1]
 
 
 async def test_evidence_without_a_clock_names_its_basis() -> None:
@@ -175,7 +175,7 @@ async def test_events_with_other_ids_than_the_pictures_prove_nothing() -> None:
             frame = await source.trigger()
             assert number_in(frame) == there.exposed[number]
             assert frame.trigger is not None
-            assert "by the camera's clock" in frame.trigger.evidence[0]
+            assert "after the camera's clock" in frame.trigger.evidence[0]
 
 
 async def test_picture_of_another_block_than_the_events_is_not_used() -> None:

@@ -17,19 +17,19 @@ from tests.frames.inside import gvcp
     [
         (gvcp.encode(gvcp.GvcpCommand.DISCOVERY, 1, flags=0x11), "4211000200000001"),
         (
-            gvcp.encode(gvcp.GvcpCommand.READREG, 2, gvcp.read_registers(0x0A00)),
+            gvcp.encode(gvcp.GvcpCommand.READREG, 2, gvcp.readreg_payload(0x0A00)),
             "420100800004000200000a00",
         ),
         (
-            gvcp.encode(gvcp.GvcpCommand.WRITEREG, 3, gvcp.write_registers((0x0A00, 2))),
+            gvcp.encode(gvcp.GvcpCommand.WRITEREG, 3, gvcp.writereg_payload((0x0A00, 2))),
             "420100820008000300000a0000000002",
         ),
         (
-            gvcp.encode(gvcp.GvcpCommand.READMEM, 4, gvcp.read_memory(0x200, 512)),
+            gvcp.encode(gvcp.GvcpCommand.READMEM, 4, gvcp.readmem_payload(0x200, 512)),
             "4201008400080004" + "0000020000000200",
         ),
         (
-            gvcp.encode(gvcp.GvcpCommand.WRITEMEM, 5, gvcp.write_memory(0x200, b"abcd")),
+            gvcp.encode(gvcp.GvcpCommand.WRITEMEM, 5, gvcp.writemem_payload(0x200, b"abcd")),
             "4201008600080005" + "0000020061626364",
         ),
         (

@@ -184,9 +184,9 @@ def test_marker_ends_frames_only_after_it_proved_reliable() -> None:
 def test_marker_of_another_stream_has_to_prove_reliable_again() -> None:
     depacketizer = wary()
     took(depacketizer, *(packet(KEY, number, number, True) for number in range(4)))
-    assert depacketizer.right_markers == 3
+    assert depacketizer.correct_markers == 3
     assert took(depacketizer, packet(KEY, 9, 9, True)._replace(ssrc=2)) == []
-    assert depacketizer.right_markers == 0
+    assert depacketizer.correct_markers == 0
     took(depacketizer, packet(SLICE, 10, 9, True)._replace(ssrc=2))
     assert took(depacketizer, packet(KEY, 11, 10, True)._replace(ssrc=2))[0].data == annex_b(
         KEY, SLICE

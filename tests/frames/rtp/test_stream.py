@@ -20,7 +20,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
 )
 from smartcam.frames import Codecs, Moment, RtpSender
-from smartcam.frames._inside import entry_point, read_stamp
+from smartcam.frames._inside import random_access_point, read_stamp
 from smartcam.frames._streaming.rtp import decoding as receiving
 from smartcam.frames._streaming.rtp import feedback
 from smartcam.frames._streaming.rtp.sockets import host_and_port
@@ -136,7 +136,7 @@ async def test_pictures_come_whole_and_in_order_with_their_times(
         assert one.address == f"{HOST}:{port + 1}"
         assert (one.loss, one.lost) == (0, 0)
         assert sent.frames >= len(got)
-        assert sent.anew >= 1  # for the new receiver
+        assert sent.extra_key_frames >= 1  # for the new receiver
 
 
 async def test_lost_packets_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,7 +221,7 @@ async def test_a_key_frame_in_the_midst_of_a_refresh_is_shown_at_once(
             if number == 35:
                 encoder.request_key_frame()
             sent.append(bytes((await encoder.encode(frame_of(stamped(number), "Mono8"))).data))
-    (refresh,) = (number for number in range(1, 35) if entry_point(sent[number])[1])
+    (refresh,) = (number for number in range(1, 35) if random_access_point(sent[number])[1])
     async with (
         frames.open(f"rtp://{HOST}:{port}?{SIZE}&repair=0", timeout=LIMIT) as source,
         source.reader() as reader,
@@ -261,9 +261,9 @@ async def test_stream_goes_on_after_a_loss_without_a_broken_picture(back: bool) 
             assert [number_of(frame) for frame in got]
             assert sum(frame.lost for frame in got) >= 3
             if back:
-                await until(lambda: sender.statistics().anew > 1)
+                await until(lambda: sender.statistics().extra_key_frames > 1)
             else:
-                assert sender.statistics().anew == 0
+                assert sender.statistics().extra_key_frames == 0
 
 
 async def test_another_stream_replaces_a_silent_one() -> None:
@@ -406,7 +406,7 @@ async def test_a_full_socket_cuts_a_frame_and_the_next_one_is_a_key_frame() -> N
             got = await read(source, lambda found: len(found) > 2 and sender.statistics().cut == 3)
             got += await read(source, lambda found: len(found) > 2)
             assert [number_of(frame) for frame in got]
-        assert sender.statistics().anew >= 1
+        assert sender.statistics().extra_key_frames >= 1
 
 
 async def test_strangers_get_nothing_from_a_sender() -> None:

@@ -266,7 +266,7 @@ BAD: dict[str, Bad] = {
         "an answer to DESCRIBE, got none within", answers(DESCRIBE=HEAD + b"Conte"), SHORT
     ),
     "sends a head without an end": Bad(
-        "lines of 65536 bytes at most", answers(DESCRIBE=HEAD + b"X: " + b"a" * 200_000)
+        "a header of 65536 bytes at most", answers(DESCRIBE=HEAD + b"X: " + b"a" * 200_000)
     ),
     "sends a body without an end": Bad(
         "a body of 65536 bytes at most",

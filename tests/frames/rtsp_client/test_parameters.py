@@ -128,7 +128,7 @@ async def test_refusals_of_a_camera_are_errors(encoded: list[bytes]) -> None:
                 await features[name].get()
         with pytest.raises(FrameFeatureError, match=r"expected a value of one line, got '1.*2'"):
             await features["zoom"].set("1\r\nfocus: 2")
-        for call in (features.names(), features.describe(), features.start_with("UserSet1")):
+        for call in (features.names(), features.describe(), features.load_at_power_on("UserSet1")):
             with pytest.raises(UnsupportedError, match="cannot list its parameters"):
                 await call
         with pytest.raises(UnsupportedError, match="cannot execute a command such as Reboot"):

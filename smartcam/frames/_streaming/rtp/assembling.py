@@ -43,7 +43,7 @@ class OpenUnit(ABC):
 
     Args:
         timestamp: ticks of 90 kHz.
-        unbroken: whether the unit's first packet is not missing.
+        has_first_packet: whether the unit's first packet has arrived.
         arrived_at: time of arrival of the first packet.
 
     Attributes:
@@ -52,8 +52,8 @@ class OpenUnit(ABC):
         parts: received bytes, in order.
     """
 
-    def __init__(self, timestamp: int, unbroken: bool, arrived_at: float) -> None:
-        self.timestamp, self.is_intact, self.arrived_at = timestamp, unbroken, arrived_at
+    def __init__(self, timestamp: int, has_first_packet: bool, arrived_at: float) -> None:
+        self.timestamp, self.is_intact, self.arrived_at = timestamp, has_first_packet, arrived_at
         self.parts: list[bytes] = []
         self.size = 0
         self.has_picture = False
@@ -84,11 +84,11 @@ class OpenUnit(ABC):
 class PayloadFormat(Protocol):
     """An RTP payload format: where an access unit starts, and how it is assembled."""
 
-    def new_unit(self, timestamp: int, unbroken: bool, arrived_at: float, /) -> OpenUnit:
+    def new_unit(self, timestamp: int, has_first_packet: bool, arrived_at: float, /) -> OpenUnit:
         """Return a new access unit."""
         ...
 
-    def is_frame_start(self, payload: bytes, /) -> bool:
+    def certainly_starts_frame(self, payload: bytes, /) -> bool:
         """Return True if a packet is certainly the first of a frame."""
         ...
 
@@ -106,8 +106,8 @@ class NalAccessUnit(OpenUnit):
     FRAGMENT: ClassVar[int]
     """Type of a packet with a fragment of a NAL unit."""
 
-    def __init__(self, timestamp: int, unbroken: bool, arrived_at: float) -> None:
-        super().__init__(timestamp, unbroken, arrived_at)
+    def __init__(self, timestamp: int, has_first_packet: bool, arrived_at: float) -> None:
+        super().__init__(timestamp, has_first_packet, arrived_at)
         self._fragmented_type = -1  # type of the NAL unit whose fragments come now; -1: none
 
     @staticmethod
@@ -127,7 +127,7 @@ class NalAccessUnit(OpenUnit):
 
     @classmethod
     def leading_units(cls, access_unit: bytes) -> Iterator[bytes]:
-        """Yield the NAL units before a frame's picture, and then the header of the picture's first.
+        """Yield the NAL units before a frame's picture, and the header of the picture's first unit.
 
         Start codes are left out.
         """

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.frames._codecs.h264 import H264Decoder
     from smartcam.frames._driver import FrameSink
     from smartcam.frames._streaming.rtp.assembling import AccessUnit
-    from smartcam.frames._streaming.rtp.codings import Coding
+    from smartcam.frames._streaming.rtp.stream_codecs import StreamCodec
 
 
 MAX_WAITING_FRAMES: Final = 16
@@ -59,16 +59,16 @@ class DecodingPlan(NamedTuple):
 
     Attributes:
         name: name of the source.
-        coding: codec of the stream.
+        codec: codec of the stream.
         delay: longest time from exposure to arrival, seconds.
         size: size that the pictures must have; None: any.
-        sets: parameters of the codec from the stream's description, as in a file.
+        sets: parameter sets from the stream's description, with start codes; b"": none.
         pixel_format: pixel format of FFmpeg that pictures are converted to; "": no conversion.
         passes_encoded: whether encoded frames are passed on without decoding.
     """
 
     name: str
-    coding: Coding
+    codec: StreamCodec
     delay: float
     size: tuple[int, int] | None = None
     sets: bytes = b""
@@ -86,7 +86,7 @@ class UnitDecoding:
 
     def __init__(self, plan: DecodingPlan, sink: FrameSink) -> None:
         self._plan, self._sink, self._name = plan, sink, plan.name
-        self._size = plan.size or (plan.coding.size_in(plan.sets) if plan.sets else None)
+        self._size = plan.size or (plan.codec.size_in(plan.sets) if plan.sets else None)
         self._loop = asyncio.get_running_loop()
         self._units: collections.deque[tuple[AccessUnit, float | None]] = collections.deque()
         self._unit_queued = asyncio.Event()
@@ -206,10 +206,10 @@ class UnitDecoding:
 
     def _new_decoder(self) -> H264Decoder:
         reorders, pixel_format = self._reorders, self._plan.pixel_format
-        return self._plan.coding.decoder(self._run, reorders=reorders, pixel_format=pixel_format)
+        return self._plan.codec.decoder(self._run, reorders=reorders, pixel_format=pixel_format)
 
     def _with_parameters(self, unit: AccessUnit) -> AccessUnit:
-        if not self._plan.sets or self._plan.coding.size_in(unit.data) is not None:
+        if not self._plan.sets or self._plan.codec.size_in(unit.data) is not None:
             return unit
         return unit._replace(data=self._plan.sets + unit.data)
 
@@ -222,16 +222,14 @@ class UnitDecoding:
             frame = await self._decode_frame(decoder, frame)
         if frame is not None:
             self._pass_on(frame)
-        elif not (
-            self._reorders and decoder.has_whole_picture
-        ):  # the decoder waits for another frame
+        elif not (self._reorders and decoder.has_whole_picture):  # else it waits for later frames
             self._missed_frames += 1
             if self._source is not None:
                 self._source.request_key_frame()
 
     def _encoded_frame(self, unit: AccessUnit, device_time: float | None) -> Frame | None:
         """Return an encoded frame; None: the size is not known yet."""
-        size = self._size = self._plan.coding.size_in(unit.data) or self._size
+        size = self._size = self._plan.codec.size_in(unit.data) or self._size
         if size is None:
             return None
         if self._plan.size not in (None, size):
@@ -243,7 +241,7 @@ class UnitDecoding:
         age = self._loop.time() - unit.arrived_at
         return Frame(
             data=unit.data,
-            format=find_format(self._plan.coding.format),
+            format=find_format(self._plan.codec.format),
             width=size[0],
             height=size[1],
             stride=0,

@@ -21,8 +21,8 @@ MAX_PACKETS_AHEAD, MAX_PACKETS_LATE = 3000, 500
 """Largest distance of a packet's sequence number from the expected one, forwards and backwards. Two
 consecutive numbers that are farther away show a restarted stream."""
 
-MIN_RIGHT_MARKERS: Final = 2
-"""Number of frames with a right marker after which markers are trusted."""
+MIN_CORRECT_MARKERS: Final = 2
+"""Number of frames with a correct marker after which markers are trusted."""
 
 
 class Depacketizer:
@@ -33,21 +33,21 @@ class Depacketizer:
     stream.
 
     A frame ends with the packet that has the marker. Some senders mark each slice or unit: with
-    ``verify_markers``, a marker ends a frame only after :data:`MIN_RIGHT_MARKERS` frames with right
-    markers, or if the caller calls :meth:`end_marked`. After a wrong marker, frames end at the next
-    timestamp. Parameters without a picture always belong to the next frame.
+    ``verify_markers``, a marker ends a frame only after :data:`MIN_CORRECT_MARKERS` frames with
+    correct markers, or if the caller calls :meth:`end_marked`. After a wrong marker, frames end at
+    the next timestamp. Parameters without a picture always belong to the next frame.
 
     Args:
         window: largest number of packets that wait for a missing one.
         payload_format: format of the payloads; None: H.264.
-        verify_markers: whether markers are trusted only after frames with right markers.
+        verify_markers: whether markers are trusted only after frames with correct markers.
 
     Attributes:
         lost: number of lost packets.
         duplicates: packets that came more than once, or too late.
         damaged: number of incomplete frames.
         streams: number of streams so far.
-        right_markers: number of frames whose marker was right; :data:`MIN_RIGHT_MARKERS` are
+        correct_markers: number of frames whose marker was correct; :data:`MIN_CORRECT_MARKERS` are
             enough to trust markers.
     """
 
@@ -60,7 +60,7 @@ class Depacketizer:
     ) -> None:
         self._window, self._payload_format = window, payload_format or H264PayloadFormat()
         self._verify_markers = verify_markers
-        self.right_markers = 0 if verify_markers else MIN_RIGHT_MARKERS
+        self.correct_markers = 0 if verify_markers else MIN_CORRECT_MARKERS
         self.lost = self.duplicates = self.damaged = self.streams = 0
         self._ssrc: int | None = None
         self._reported = (0, 0)  # lost and damaged when the last unit was returned
@@ -90,7 +90,7 @@ class Depacketizer:
         if packet.ssrc != self._ssrc:
             self._drop_open_frame()
             if self._verify_markers and self._ssrc is not None:
-                self.right_markers = 0
+                self.correct_markers = 0
             self._ssrc = packet.ssrc
             self.streams += 1
             self._reset_stream()
@@ -195,7 +195,7 @@ class Depacketizer:
         if self._open is not None and self._open.timestamp != packet.timestamp:
             yield from self._end_frame()
         elif self._open is not None and self._marked_at is not None and packet.payload:
-            self._markers_are_wrong, self._marked_at, self.right_markers = True, None, 0
+            self._markers_are_wrong, self._marked_at, self.correct_markers = True, None, 0
         if self._open is None:
             self._open = self._new_open_unit(packet, now)
         self._open.add(packet.payload)
@@ -203,17 +203,17 @@ class Depacketizer:
         can_end = self._open.has_picture or not self._open.parts
         if packet.marker and can_end and not self._markers_are_wrong:
             self._marked_at = now
-            if self.right_markers >= MIN_RIGHT_MARKERS:
+            if self.correct_markers >= MIN_CORRECT_MARKERS:
                 yield from self._end_frame()
 
     def _new_open_unit(self, packet: RtpPacket, now: float) -> OpenUnit:
         ended_early = packet.timestamp == self._last_timestamp
-        self.right_markers += self._last_had_marker and self._unbroken and not ended_early
+        self.correct_markers += self._last_had_marker and self._unbroken and not ended_early
         if ended_early and self._unbroken and packet.payload:
-            self._markers_are_wrong, self.right_markers = True, 0
-        starts_here = self._unbroken or self._payload_format.is_frame_start(packet.payload)
-        unbroken = starts_here and not ended_early
-        opened = self._payload_format.new_unit(packet.timestamp, unbroken, now)
+            self._markers_are_wrong, self.correct_markers = True, 0
+        starts_here = self._unbroken or self._payload_format.certainly_starts_frame(packet.payload)
+        has_first_packet = starts_here and not ended_early
+        opened = self._payload_format.new_unit(packet.timestamp, has_first_packet, now)
         parameters, self._parameters = self._parameters, None
         if parameters is not None and self._unbroken:
             opened.parts, opened.size = parameters.parts, parameters.size

@@ -9,10 +9,10 @@ from smartcam._extras import load
 from smartcam.exceptions import FrameSourceError, LocalProtocolError
 from smartcam.frames._driver import FrameDriver, FrameSink, StreamFormat
 from smartcam.frames._pixels.formats import find_format
-from smartcam.frames._streaming.rtp.codings import H264
 from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
 from smartcam.frames._streaming.rtp.receiver import RtpStatistics, StreamReceiver
 from smartcam.frames._streaming.rtp.sockets import SocketPair, resolve
+from smartcam.frames._streaming.rtp.stream_codecs import H264
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
@@ -34,7 +34,7 @@ class RtpDriver(FrameDriver):
     ``repair``   seconds to wait for a missing packet, which is requested from the sender;
                  default 0.1; 0: no repair
     ``timeout``  seconds without a packet after which the sender counts as gone; default 5
-    ``delay``    longest time from exposure to arrival, seconds; default 1
+    ``delay``    assumed longest time from exposure to arrival, seconds; default 1
     ``from``     only accepted sender; default: any host, one sender at a time
     ``name``     of the camera
     ============ =================================================================================

@@ -188,7 +188,7 @@ class H264PayloadFormat:
     new_unit = H264AccessUnit
 
     @staticmethod
-    def is_frame_start(payload: bytes) -> bool:
+    def certainly_starts_frame(payload: bytes) -> bool:
         """Return True if a packet has parameters, a delimiter, or a key frame's first slice."""
         unit_type = payload[0] & 0x1F if payload else 0
         if unit_type == STAP_A and len(payload) > 3:

@@ -43,7 +43,7 @@ class H265PayloadFormat:
     new_unit = H265AccessUnit
 
     @staticmethod
-    def is_frame_start(payload: bytes) -> bool:
+    def certainly_starts_frame(payload: bytes) -> bool:
         """Return True if a packet begins with a NAL unit that can only begin a frame."""
         unit_type = H265AccessUnit.unit_type(payload[0]) if payload else -1
         if unit_type == H265AccessUnit.AGGREGATION and len(payload) > 4:

@@ -66,12 +66,12 @@ class JpegPayloadFormat:
         self.size = size
         self.tables: dict[int, tuple[bytes, ...]] = {}
 
-    def new_unit(self, timestamp: int, unbroken: bool, arrived_at: float) -> JpegAccessUnit:
+    def new_unit(self, timestamp: int, has_first_packet: bool, arrived_at: float) -> JpegAccessUnit:
         """Return a new picture."""
-        return JpegAccessUnit(self, timestamp, unbroken, arrived_at)
+        return JpegAccessUnit(self, timestamp, has_first_packet, arrived_at)
 
     @staticmethod
-    def is_frame_start(payload: bytes) -> bool:
+    def certainly_starts_frame(payload: bytes) -> bool:
         """Return True if a packet has the first piece of a picture."""
         return len(payload) > HEAD_BYTES and payload[1:4] == b"\0\0\0"
 
@@ -83,10 +83,10 @@ class JpegAccessUnit(OpenUnit):
         self,
         payload_format: JpegPayloadFormat,
         timestamp: int,
-        unbroken: bool,
+        has_first_packet: bool,
         arrived_at: float,
     ) -> None:
-        super().__init__(timestamp, unbroken, arrived_at)
+        super().__init__(timestamp, has_first_packet, arrived_at)
         self._payload_format = payload_format
         self._next_offset = 0  # offset of the next piece in the picture
 

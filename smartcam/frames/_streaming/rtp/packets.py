@@ -239,7 +239,7 @@ def parse_rtcp(data: bytes) -> list[Report]:
     """Read a datagram of RTCP; unsupported kinds of packets are skipped.
 
     Raises:
-        MessageError: a length or count is wrong, or the first packet is no report.
+        MessageError: the version, a type, a length or a count is wrong.
     """
     reports: list[Report] = []
     offset = 0

@@ -53,8 +53,8 @@ KEY_FRAME_REQUEST_INTERVAL: Final = 0.2
 """Seconds between two requests for a key frame."""
 
 NEW_STREAM_DELAY: Final = 1.0
-"""Seconds after which another stream replaces the current one: of silence if the other comes from
-the same host, or of packets without a decodable picture, then from any host."""
+"""Seconds after which another stream replaces the current one: a stream from the same host if the
+current one is silent, a stream from any host if the current one has no decodable picture."""
 
 NEW_HOST_DELAY: Final = 5.0
 """Seconds of silence after which a stream from another host is accepted."""
@@ -111,16 +111,16 @@ class StreamReceiver:
     """Receiver of a stream from a pair of channels, which :meth:`close` closes.
 
     Args:
-        pair: unused channels.
+        pair: channels that nobody reads yet.
         payload_type: payload type of the stream's packets.
-        repair: seconds to wait for a missing packet after a request.
+        repair_timeout: seconds to wait for a missing packet after a request.
         on_units: function that is called with complete encoded frames.
         on_goodbye: function that is called with the reason when the sender ends the stream.
         only_hosts: addresses of accepted hosts; empty: any host.
         payload_format: format of the payloads; None: H.264.
         is_negotiated: whether RTSP negotiated the stream: then a new stream of the same host
             replaces it at once, and the wait for missing packets is short.
-        right_markers: number of earlier frames of the sender with a right marker.
+        correct_markers: number of earlier frames of the sender with a correct marker.
 
     Attributes:
         last_packet_at: time of the stream's last packet, on the loop's clock.
@@ -130,21 +130,21 @@ class StreamReceiver:
         self,
         pair: PacketChannels,
         payload_type: int,
-        repair: float,
+        repair_timeout: float,
         on_units: Callable[[list[AccessUnit]], None],
         on_goodbye: Callable[[str], None],
         only_hosts: tuple[str, ...] = (),
         payload_format: PayloadFormat | None = None,
         *,
         is_negotiated: bool = False,
-        right_markers: int = 0,
+        correct_markers: int = 0,
     ) -> None:
-        self._pair, self._payload_type, self._repair = pair, payload_type, repair
+        self._pair, self._payload_type, self._repair_timeout = pair, payload_type, repair_timeout
         self._on_units, self._on_goodbye, self._only_hosts = on_units, on_goodbye, only_hosts
         self._is_negotiated = is_negotiated
         self._loop = asyncio.get_running_loop()
         self._depacketizer = Depacketizer(MAX_WAITING_PACKETS, payload_format, verify_markers=True)
-        self._depacketizer.right_markers = right_markers
+        self._depacketizer.correct_markers = correct_markers
         self._reception: Reception | None = None
         # report that came before the first packet, and its time
         self._early_report: tuple[wire.SenderReport, float] | None = None
@@ -188,9 +188,9 @@ class StreamReceiver:
         )
 
     @property
-    def right_markers(self) -> int:
-        """Number of the sender's frames with a right marker."""
-        return self._depacketizer.right_markers
+    def correct_markers(self) -> int:
+        """Number of the sender's frames with a correct marker."""
+        return self._depacketizer.correct_markers
 
     def utc(self, timestamp: int) -> float | None:
         """Return a time on the sender's wall clock; None if the sender has not reported it yet."""
@@ -295,7 +295,7 @@ class StreamReceiver:
             self._unanswered_requests += 1
             self._requested_at.clear()
             self.request_key_frame()
-        elif self._repair and len(missing) <= MAX_PACKETS_REQUESTED:
+        elif self._repair_timeout and len(missing) <= MAX_PACKETS_REQUESTED:
             next_sequence = self._depacketizer.next_of_open_frame()
             if (
                 next_sequence is not None
@@ -310,11 +310,11 @@ class StreamReceiver:
         if self._is_negotiated:
             return REORDER_GRACE
         repeats = self._unanswered_requests < MAX_UNANSWERED_REQUESTS
-        return self._repair if repeats else min(self._repair, REORDER_GRACE)
+        return self._repair_timeout if repeats else min(self._repair_timeout, REORDER_GRACE)
 
     def _awaits_frame_end(self) -> bool:
         """Return True if the rest of a frame is missing and the sender repairs such losses."""
-        if not self._repaired or self._loop.time() - self.last_packet_at > self._repair:
+        if not self._repaired or self._loop.time() - self.last_packet_at > self._repair_timeout:
             return False
         return self._depacketizer.next_of_open_frame() is not None
 
@@ -367,7 +367,7 @@ class StreamReceiver:
         if self._reception is None:
             return
         is_request = bool(more) and isinstance(more[0], wire.PacketsMissing | wire.PictureLost)
-        blocks = () if is_request else (self._reception.block(self._loop.time()),)
+        blocks = () if is_request else (self._reception.make_report_block(self._loop.time()),)
         report = wire.ReceiverReport(self._ssrc, blocks)
         name = wire.SourceDescription(self._ssrc, self._cname)
         self._pair.send_rtcp(wire.compound(report, name, *more), self._report_address)

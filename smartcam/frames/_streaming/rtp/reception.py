@@ -61,7 +61,7 @@ class Reception:
         """Set the last sender report, which came at a moment."""
         self._sender_report = (report, now)
 
-    def block(self, now: float) -> ReportBlock:
+    def make_report_block(self, now: float) -> ReportBlock:
         """Return a report block for the time since the last report."""
         expected = (
             0 if self._first_sequence is None else self._highest_sequence - self._first_sequence + 1

@@ -61,7 +61,8 @@ class RtpSenderStatistics:
         bytes: bytes of these packets, with the headers of RTP.
         cut: frames that were sent only in part, since the socket was full.
         resent: packets sent again on request.
-        anew: key frames encoded because a receiver joined or lost packets, or a frame was cut.
+        extra_key_frames: key frames encoded because a receiver joined or lost packets, or a frame
+            was cut.
         receivers: last reports of the receivers.
     """
 
@@ -70,7 +71,7 @@ class RtpSenderStatistics:
     bytes: int
     cut: int
     resent: int
-    anew: int
+    extra_key_frames: int
     receivers: tuple[RtpReceiver, ...]
 
 
@@ -139,7 +140,7 @@ class RtpSender:
         self._reports = ReceiverReports(self._packetizer.ssrc)
         self._parameter_sets: tuple[bytes, bytes] | None = None
         self._frames = self._packets = self._bytes = self._cut = self._resent = self._key_frames = 0
-        self._octets = 0
+        self._payload_bytes = 0
         self._key_frame_wanted = False  # whether the next frame must be a key frame
         self._key_frame_at = float("-inf")
         self._endpoint: Endpoint | None = None
@@ -306,7 +307,7 @@ class RtpSender:
             sequence = sequence + 1 & 0xFFFF
             self._packets += 1
             self._bytes += len(packet)
-            self._octets += len(packet) - 12
+            self._payload_bytes += len(packet) - 12
         self._frames += 1
         return True
 
@@ -318,7 +319,7 @@ class RtpSender:
     def _send_report(self, link: _RtpOutlet, *more: wire.Report) -> None:
         now = int(time.monotonic() * CLOCK_RATE) + self._first_timestamp & 0xFFFF_FFFF
         report = wire.SenderReport(
-            self._packetizer.ssrc, ntp_time(time.time()), now, self._packets, self._octets
+            self._packetizer.ssrc, ntp_time(time.time()), now, self._packets, self._payload_bytes
         )
         name = wire.SourceDescription(self._packetizer.ssrc, self._cname)
         link.pair.send_rtcp(wire.compound(report, name, *more), link.to.rtcp_address)

@@ -65,8 +65,9 @@ class Authentication:
         if parameters.get("algorithm", "MD5").upper() != "MD5" or "qop" in parameters:
             return False
         uri = parameters.get("uri", "")
+        # a prefix is enough: live555 names the stream also in requests for its track
         if not f"{request.url}/".startswith(f"{uri.rstrip('/')}/"):
-            return False  # live555 names the stream also in requests for its track
+            return False
         hash_of_request = _md5(request.method.encode(), uri.encode())
         response = _md5(self._hashed_secret.encode(), nonce.encode(), hash_of_request.encode())
         return _is_equal(parameters.get("response", "").lower(), response) and all(matches)

@@ -66,7 +66,7 @@ class ConnectionOwner(Protocol):
         ...
 
     def mark_served(self, connection: RtspConnection) -> None:
-        """Mark a connection as the most recently served one, which is closed last to make room."""
+        """Mark a connection as the most recently served one: others are closed first for room."""
         ...
 
     def on_last_session_end(self, connection: RtspConnection) -> None:
@@ -89,7 +89,7 @@ class ConnectionOwner(Protocol):
 class RtspConnection(asyncio.Protocol):
     """Read and answer requests; end the sessions when the connection ends.
 
-    A task answers one request at a time. While it does, at most one further message is read.
+    A task answers one request at a time. While it does, about one further message is read.
     """
 
     transport: asyncio.Transport
@@ -160,9 +160,9 @@ class RtspConnection(asyncio.Protocol):
 
     # called by the server
 
-    def close(self, why: str = "") -> None:
+    def close(self, reason: str = "") -> None:
         """Close the connection when all bytes are sent, or after a short time. Idempotent."""
-        self._end_sessions(why)
+        self._end_sessions(reason)
         if self._is_closing:
             return
         self._is_closing = True
@@ -195,15 +195,15 @@ class RtspConnection(asyncio.Protocol):
             self._is_serving = False
             self.owner.mark_served(self)
 
-    def on_session_end(self, session: RtspSession, why: str) -> None:
+    def on_session_end(self, session: RtspSession, reason: str) -> None:
         """Remove an ended session, and close the connection after the last session.
 
         Args:
             session: session that ended by itself.
-            why: reason; "": the client accepts no data, so the connection is aborted.
+            reason: reason of the end; "": the client accepts no data, so the connection is aborted.
         """
         self.remove_session(session)
-        if not why:
+        if not reason:
             self.abort()
         elif not self.sessions:
             self.close()
@@ -221,9 +221,9 @@ class RtspConnection(asyncio.Protocol):
             if isinstance(session.delivery, ChannelDelivery):
                 yield from session.delivery.channels
 
-    def _end_sessions(self, why: str) -> None:
+    def _end_sessions(self, reason: str) -> None:
         for session in list(self.sessions.values()):
-            session.close(why)
+            session.close(reason)
             self.remove_session(session)
 
     # the task

@@ -37,7 +37,7 @@ class PacketDelivery(Protocol):
     """Header Transport of the answer to SETUP."""
 
     def can_send(self, now: float) -> bool:
-        """Return True if a frame may be sent now, and must not be skipped."""
+        """Return True if a frame may be sent now, False if it has to be skipped."""
         ...
 
     def send(self, packets: list[bytes], is_key_frame: bool, now: float) -> bool:
@@ -58,7 +58,7 @@ class PacketDelivery(Protocol):
 
 
 class ChannelDelivery:
-    """Delivery over the RTSP connection (section 10.12), in complete frames."""
+    """Delivery over the RTSP connection (RFC 2326, section 10.12), in complete frames."""
 
     def __init__(self, connection: asyncio.Transport, rtp: int, rtcp: int) -> None:
         self.transport = f"RTP/AVP/TCP;unicast;interleaved={rtp}-{rtcp}"

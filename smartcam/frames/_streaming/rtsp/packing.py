@@ -25,19 +25,19 @@ class FramePacketizer:
 
     def __init__(self) -> None:
         self._packetizer = H264Packetizer(PAYLOAD_TYPE, 0, 0)
-        self._unit: Frame | None = None
+        self._last_frame: Frame | None = None
         self._payloads: list[tuple[int, bytes]] = []
 
-    def payloads(self, unit: Frame) -> list[tuple[int, bytes]]:
+    def payloads(self, frame: Frame) -> list[tuple[int, bytes]]:
         """Return each packet of a frame, as the second byte of its header and its payload.
 
         Raises:
             FrameFormatError: the frame is not valid.
         """
-        if unit is not self._unit:
-            packets = self._packetizer.packets(bytes(unit.data), 0)
-            self._unit, self._payloads = (
-                unit,
+        if frame is not self._last_frame:
+            packets = self._packetizer.packets(bytes(frame.data), 0)
+            self._last_frame, self._payloads = (
+                frame,
                 [(packet[1], packet[_HEAD.size :]) for packet in packets],
             )
         return self._payloads

@@ -82,7 +82,7 @@ async def _describe(connection: RtspConnection, request: RtspRequest) -> RtspAns
     target = target_of(request.url)
     stream = connection.owner.stream(target.name)
     try:
-        key_frame = await stream.shared.first_key_frame(FIRST_FRAME_TIMEOUT)
+        key_frame = await stream.shared_h264.first_key_frame(FIRST_FRAME_TIMEOUT)
         sets = parameter_sets(bytes(key_frame.data))
     except FrameSourceError as exc:
         raise RtspError(503, str(exc)) from exc

@@ -73,7 +73,7 @@ class RtspServing:
         if tasks:
             await asyncio.wait(tasks)
         for shared in {
-            id(stream.shared): stream.shared for stream in self._streams.values()
+            id(stream.shared_h264): stream.shared_h264 for stream in self._streams.values()
         }.values():
             await shared.close()
         await self._codecs.close()
@@ -91,7 +91,7 @@ class RtspServing:
         self._acceptor.leave(connection)
 
     def mark_served(self, connection: RtspConnection) -> None:
-        """Mark a connection as the most recently served one, which is closed last to make room."""
+        """Mark a connection as the most recently served one: others are closed first for room."""
         self._acceptor.restart_idle_time(connection)
 
     def on_last_session_end(self, connection: RtspConnection) -> None:

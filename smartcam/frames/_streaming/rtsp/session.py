@@ -82,20 +82,20 @@ class RtspSession:
         """Start sending frames; return the first packet's numbers for the header RTP-Info."""
         if not self.is_playing:
             self.is_playing, self._awaits_key_frame, self._is_skipping = True, True, False
-            self.stream.shared.add_viewer(self)
+            self.stream.shared_h264.add_viewer(self)
         now = self._timestamp(self._ticks(time.monotonic()))
         return f"seq={self._headers.sequence};rtptime={now}"
 
     def pause(self) -> None:
         """Stop sending frames until :meth:`play`."""
         self.is_playing = False
-        self.stream.shared.remove_viewer(self)
+        self.stream.shared_h264.remove_viewer(self)
 
-    def close(self, why: str = "") -> None:
+    def close(self, reason: str = "") -> None:
         """Release everything. Idempotent.
 
         Args:
-            why: reason that is sent to the client; "": no message.
+            reason: reason that is sent to the client; "": no message.
         """
         self.pause()
         if self._timer is not None:
@@ -103,8 +103,8 @@ class RtspSession:
             self._timer = None
         delivery, self.delivery = self.delivery, None
         if delivery is not None:
-            if why:
-                delivery.send_rtcp(compound(*self._sender_report(), Goodbye((self.ssrc,), why)))
+            if reason:
+                delivery.send_rtcp(compound(*self._sender_report(), Goodbye((self.ssrc,), reason)))
             delivery.close()
 
     def keep_alive(self) -> None:
@@ -120,7 +120,7 @@ class RtspSession:
         if any(isinstance(report, ReceiverReport | SenderReport) for report in reports):
             self.keep_alive()
         if any(isinstance(report, PictureLost) and report.media == self.ssrc for report in reports):
-            self.stream.shared.request_key_frame()
+            self.stream.shared_h264.request_key_frame()
 
     # called by the stream
 
@@ -133,7 +133,7 @@ class RtspSession:
         if self._awaits_key_frame and not is_key_frame:
             self.stream.skipped += self._is_skipping
             if can_send:
-                self.stream.shared.request_key_frame()
+                self.stream.shared_h264.request_key_frame()
             return
         ticks = max(self._ticks(unit.captured), self._last_ticks + 1)
         if not (can_send and self._send(delivery, unit, ticks, is_key_frame, now)):
@@ -193,6 +193,6 @@ class RtspSession:
         elif self.is_playing and now - self._reported_at >= REPORT_INTERVAL:
             self._send_report(now)
 
-    def _end(self, why: str) -> None:
-        self.close(why)
-        self._on_end(self, why)
+    def _end(self, reason: str) -> None:
+        self.close(reason)
+        self._on_end(self, reason)

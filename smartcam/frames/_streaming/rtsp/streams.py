@@ -41,7 +41,7 @@ class RtspStream:
     """A named stream of a server."""
 
     name: str
-    shared: SharedH264
+    shared_h264: SharedH264
     rate: float
     packetizer: FramePacketizer = field(default_factory=FramePacketizer)
     viewer_count: int = 0
@@ -52,7 +52,7 @@ class RtspStream:
 
     def statistics(self) -> RtspStatistics:
         """Return the counts of the stream."""
-        counts = self.shared.counts
+        counts = self.shared_h264.counts
         return RtspStatistics(
             viewers=self.viewer_count,
             encoded=counts.encoded,

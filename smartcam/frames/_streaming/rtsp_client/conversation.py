@@ -51,7 +51,7 @@ UNSUPPORTED_TRANSPORT: Final = 461
 INVALID_RANGE: Final = 457
 
 
-class OtherEncodingError(FrameFormatError):
+class OtherCodecError(FrameFormatError):
     """Error for a stream whose codec this client does not support, but FFmpeg may."""
 
 
@@ -95,7 +95,7 @@ class RtspConversation:
         self._link: RtspLink | None = None
         self._base = self._aggregate = ""
         self._session = ""
-        self._timeout = SESSION_TIMEOUT
+        self._session_timeout = SESSION_TIMEOUT
         self._has_get_parameter = False  # whether the server supports GET_PARAMETER
         self._current_step = "the connection"
         self._sockets: SocketPair | None = None
@@ -113,8 +113,8 @@ class RtspConversation:
     def senders(self) -> tuple[str, ...]:
         """Allowed senders of packets: the server, and the source that it announces.
 
-        A recorder may announce the camera as the sender. The address that a camera behind a router
-        announces is not usable.
+        A recorder may announce the camera as the sender. The server stays allowed, since a camera
+        behind a router announces an address that cannot be reached.
         """
         peer = str(self.link.peer[0]).partition("%")[0]
         return (peer, self._announced_sender) if self._announced_sender else (peer,)
@@ -290,25 +290,25 @@ class RtspConversation:
         self, tracks: tuple[VideoTrack, ...], others: tuple[str, ...], answer: ServerAnswer
     ) -> FrameFormatError:
         offered = [
-            f"{'encrypted ' * track.is_encrypted}{track.encoding or track.payload_type}"
+            f"{'encrypted ' * track.is_encrypted}{track.codec_name or track.payload_type}"
             for track in tracks
         ]
         shown = ", ".join((*offered, *others)) or f"{len(answer.body)} bytes without a stream"
         error_class = FrameFormatError
-        if any(track.encoding and not track.is_encrypted for track in tracks):
-            error_class = OtherEncodingError
+        if any(track.codec_name and not track.is_encrypted for track in tracks):
+            error_class = OtherCodecError
         text = f"{self._plan.name}: expected video in H264, H265 or JPEG, got {shown[:200]}"
         return error_class(text, source=self._plan.name)
 
     async def _choose_transport(self) -> None:
         first, *others = self._plan.transports
-        answer = await self._set_up(first)
+        answer = await self._request_transport(first)
         for transport in others:
             if answer.status == UNSUPPORTED_TRANSPORT:
-                answer = await self._set_up(transport)
+                answer = await self._request_transport(transport)
         self._expect_ok("SETUP", answer)
 
-    async def _set_up(self, transport: str) -> ServerAnswer:
+    async def _request_transport(self, transport: str) -> ServerAnswer:
         return await (self._set_up_channels() if transport == "tcp" else self._set_up_ports())
 
     async def _set_up_channels(self) -> ServerAnswer:
@@ -366,7 +366,7 @@ class RtspConversation:
         self._session = session.strip() or self._session
         match = re.search(r"(?i)timeout\s*=\s*([0-9]{1,6})", options)
         if match is not None and int(match[1]):
-            self._timeout = max(MIN_SESSION_TIMEOUT, float(match[1]))
+            self._session_timeout = max(MIN_SESSION_TIMEOUT, float(match[1]))
 
     # while it plays
 
@@ -383,10 +383,10 @@ class RtspConversation:
     async def _keep_alive(self) -> None:
         """Send a request twice per session timeout."""
         while True:
-            await asyncio.sleep(self._timeout / 2)
+            await asyncio.sleep(self._session_timeout / 2)
             method = "GET_PARAMETER" if self._has_get_parameter else "OPTIONS"
             try:
-                async with asyncio.timeout(min(self._plan.timeout, self._timeout)):
+                async with asyncio.timeout(min(self._plan.timeout, self._session_timeout)):
                     answer = await self.link.ask(method, self._aggregate, self._headers())
             except TimeoutError:
                 continue  # some cameras do not answer while they play
@@ -398,7 +398,7 @@ class RtspConversation:
                 return
             self._has_get_parameter &= answer.status == 200
 
-    # both
+    # before and while it plays
 
     def _headers(self) -> dict[str, str]:
         return {"Session": self._session} if self._session else {}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from smartcam.frames._streaming.rtp.assembling import START_CODE
-from smartcam.frames._streaming.rtp.codings import H264, H265, JPEG, Coding
+from smartcam.frames._streaming.rtp.stream_codecs import H264, H265, JPEG, StreamCodec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MAX_LINES: Final = 1000
 """Largest number of lines of a description that are read."""
 
-CODINGS: Final = {"H264": H264, "H265": H265, "HEVC": H265, "JPEG": JPEG}
+CODECS: Final = {"H264": H264, "H265": H265, "HEVC": H265, "JPEG": JPEG}
 """Supported codecs by their names."""
 
 STATIC_CODECS: Final = {26: "JPEG", 28: "NV", 31: "H261", 32: "MPV", 33: "MP2T", 34: "H263"}
@@ -30,7 +30,7 @@ class VideoTrack(NamedTuple):
 
     Attributes:
         payload_type: payload type of the packets.
-        encoding: name of the codec, in capital letters; "": unknown.
+        codec_name: name of the codec, in capital letters; "": unknown.
         control: URL of the stream in the description, perhaps relative; "": the description's URL.
         parameters: parameters of the codec (fmtp), by names in lower case.
         size: size of the pictures; None: not in the description.
@@ -38,20 +38,20 @@ class VideoTrack(NamedTuple):
     """
 
     payload_type: int
-    encoding: str
+    codec_name: str
     control: str = ""
     parameters: Mapping[str, str] = MappingProxyType({})
     size: tuple[int, int] | None = None
     is_encrypted: bool = False
 
     @property
-    def coding(self) -> Coding | None:
+    def codec(self) -> StreamCodec | None:
         """Codec of the stream; None: not supported."""
-        return CODINGS.get(self.encoding)
+        return CODECS.get(self.codec_name)
 
     @property
     def parameter_sets(self) -> bytes:
-        """Parameter sets for the decoder, as in a file; b"" if the description has none."""
+        """Parameter sets with start codes, for the decoder; b"" if the description has none."""
         names = ("sprop-vps", "sprop-sps", "sprop-pps", "sprop-parameter-sets")
         units = [value for name in names for value in self.parameters.get(name, "").split(",")]
         return b"".join(START_CODE + unit for text in units if (unit := _decode_base64(text)))
@@ -73,7 +73,7 @@ class StreamDescription(NamedTuple):
     def first_supported_track(self) -> VideoTrack | None:
         """Return the first supported stream of video; None: there is none."""
         tracks = self.tracks
-        return next((track for track in tracks if track.coding and not track.is_encrypted), None)
+        return next((track for track in tracks if track.codec and not track.is_encrypted), None)
 
 
 def parse_description(body: bytes) -> StreamDescription:
@@ -97,20 +97,25 @@ def parse_description(body: bytes) -> StreamDescription:
 
 def _track(media_line: list[str], lines: list[str]) -> VideoTrack:
     types = [int(text) for text in media_line[3:] if re.fullmatch(r"[0-9]{1,3}", text)] or [-1]
-    encodings = {payload_type: _encoding(payload_type, lines) for payload_type in types}
-    supported = (payload_type for payload_type in types if encodings[payload_type] in CODINGS)
+    codec_names = {payload_type: _codec_name(payload_type, lines) for payload_type in types}
+    supported = (payload_type for payload_type in types if codec_names[payload_type] in CODECS)
     payload_type = next(supported, types[0])
     is_encrypted = len(media_line) > 2 and media_line[2].upper().startswith("RTP/SAVP")
     parameters = _parameters(_typed_attribute(lines, "fmtp", payload_type))
-    encoding = encodings[payload_type]
-    if not encoding and "sprop-parameter-sets" in parameters:
-        encoding = "H264"
+    codec_name = codec_names[payload_type]
+    if not codec_name and "sprop-parameter-sets" in parameters:
+        codec_name = "H264"
     return VideoTrack(
-        payload_type, encoding, _attribute(lines, "control"), parameters, _size(lines), is_encrypted
+        payload_type,
+        codec_name,
+        _attribute(lines, "control"),
+        parameters,
+        _size(lines),
+        is_encrypted,
     )
 
 
-def _encoding(payload_type: int, lines: list[str]) -> str:
+def _codec_name(payload_type: int, lines: list[str]) -> str:
     text = _typed_attribute(lines, "rtpmap", payload_type)
     name = text.partition(";")[0].partition("/")[0].strip().upper()
     return name or STATIC_CODECS.get(payload_type, "")

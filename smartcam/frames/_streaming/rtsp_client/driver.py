@@ -14,7 +14,7 @@ from smartcam.frames._streaming.rtp.jpeg import JpegPayloadFormat
 from smartcam.frames._streaming.rtp.receiver import RtpStatistics, StreamReceiver
 from smartcam.frames._streaming.rtsp_client.conversation import (
     ConversationPlan,
-    OtherEncodingError,
+    OtherCodecError,
     RtspConversation,
 )
 from smartcam.frames._streaming.rtsp_client.parameters import RtspParameters
@@ -46,16 +46,16 @@ class RtspDriver(FrameDriver):
                       camera counts as lost; default 5
     ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
                       passes such bytes on unchanged; default: the decoder's format
-    ``delay``         longest time from exposure to arrival, seconds; default 1
+    ``delay``         assumed longest time from exposure to arrival, seconds; default 1
     ``verify``        of TLS (``rtsps:``): ``no`` trusts any certificate
     ``ca``            of TLS: file with the certificates that are trusted; default: the system's
     ``elsewhere``     ``yes`` follows a redirect to another host or port; default ``no``
     ``name``          of the camera
     ================= =============================================================================
 
-    Only complete pictures are returned, each with its last packet. After a loss, pictures continue
-    at the next key frame, which is requested, or at the end of a refresh. ``frame.lost`` counts
-    lost frames.
+    Only complete pictures are returned, each when its last packet comes. After a loss, pictures
+    continue at the next key frame, which is requested, or at the end of a refresh. ``frame.lost``
+    counts lost frames.
 
     ``captured`` is the arrival of a frame's first packet. Once the camera has reported its clock
     (RTCP sender reports), ``device_time`` is the frame's time on that clock, in seconds since 1970.
@@ -86,7 +86,7 @@ class RtspDriver(FrameDriver):
             raise address.wrong("address", "rtsp://HOST/PATH", address.shown)
         self._plan = ConversationPlan(self._name, url, timeout, transports, follows_elsewhere, tls)
         self._size: tuple[int, int] | None = None
-        self._right_markers = 0
+        self._correct_markers = 0
         self._playing: _PlayingSession | None = None
         self._ffmpeg_driver: VideoDriver | None = None
 
@@ -130,7 +130,7 @@ class RtspDriver(FrameDriver):
             await self._start(first)
             async with asyncio.timeout(self._plan.timeout):
                 frame = await first.outcome
-        except OtherEncodingError:
+        except OtherCodecError:
             self._ffmpeg_driver = VideoDriver(self.address)
             return await self._ffmpeg_driver.open()
         except TimeoutError:
@@ -162,7 +162,7 @@ class RtspDriver(FrameDriver):
             plan = self._decoding_plan(conversation.track)
             has_size = self._size is not None
             self._playing = _PlayingSession(
-                self._plan, plan, conversation, sink, has_size, self._right_markers
+                self._plan, plan, conversation, sink, has_size, self._correct_markers
             )
             await self._playing.start()
         except BaseException:
@@ -173,16 +173,16 @@ class RtspDriver(FrameDriver):
             raise
 
     def _decoding_plan(self, track: VideoTrack) -> DecodingPlan:
-        coding = track.coding
-        assert coding is not None  # noqa: S101 - others are not chosen
+        codec = track.codec
+        assert codec is not None  # noqa: S101 - others are not chosen
         passes_encoded = self._format in ("H264", "MJPEG")
-        actual = coding.format if coding.name != "H265" else coding.name
+        actual = codec.format if codec.name != "H265" else codec.name
         if passes_encoded and actual != self._format:
             raise self._plan.source_error(f"expected {self._format}, got {actual}")
         converts = bool(self._format) and not passes_encoded
         return DecodingPlan(
             self._name,
-            coding,
+            codec,
             self._delay,
             self._size,
             track.parameter_sets,
@@ -196,7 +196,7 @@ class RtspDriver(FrameDriver):
             await self._ffmpeg_driver.stop()
         playing, self._playing = self._playing, None
         if playing is not None:
-            self._right_markers = playing.right_markers
+            self._correct_markers = playing.correct_markers
             await playing.stop()
 
     async def close(self) -> None:
@@ -210,7 +210,7 @@ class _PlayingSession:
     Args:
         detects_silence: whether a pause without packets is an error; :meth:`RtspDriver.open` waits
             for a picture with a timeout of its own instead.
-        right_markers: number of earlier frames of the camera with a right marker.
+        correct_markers: number of earlier frames of the camera with a correct marker.
     """
 
     def __init__(
@@ -220,11 +220,11 @@ class _PlayingSession:
         conversation: RtspConversation,
         sink: FrameSink,
         detects_silence: bool,
-        right_markers: int,
+        correct_markers: int,
     ) -> None:
         self._plan, self.conversation, self._detects_silence = plan, conversation, detects_silence
         track = conversation.track
-        payload_format: PayloadFormat = decoding.coding.payload_format()
+        payload_format: PayloadFormat = decoding.codec.payload_format()
         if isinstance(payload_format, JpegPayloadFormat):
             payload_format.size = track.size
         self._decoding = UnitDecoding(decoding, sink)
@@ -240,7 +240,7 @@ class _PlayingSession:
             only_hosts=conversation.senders,
             payload_format=payload_format,
             is_negotiated=True,
-            right_markers=right_markers,
+            correct_markers=correct_markers,
         )
         conversation.link.on_end = self._report_end
 
@@ -267,9 +267,9 @@ class _PlayingSession:
             await self._decoding.stop()
 
     @property
-    def right_markers(self) -> int:
-        """Number of the camera's frames with a right marker."""
-        return self._receiver.right_markers
+    def correct_markers(self) -> int:
+        """Number of the camera's frames with a correct marker."""
+        return self._receiver.correct_markers
 
     def statistics(self) -> RtpStatistics:
         """Return the counts of packets received."""
@@ -278,8 +278,8 @@ class _PlayingSession:
     def _on_goodbye(self, reason: str) -> None:
         self._report_end(f"the server ended the stream{f' ({reason})' if reason else ''}")
 
-    def _report_end(self, why: str) -> None:
-        self._decoding.report_end(self._plan.source_error(why))
+    def _report_end(self, reason: str) -> None:
+        self._decoding.report_end(self._plan.source_error(reason))
 
     async def _watch_silence(self) -> None:
         loop, timeout = asyncio.get_running_loop(), self._plan.timeout

@@ -99,9 +99,9 @@ class RtspLink(asyncio.Protocol):
         """The family of the addresses."""
         return socket.AF_INET6 if ":" in str(self.peer[0]) else socket.AF_INET
 
-    def fail(self, why: str) -> None:
+    def fail(self, reason: str) -> None:
         """End the link with a reason for :attr:`on_end`."""
-        self._end(why)
+        self._end(reason)
 
     def _socket_info(self, name: str) -> Any:
         value = None if self._transport is None else self._transport.get_extra_info(name)
@@ -201,8 +201,10 @@ class RtspLink(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Fail all calls that wait for an answer."""
-        why = getattr(exc, "strerror", None) if exc is not None else None
-        self._end(f"the connection is lost: {why}" if why else "the server closed the connection")
+        reason = getattr(exc, "strerror", None) if exc is not None else None
+        self._end(
+            f"the connection is lost: {reason}" if reason else "the server closed the connection"
+        )
 
     # received messages
 
@@ -235,15 +237,15 @@ class RtspLink(asyncio.Protocol):
         if request.method in _ENDING_METHODS:
             self._end(f"the server ended the session ({request.method})")
 
-    def _end(self, why: str) -> None:
+    def _end(self, reason: str) -> None:
         if self.end_reason:
             return
-        self.end_reason = why
+        self.end_reason = reason
         if self._pending_answer is not None and not self._pending_answer[1].done():
-            self._pending_answer[1].set_exception(self._error(why))
+            self._pending_answer[1].set_exception(self._error(reason))
             self._pending_answer[1].exception()  # mark the error as retrieved
         on_end, self.on_end = self.on_end, _ignore
-        on_end(why)
+        on_end(reason)
         if self._transport is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._transport.close()

@@ -34,7 +34,7 @@ MAX_SHOWN_CHARACTERS: Final = 80
 class RtspParameters(DeviceFeatures):
     """The parameters of a camera, by their names in its maker's documents.
 
-    A name is sent unchanged, since there is no list of names for other spellings.
+    A name is sent unchanged: without a list of names, other spellings cannot be recognized.
 
     Args:
         name: name of the source, for errors.
@@ -98,12 +98,12 @@ class RtspParameters(DeviceFeatures):
         status = f"{method}: {answer.status} {answer.reason}".rstrip()
         if answer.status in UNSUPPORTED_METHOD:
             raise UnsupportedError(f"{self._name}: it has no such request: {status}")
-        why = {
+        reason = {
             NOT_UNDERSTOOD: "there is no such parameter",
             READ_ONLY: "it can only be read",
             INVALID_VALUE: "the camera does not accept the value",
         }.get(answer.status, "it refuses that")
-        raise self._feature_error(name, f"{why}: {status}")
+        raise self._feature_error(name, f"{reason}: {status}")
 
     def _raise_unsupported(self, action: str) -> NoReturn:
         raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {action}")

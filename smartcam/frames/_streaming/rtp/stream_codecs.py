@@ -22,7 +22,7 @@ class H265Decoder(H264Decoder):
     CODEC: ClassVar = "hevc"
     NAME: ClassVar = "H265"
 
-    def _entry_point(self, data: bytes) -> tuple[bool, int | None]:
+    def _random_access_point(self, data: bytes) -> tuple[bool, int | None]:
         types = [H265AccessUnit.unit_type(unit[0]) for unit in H265AccessUnit.leading_units(data)]
         return bool(types) and types[-1] in h265.KEY_SLICES, None
 
@@ -33,16 +33,16 @@ class JpegDecoder(H264Decoder):
     CODEC: ClassVar = "mjpeg"
     NAME: ClassVar = "JPEG"
 
-    def _entry_point(self, data: bytes) -> tuple[bool, int | None]:
+    def _random_access_point(self, data: bytes) -> tuple[bool, int | None]:
         return True, None
 
 
-class Coding(NamedTuple):
+class StreamCodec(NamedTuple):
     """The codec of a stream.
 
     Attributes:
         name: name of the codec.
-        format: name of the encoded frames' format.
+        format: name of the encoded frames' format; for H.265, which has none, that of H.264.
         payload_format: class of the RTP payload format.
         size_in: function that returns the size of the pictures from an encoded frame; None if the
             frame lacks parameters.
@@ -56,6 +56,6 @@ class Coding(NamedTuple):
     decoder: type[H264Decoder]
 
 
-H264: Final = Coding("H264", "H264", H264PayloadFormat, parameters.size_in, H264Decoder)
-H265: Final = Coding("H265", "H264", H265PayloadFormat, h265.size_in, H265Decoder)
-JPEG: Final = Coding("JPEG", "MJPEG", JpegPayloadFormat, jpeg.size_in, JpegDecoder)
+H264: Final = StreamCodec("H264", "H264", H264PayloadFormat, parameters.size_in, H264Decoder)
+H265: Final = StreamCodec("H265", "H264", H265PayloadFormat, h265.size_in, H265Decoder)
+JPEG: Final = StreamCodec("JPEG", "MJPEG", JpegPayloadFormat, jpeg.size_in, JpegDecoder)

@@ -46,14 +46,14 @@ def read_wanted_stream(address: FrameAddress) -> WantedStream:
     if resend not in ("on", "off"):
         raise address.wrong("resend", "on or off", resend)
     packet_size = parameters.get("packet_size", "auto")
-    size = 0.0
+    packet_bytes = 0.0
     if packet_size != "auto":
-        size = address.number("packet_size", packet_size, *PACKET_SIZES)
+        packet_bytes = address.number("packet_size", packet_size, *PACKET_SIZES)
     return WantedStream(
         parameters,
         address.size(parameters["size"]) if "size" in parameters else None,
         address.number("fps", parameters["fps"], 0.001, 100_000) if "fps" in parameters else None,
-        int(size) & ~3,
+        int(packet_bytes) & ~3,
         resend == "on",
         parameters.get("trigger"),
     )
