@@ -189,7 +189,9 @@ class RequestParser:
             if name in _SINGLE_HEADERS:
                 _raise_error(f"{name}: expected once, got it twice")
             value = f"{self._headers.pop(name)}, {value}"
-        if len(self._headers) == MAX_HEADERS or len(value) > MAX_LINE_BYTES:
+        if len(value) > MAX_LINE_BYTES:
+            _raise_error(f"{name}: expected {MAX_LINE_BYTES} bytes at most, got more")
+        if len(self._headers) == MAX_HEADERS:
             _raise_error(f"headers: expected {MAX_HEADERS} at most, got more")
         if name == "content-length" and (not _is_number(value) or int(value) > MAX_BODY_BYTES):
             _raise_error(f"Content-Length: expected 0 to {MAX_BODY_BYTES}, got {value[:20]!r}", 413)
