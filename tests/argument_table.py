@@ -324,7 +324,7 @@ Recording.frames  camera: text or None
 Recording.items  camera: text or None
 Recording.results  camera: text or None
 Recording.pictures  camera: text or None
-Recording.judged  camera: text or None
+Recording.results_with_pictures  camera: text or None
 FleetRecorder.__init__  server: object, section: choice or None, on_trouble: function,
     _clock: not judged
 FleetReplay.__init__  recording: object, speed: number, loop: flag, on_over: function or None,

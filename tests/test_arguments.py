@@ -334,7 +334,10 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "RotatingRecorder.__init__": (RotatingRecorder, {"path": "x"}),
             "RotatingRecorder.add_picture": (RotatingRecorder("y").add_picture, {"frame": frame}),
             "Recording.pictures": (lambda camera: [*recording.pictures(camera)], {}),
-            "Recording.judged": (lambda camera: [*recording.judged(camera)], {}),
+            "Recording.results_with_pictures": (
+                lambda camera: [*recording.results_with_pictures(camera)],
+                {},
+            ),
             "Recording.camera": (recording.camera, {}),
             "Recording.all_items": (lambda camera: [*recording.all_items(camera)], {}),
             "Recording.errors": (lambda camera: [*recording.errors(camera)], {}),

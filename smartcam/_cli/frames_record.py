@@ -98,7 +98,7 @@ async def record(
 ) -> None:
     """Record a source of frames."""
     from smartcam.recording import Recorder
-    from smartcam.recording._inside import file_name
+    from smartcam.recording._inside import name_in_recording
 
     bounds = {"size": size, "age": age, "keep": keep}
     set_bounds = {name: bound for name, bound in bounds.items() if bound is not None}
@@ -107,12 +107,14 @@ async def record(
         recorder.open()
         try:
             if isinstance(recorder, Recorder):
-                recorder.describe(options.name or file_name(source.name), frames=source.name)
+                recorder.describe(
+                    options.name or name_in_recording(source.name), frames=source.name
+                )
             options.show(
                 {"url": source.name, "file": str(recorder.path)},
                 f"recording {source.name} to {recorder.path}, Ctrl-C to end",
             )
-            await _record(source, recorder, options.name or file_name(source.name), options)
+            await _record(source, recorder, options.name or name_in_recording(source.name), options)
         finally:
             await _close_and_report(recorder, source.statistics().lost, options)
 

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
     from smartcam.observers import Observer
     from smartcam.recording import BagRecorder, FleetReplay, Recorder, Recording
-    from smartcam.recording._inside import BagCounts, JudgedPictures
+    from smartcam.recording._inside import BagCounts, ResultPictures
 
 
 def _parse_time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
@@ -127,18 +127,19 @@ async def record(
     recorders = _make_recorders(output, bag, force=force, pictures=pictures != NO_PICTURES)
     url = await options.locate_url(url)
     async with contextlib.AsyncExitStack() as stack:
-        source = judged = None
+        source = result_pictures = None
         observers: list[Observer] = [*recorders]
         if pictures == JUDGED_PICTURES:
-            judged = _judged_pictures(url, recorders[0])
-            observers += [] if judged is None else [judged]
+            result_pictures = _result_pictures(url, recorders[0])
+            observers += [] if result_pictures is None else [result_pictures]
         elif pictures is not None and pictures != NO_PICTURES:
             with from_part("frames", "pictures need"):
                 from smartcam._cli.frame_sources import make_source
 
             source = await stack.enter_async_context(make_source(pictures, options))
         camera = stack.enter_context(options.camera(url, observers=observers, reconnect=Backoff()))
-        await _record(camera, recorders, _Plan(every, source, judged, read_images), options)
+        plan = _Plan(every, source, result_pictures, read_images)
+        await _record(camera, recorders, plan, options)
 
 
 class _Plan(NamedTuple):
@@ -146,11 +147,12 @@ class _Plan(NamedTuple):
 
     every: float | None  # seconds between triggers; None: none are sent
     source: FrameSource | None  # source whose pictures are recorded, too
-    judged: JudgedPictures | None  # finds the picture of each result among the camera's frames
+    # finds the picture of each result among the camera's frames
+    result_pictures: ResultPictures | None
     read_images: bool  # whether the camera's picture is read after each trigger
 
 
-def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
+def _result_pictures(url: str, recorder: Recorder) -> ResultPictures | None:
     """Return the finder of results' pictures; None for a software camera, which sends them.
 
     Raises UnsupportedError: the pictures of the camera's results cannot be found.
@@ -166,8 +168,8 @@ def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
             "of a source of frames, and --read-images asks a camera that has any"
         )
     with from_part("frames", "pictures need"):
-        from smartcam.recording._inside import JudgedPictures
-    return JudgedPictures(recorder)
+        from smartcam.recording._inside import ResultPictures
+    return ResultPictures(recorder)
 
 
 def _make_recorders(
@@ -233,8 +235,8 @@ async def _record(
             )
             async with _judged_source(camera, plan) as source, counting_line(camera):
                 jobs = _recording_jobs(camera, recorders, plan, results, options)
-                if source is not None and plan.judged is not None:
-                    jobs.insert(0, plan.judged.record(source, camera.name))
+                if source is not None and plan.result_pictures is not None:
+                    jobs.insert(0, plan.result_pictures.record(source, camera.name))
                 await run_until_first(jobs, options.seconds)
     finally:
         await _close_all(opened_recorders, unopened_camera, options)
@@ -243,7 +245,7 @@ async def _record(
 @contextlib.asynccontextmanager
 async def _judged_source(camera: Camera, plan: _Plan) -> AsyncIterator[FrameSource | None]:
     """Yield the open source of the camera's frames, if pictures of results are to be found."""
-    if plan.judged is None:
+    if plan.result_pictures is None:
         yield None
         return
     async with cast("FleetCamera[Any]", camera).frame_source() as source:
@@ -261,10 +263,12 @@ def _recording_jobs(
     image_recorder = recorders[0] if plan.read_images else None
     # with images, the triggers end it, so that the last picture is read, too
     result_count = count if image_recorder is None else None
-    jobs.append(_wait_for_count(results, recorders[0], plan.judged, result_count))
+    jobs.append(_wait_for_count(results, recorders[0], plan.result_pictures, result_count))
     if plan.every is not None:
         timeout = options.step_timeout(DEFAULT_TRIGGER_TIMEOUT)
-        jobs.append(_send_triggers(camera, plan.every, timeout, image_recorder, count, plan.judged))
+        jobs.append(
+            _send_triggers(camera, plan.every, timeout, image_recorder, count, plan.result_pictures)
+        )
     if plan.source is not None:
         jobs.append(_record_pictures(plan.source, recorders[0], camera.name))
     return jobs
@@ -307,7 +311,7 @@ async def _watch_disk(recorder: Recorder) -> None:
 
 
 async def _wait_for_count(
-    results: Any, recorder: Recorder, judged: JudgedPictures | None, count: int | None
+    results: Any, recorder: Recorder, result_pictures: ResultPictures | None, count: int | None
 ) -> None:
     """Wait until ``count`` results and their pictures are recorded, or the camera is closed."""
     while count is None or recorder.counts.results < count:
@@ -317,8 +321,8 @@ async def _wait_for_count(
             pass  # it is recorded as an error
         except StopAsyncIteration:
             return
-    if judged is not None:
-        await judged.wait_settled()
+    if result_pictures is not None:
+        await result_pictures.wait_settled()
 
 
 async def _record_pictures(source: FrameSource, recorder: Recorder, camera: str) -> None:
@@ -345,15 +349,15 @@ async def _send_triggers(
     timeout: float,
     image_recorder: Recorder | None,
     count: int | None,
-    judged: JudgedPictures | None,
+    result_pictures: ResultPictures | None,
 ) -> None:
     """Send a trigger every ``every`` seconds; after the first success, ignore failed triggers.
 
     ``image_recorder``: recorder for the picture of each of ``count`` results, None for no pictures.
-    ``judged``: finds each result's picture; the first trigger waits until frames arrive.
+    ``result_pictures``: finds each result's picture; the first trigger waits until frames arrive.
     """
-    if judged is not None:
-        await judged.wait_streaming()
+    if result_pictures is not None:
+        await result_pictures.wait_streaming()
     loop = asyncio.get_running_loop()
     next_at, has_succeeded = loop.time(), False
     while True:
@@ -574,10 +578,10 @@ async def bag(
             if not number % 32:
                 await asyncio.sleep(0)  # here the task can be cancelled
     counts = conversion.counts
-    if counts.unread:
+    if counts.uninterpreted:
         click.echo(
-            f"smartcam: note: {counts.unread} of {counts.results} results could not be read: "
-            "their messages say why",
+            f"smartcam: note: {counts.uninterpreted} of {counts.results} results could not be "
+            "read: their messages say why",
             err=True,
         )
     _show_bag(output, counts, options)

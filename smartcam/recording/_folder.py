@@ -42,7 +42,7 @@ class FileName(NamedTuple):
 
     Attributes:
         camera: name of the camera.
-        at: time of the first record, UTC, in whole milliseconds; later if the clock was set back.
+        at: time of the first record, UTC, in whole milliseconds; never before the previous file's.
     """
 
     camera: str

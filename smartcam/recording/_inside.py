@@ -9,14 +9,14 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.recording._bags.conversion import BagConversion
     from smartcam.recording._bags.items import BagCounts
-    from smartcam.recording._pictures.folder import file_name
-    from smartcam.recording._pictures.judged import JudgedPictures
+    from smartcam.recording._pictures.folder import name_in_recording
+    from smartcam.recording._pictures.result_pictures import ResultPictures
 
 __all__ = [
     "BagConversion",
     "BagCounts",
-    "JudgedPictures",
-    "file_name",
+    "ResultPictures",
+    "name_in_recording",
 ]
 
 if not TYPE_CHECKING:
@@ -25,7 +25,7 @@ if not TYPE_CHECKING:
         {
             "_bags.items": "BagCounts",
             "_bags.conversion": "BagConversion",
-            "_pictures.folder": "file_name",
-            "_pictures.judged": "JudgedPictures",
+            "_pictures.folder": "name_in_recording",
+            "_pictures.result_pictures": "ResultPictures",
         },
     )

@@ -26,7 +26,7 @@ _TYPES: Final = {4: 0x0800, 16: 0x86DD}
 _HOPS: Final = 64
 _DO_NOT_FRAGMENT: Final = 0x4000
 _WINDOW: Final = 0xFFFF
-_MICROSECONDS, _ETHERNET = 0xA1B2C3D4, 1
+_MAGIC_MICROSECONDS, _ETHERNET = 0xA1B2C3D4, 1
 
 _FILE: Final = struct.Struct("<IHHiIII")
 _RECORD: Final = struct.Struct("<IIII")
@@ -48,7 +48,7 @@ class Side:
 
 def file_header() -> bytes:
     """Return the header of a pcap file."""
-    return _FILE.pack(_MICROSECONDS, 2, 4, 0, 0, MAX_PACKET_BYTES, _ETHERNET)
+    return _FILE.pack(_MAGIC_MICROSECONDS, 2, 4, 0, 0, MAX_PACKET_BYTES, _ETHERNET)
 
 
 def file_record(time: int, packet: bytes) -> bytes:
@@ -76,10 +76,9 @@ def tcp_packet(
     acknowledged = receiver.sequence & 0xFFFFFFFF if flags & ACK else 0
     header = sender.port, receiver.port, sender.sequence & 0xFFFFFFFF, acknowledged, size << 2
     without_checksum = _TCP_HEADER.pack(*header, flags, _WINDOW, 0, 0) + options + data
-    total = _checksum(
-        _pseudo_header(sender, receiver, _TCP, len(without_checksum)) + without_checksum
-    )
-    body = _TCP_HEADER.pack(*header, flags, _WINDOW, total, 0) + options + data
+    pseudo_header = _pseudo_header(sender, receiver, _TCP, len(without_checksum))
+    checksum = _checksum(pseudo_header + without_checksum)
+    body = _TCP_HEADER.pack(*header, flags, _WINDOW, checksum, 0) + options + data
     return _ethernet(sender, receiver, _TCP, number, body)
 
 
@@ -87,10 +86,9 @@ def udp_packet(sender: Side, receiver: Side, number: int, data: bytes) -> bytes:
     """Return an Ethernet frame with a UDP datagram; ``number`` is the IP packet's, in IPv4."""
     header = sender.port, receiver.port, _UDP_HEADER.size + len(data)
     without_checksum = _UDP_HEADER.pack(*header, 0) + data
-    total = _checksum(
-        _pseudo_header(sender, receiver, _UDP, len(without_checksum)) + without_checksum
-    )
-    body = _UDP_HEADER.pack(*header, total or 0xFFFF) + data  # 0 would mean no checksum
+    pseudo_header = _pseudo_header(sender, receiver, _UDP, len(without_checksum))
+    checksum = _checksum(pseudo_header + without_checksum)
+    body = _UDP_HEADER.pack(*header, checksum or 0xFFFF) + data  # 0 would mean no checksum
     return _ethernet(sender, receiver, _UDP, number, body)
 
 
@@ -99,15 +97,15 @@ def _ethernet(sender: Side, receiver: Side, protocol: int, number: int, body: by
     if len(sender.ip) == 4:
         size = _IPV4.size + len(body)
         fields_before = 0x45, 0, size, number, _DO_NOT_FRAGMENT, _HOPS, protocol
-        total = _checksum(_IPV4.pack(*fields_before, 0, sender.ip, receiver.ip))
-        ip = _IPV4.pack(*fields_before, total, sender.ip, receiver.ip)
+        checksum = _checksum(_IPV4.pack(*fields_before, 0, sender.ip, receiver.ip))
+        ip = _IPV4.pack(*fields_before, checksum, sender.ip, receiver.ip)
     else:
         ip = _IPV6.pack(6 << 28, len(body), protocol, _HOPS, sender.ip, receiver.ip)
     return receiver.mac + sender.mac + struct.pack(">H", ethertype) + ip + body
 
 
 def _pseudo_header(sender: Side, receiver: Side, protocol: int, size: int) -> bytes:
-    """Return the part of a checksum that is not in the segment itself."""
+    """Return the bytes that a checksum covers in addition to the segment."""
     if len(sender.ip) == 4:
         return sender.ip + receiver.ip + struct.pack(">HH", protocol, size)
     return sender.ip + receiver.ip + struct.pack(">II", size, protocol)

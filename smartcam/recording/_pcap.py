@@ -252,7 +252,7 @@ class _Capture:
 
     def _packet(self, data: bytes) -> _Packet:
         if self._now >= MAX_TIME_NS:
-            raise RecordingError("a frame of the year 2106 or later, which pcap cannot tell")
+            raise RecordingError("a frame came in the year 2106 or later, which pcap cannot store")
         return _Packet(self._now, data)
 
 

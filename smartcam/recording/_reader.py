@@ -18,7 +18,6 @@ from smartcam.exceptions import (
 from smartcam.models import CameraEvent, Result
 from smartcam.observers import TraceEntry
 from smartcam.recording._folder import SUFFIX, FileName, files_of
-from smartcam.recording._judged import match_pictures
 from smartcam.recording._mcap.bodies import LastBodies
 from smartcam.recording._mcap.form import (
     ANNOTATIONS_SCHEMA,
@@ -45,6 +44,7 @@ from smartcam.recording._mcap.records import (
     RecordReader,
     Schema,
 )
+from smartcam.recording._picture_matching import match_pictures
 from smartcam.recording._recorder import Counts
 from smartcam.recording._state import STATE_METADATA, RecordedState
 
@@ -54,12 +54,12 @@ if TYPE_CHECKING:
 
     from smartcam.frames import Frame
     from smartcam.frames._inside import Drawing
-    from smartcam.recording._judged import JudgedResult
     from smartcam.recording._mcap.form import Item, MessageKind
     from smartcam.recording._mcap.records import Record
+    from smartcam.recording._picture_matching import ResultWithPicture
 
-MIN_VALUES = 10_000_000
-"""Number of values that the messages of any file may have; to read them takes ten seconds."""
+VALUE_ALLOWANCE = 10_000_000
+"""Number of values that the messages of a small file may have; to read them takes ten seconds."""
 
 VALUES_PER_BYTE = 100
 """Number of values that a larger file may have for each of its bytes. Real recordings have less
@@ -72,7 +72,7 @@ T = TypeVar("T")
 
 
 class RecordedCamera(NamedTuple):
-    """The recorded facts about a camera.
+    """The recorded metadata of a camera.
 
     Attributes:
         name: name of the camera.
@@ -81,7 +81,7 @@ class RecordedCamera(NamedTuple):
         dialect: name of the dialect; None if it is not known.
         quirks: deviations from the dialect.
         interpret_as: interpreter of the results, as text; None if it was not recorded.
-        facts: all recorded facts, by name.
+        metadata: all recorded texts, by their names.
     """
 
     name: str
@@ -90,7 +90,7 @@ class RecordedCamera(NamedTuple):
     dialect: str | None
     quirks: tuple[str, ...]
     interpret_as: str | None
-    facts: dict[str, str]
+    metadata: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -193,7 +193,7 @@ class Recording:
                 yield path
 
     def frames(self, camera: str | None = None) -> Iterator[TraceEntry]:
-        """Yield the frames."""
+        """Yield the frames on the wire; :meth:`pictures` yields the pictures."""
         return self._items_of_type(TraceEntry, camera)
 
     def results(self, camera: str | None = None) -> Iterator[Result]:
@@ -215,7 +215,7 @@ class Recording:
         """
         return (frame_of(item) for item in self._items_of_type(RecordedPicture, camera))
 
-    def judged(self, camera: str | None = None) -> Iterator[JudgedResult]:
+    def results_with_pictures(self, camera: str | None = None) -> Iterator[ResultWithPicture]:
         """Yield each result with its picture, if the picture is known.
 
         The picture was recorded for its result, or is found by its time: the first picture of the
@@ -330,7 +330,7 @@ class _FolderScan:
     ended: datetime | None = None
     version: str = ""
     names: dict[str, None] = field(default_factory=dict[str, None])
-    facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     remarks: list[str] = field(default_factory=list[str])
 
     def add_file(self, scan: _FileScan) -> None:
@@ -340,10 +340,10 @@ class _FolderScan:
                 self._add_item(item)
                 del item  # free it, since the next one may be large, too
         finally:
-            for name, facts in scan.camera_facts.items():
-                self.facts[name] = {**self.facts.get(name, {}), **facts}
-            _check_cameras(self.path, self.facts)
-            self.version = scan.file_facts.get("version", self.version)
+            for name, texts in scan.camera_metadata.items():
+                self.metadata[name] = {**self.metadata.get(name, {}), **texts}
+            _check_cameras(self.path, self.metadata)
+            self.version = scan.file_metadata.get("version", self.version)
         if scan.remark:
             remark = scan.remark if scan.path == self.path else f"{scan.path.name}: {scan.remark}"
             self.remarks.append(remark)
@@ -367,7 +367,7 @@ class _FolderScan:
         return Recording(
             path=self.path,
             version=self.version,
-            cameras={name: _camera(name, self.facts.get(name, {})) for name in self.names},
+            cameras={name: _camera(name, self.metadata.get(name, {})) for name in self.names},
             counts=Counts(**self.counts),
             began=self.began,
             ended=self.ended,
@@ -404,15 +404,15 @@ def _count_name(item: Item) -> str:
             return "events"
 
 
-def _camera(name: str, facts: dict[str, str]) -> RecordedCamera:
+def _camera(name: str, metadata: dict[str, str]) -> RecordedCamera:
     return RecordedCamera(
         name,
-        facts.get("url", ""),
-        facts.get("protocol", ""),
-        facts.get("dialect"),
-        tuple(quirk for quirk in facts.get("quirks", "").split(",") if quirk),
-        facts.get("interpret_as"),
-        facts,
+        metadata.get("url", ""),
+        metadata.get("protocol", ""),
+        metadata.get("dialect"),
+        tuple(quirk for quirk in metadata.get("quirks", "").split(",") if quirk),
+        metadata.get("interpret_as"),
+        metadata,
     )
 
 
@@ -421,11 +421,11 @@ class _FileScan:
     """One pass through a file."""
 
     path: Path
-    # facts about the file; this and the next two attributes are filled during the pass
-    file_facts: dict[str, str] = field(default_factory=dict[str, str])
-    # facts about cameras, by their names
-    camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    remark: str = ""  # place and reason if the file stops being readable
+    # metadata of the file; this and the next two attributes are filled during the pass
+    file_metadata: dict[str, str] = field(default_factory=dict[str, str])
+    # metadata of cameras, by their names
+    camera_metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    remark: str = ""  # offset and reason if the file stops being readable
     values: int = 0  # number of values in its messages so far
     # number and marks of the last message of annotations, until the next picture
     marks: tuple[int, tuple[Drawing, ...]] = (0, ())
@@ -511,14 +511,14 @@ class _FileScan:
                 if isinstance(item, TraceEntry) and (hex_data := data_of(item)):
                     self.bodies.add((item.camera, sequence), hex_data, len(hex_data))
                 return item
-            case Metadata(name, facts) if name == FILE_METADATA:
-                self.file_facts = facts
+            case Metadata(name, texts) if name == FILE_METADATA:
+                self.file_metadata = texts
                 self._check_format()
-            case Metadata(name, facts) if name == CAMERA_METADATA:
-                self.camera_facts[facts.get("camera", "")] = facts
-                _check_cameras(self.path, self.camera_facts)
-            case Metadata(name, facts) if name == STATE_METADATA:
-                return RecordedState.from_facts(facts)
+            case Metadata(name, texts) if name == CAMERA_METADATA:
+                self.camera_metadata[texts.get("camera", "")] = texts
+                _check_cameras(self.path, self.camera_metadata)
+            case Metadata(name, texts) if name == STATE_METADATA:
+                return RecordedState.from_metadata(texts)
             case _:
                 pass
         return None
@@ -543,17 +543,17 @@ class _FileScan:
             return
         raw = self.bodies.get((camera_name(fields), raw_from))
         if raw is None:
-            raise ValueError(f"raw_from: {raw_from} came, expected a frame before that has data")
+            raise ValueError(f"raw_from: {raw_from} came, expected an earlier frame that has data")
         reader.count_unpacked(len(raw))
         fields["raw"] = raw
 
     def _count_values(self, count: int, offset: int) -> None:
         self.values += count
-        if self.values > max(MIN_VALUES, VALUES_PER_BYTE * offset):
+        if self.values > max(VALUE_ALLOWANCE, VALUES_PER_BYTE * offset):
             raise RecordingError(
                 f"recording {self.path}: {self.values} values in the messages of the first "
                 f"{offset} bytes of the file, expected {VALUES_PER_BYTE} a byte at most, "
-                f"or {MIN_VALUES}"
+                f"or {VALUE_ALLOWANCE}"
             )
 
     def _check_magic(self, begin: bytes) -> None:
@@ -562,15 +562,15 @@ class _FileScan:
             raise ConfigurationError(f"recording {self.path}: this is no MCAP file: {actual}")
 
     def _check_format(self) -> None:
-        actual, version = self.file_facts.get("format"), self.file_facts.get("version")
+        actual, version = self.file_metadata.get("format"), self.file_metadata.get("version")
         if actual not in FORMATS:
             raise ConfigurationError(
-                f"recording {self.path}: its form is {actual}, this version of smartcam reads "
+                f"recording {self.path}: its format is {actual}, this version of smartcam reads "
                 f"{' and '.join(FORMATS)}; it was written by smartcam {version}"
             )
 
     def _check_is_recording(self, schemas: dict[int, str]) -> None:
-        if not self.file_facts:
+        if not self.file_metadata:
             names = ", ".join(sorted(set(schemas.values()))[:8]) or "nothing"
             if any(name.startswith("smartcam.") for name in schemas.values()):
                 raise ConfigurationError(

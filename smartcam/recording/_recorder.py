@@ -109,9 +109,9 @@ class Counts(NamedTuple):
 
 
 class Description(NamedTuple):
-    """Facts about a camera, for the file's metadata."""
+    """Texts about a camera, for the file's metadata."""
 
-    facts: dict[str, str]
+    metadata: dict[str, str]
 
 
 RecorderInput: TypeAlias = "Item | RawFrame | Description"
@@ -278,12 +278,12 @@ class Recorder(Observer):
         """
         return await asyncio.shield(asyncio.wrap_future(self._failure))
 
-    def describe(self, camera: str, **facts: object) -> None:
-        """Write facts about a camera to the file, such as ``interpret_as``; None is left out.
+    def describe(self, camera: str, **metadata: object) -> None:
+        """Write metadata of a camera to the file, such as ``interpret_as``; None is left out.
 
         The address and the dialect are written without this call, at the start of every session.
         """
-        texts = {name: str(fact) for name, fact in facts.items() if fact is not None}
+        texts = {name: str(value) for name, value in metadata.items() if value is not None}
         self._put(Description({"camera": camera, **texts}), 0)
 
     # ------------------------------------------------------------------ the observer
@@ -343,8 +343,8 @@ class Recorder(Observer):
             ConfigurationError: an argument has a wrong type; or the file is a video of another
                 camera.
             FrameFormatError: the file is a video, which cannot hold the picture without loss; or
-                the picture could not be read again, such as one of more than 1,048,576 pixels along
-                a side. The recording goes on without it.
+                the picture exceeds the bounds for reading, such as a side of more than 1,048,576
+                pixels. The recording goes on without it.
             MissingExtraError: the distribution of frames is not installed.
         """
         with from_part("frames", "pictures need"):
@@ -354,10 +354,8 @@ class Recorder(Observer):
         check_kind(frame, Frame, "frame", "a Frame", "recording")
         if result is not None:
             check_kind(result, Result, "result", "a Result, or None", "recording")
-        name = (
-            check_text(camera, "camera", "recording", least=0, most=MAX_NAME_CHARACTERS)
-            or frame.source
-        )
+        camera = check_text(camera, "camera", "recording", least=0, most=MAX_NAME_CHARACTERS)
+        name = camera or frame.source
         result_key = (None, None) if result is None else (result.number, result.received_at)
         check_readable(frame)
         if (check := getattr(self._file, "check_picture", None)) is not None:
@@ -396,7 +394,7 @@ class Recorder(Observer):
             result: result of the picture.
 
         Returns:
-            True if the picture was added, as of :meth:`add_picture`.
+            True if the picture was added, as for :meth:`add_picture`.
 
         Raises:
             ConfigurationError: an argument has a wrong type.
@@ -423,8 +421,8 @@ class Recorder(Observer):
         """Record every picture of a source until it ends, or until ``count`` pictures.
 
         The source streams for the recording and for its other readers. A source that can wait, such
-        as a file with ``pace=none``, waits for the disk; pictures of others are left out and
-        counted if the disk is too slow.
+        as a file with ``pace=none``, waits for the disk; pictures of other sources are left
+        out and counted if the disk is too slow.
 
         Args:
             source: open source.
@@ -439,7 +437,7 @@ class Recorder(Observer):
             ConfigurationError: an argument is wrong.
             LocalProtocolError: the source is not open.
             FrameFormatError: the file is a video, which cannot hold the pictures without loss; or
-                one of them cannot be recorded, as of :meth:`add_picture`.
+                one of them cannot be recorded, as for :meth:`add_picture`.
             FrameSourceError: the source is lost, or hangs; earlier pictures are recorded.
             RecordingError: the recording failed, such as on a full disk.
             MissingExtraError: the distribution of frames is not installed.
@@ -506,7 +504,7 @@ class Recorder(Observer):
                 file.finish()
         except OSError as exc:
             self._fail(exc.strerror or str(exc), exc)
-        except ValueError as exc:  # a message that could not be read again
+        except ValueError as exc:  # a message that exceeds the bounds for reading
             self._fail(str(exc), exc)
         except Exception as exc:  # noqa: BLE001 - the thread must not end silently
             self._fail(f"unexpected {exc!r}", exc)
@@ -547,7 +545,7 @@ class RecordingFile:
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._sequences: dict[int, int] = {}
-        self._facts: dict[str, dict[str, str]] = {}
+        self._metadata: dict[str, dict[str, str]] = {}
         self._frame_texts = FrameTexts()
         self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # frame numbers by data
         self._size = 0  # size when the file was closed
@@ -558,8 +556,8 @@ class RecordingFile:
         """Write the beginning of the file."""
         self._writer.start(PROFILE, f"smartcam {smartcam.__version__}")
         began = datetime.now(UTC).isoformat()
-        facts = {"format": FORMAT, "version": smartcam.__version__, "began": began}
-        self._writer.add_metadata(FILE_METADATA, facts)
+        metadata = {"format": FORMAT, "version": smartcam.__version__, "began": began}
+        self._writer.add_metadata(FILE_METADATA, metadata)
         self.flush()
 
     def add(self, item: RecorderInput) -> None:
@@ -575,15 +573,16 @@ class RecordingFile:
         match item:
             case TraceEntry():
                 self._write_frame(item.camera, item.at, message_of("frames", item), data_of(item))
-            case Description(facts):
-                self._write_camera_facts(facts)
+            case Description(metadata):
+                self._write_camera_metadata(metadata)
             case RecordedError():
                 self._write_message("errors", item.camera, item.at, item)
             case RecordedPicture():
                 self._write_picture(item)
             case _:
                 if isinstance(item, (Connected, Reconnected)):
-                    self._write_camera_facts({"camera": item.camera, **address_facts(item.url)})
+                    texts = {"camera": item.camera, **address_metadata(item.url)}
+                    self._write_camera_metadata(texts)
                 self._write_message("events", item.camera, item.at, item)
 
     @property
@@ -591,10 +590,10 @@ class RecordingFile:
         """Number of bytes so far, without the chunk that is being filled."""
         return self._size if self._stream.closed else self._stream.tell()
 
-    def add_facts(self, name: str, facts: dict[str, str]) -> None:
-        """Write facts under a name, after the items so far."""
-        self._writer.flush()  # write the chunk, which would otherwise follow the facts
-        self._writer.add_metadata(name, facts)
+    def add_metadata(self, name: str, texts: dict[str, str]) -> None:
+        """Write texts under a name, after the items so far."""
+        self._writer.flush()  # write the chunk, which would otherwise follow the texts
+        self._writer.add_metadata(name, texts)
 
     def check_path(self) -> None:
         """Check that the file is still at its path.
@@ -634,10 +633,10 @@ class RecordingFile:
             self._stream.close()
 
     def _write_message(
-        self, kind: str, camera: str, at: datetime, item: Item, raw_from: int | None = None
+        self, kind: str, camera: str, at: datetime, item: Item, raw_frame: int | None = None
     ) -> int:
         """Write a message; return its number, which is counted for each topic."""
-        return self._write(kind, camera, at, message_of(kind, item, raw_from))
+        return self._write(kind, camera, at, message_of(kind, item, raw_frame))
 
     def _write_frame(self, camera: str, at: datetime, text: bytes, data: str) -> None:
         """Write a frame; keep its data, as hex, for its result."""
@@ -716,17 +715,17 @@ class RecordingFile:
         self._sequences[channel] = 0
         return channel
 
-    def _write_camera_facts(self, facts: dict[str, str]) -> None:
-        """Write a camera's facts if they are new."""
-        old_facts = self._facts.get(facts["camera"], {})
-        new_facts = {**old_facts, **facts}
-        if new_facts != old_facts:
-            self._facts[facts["camera"]] = new_facts
-            self._writer.add_metadata(CAMERA_METADATA, new_facts)
+    def _write_camera_metadata(self, metadata: dict[str, str]) -> None:
+        """Write a camera's metadata if they are new."""
+        old_metadata = self._metadata.get(metadata["camera"], {})
+        new_metadata = {**old_metadata, **metadata}
+        if new_metadata != old_metadata:
+            self._metadata[metadata["camera"]] = new_metadata
+            self._writer.add_metadata(CAMERA_METADATA, new_metadata)
 
 
-def address_facts(url: str) -> dict[str, str]:
-    """Return the facts about a camera that follow from its address."""
+def address_metadata(url: str) -> dict[str, str]:
+    """Return the metadata of a camera that follow from its address."""
     if is_fleet(url):  # only the agent has the dialect
         return {"url": url, "protocol": "fleet"}
     try:
@@ -734,5 +733,5 @@ def address_facts(url: str) -> dict[str, str]:
     except ConfigurationError:  # a plug-in that is no longer installed
         return {"url": url}
     quirks = ",".join(address.quirks)
-    facts = {"protocol": address.protocol, "dialect": address.dialect, "quirks": quirks}
-    return {"url": address.url, **{name: text for name, text in facts.items() if text}}
+    metadata = {"protocol": address.protocol, "dialect": address.dialect, "quirks": quirks}
+    return {"url": address.url, **{name: text for name, text in metadata.items() if text}}

@@ -57,40 +57,40 @@ class RecordedState(NamedTuple):
             case _:
                 return self
 
-    def to_facts(self, endian: int, at: datetime) -> dict[str, str]:
+    def to_metadata(self, endian: int, at: datetime) -> dict[str, str]:
         """Return the texts of the camera's state at a time, for a metadata record.
 
         ``at`` is the time of the next record. The time of writing is later, since records wait for
         the disk, so with it a replay of a span would begin at a wrong time.
         """
-        facts = {
+        metadata = {
             "camera": self.camera,
             "at": at.isoformat(),
             "connected": "yes" if self.connected else "no",
             "endian": str(endian),
         }
         if self.application is not None:
-            facts["application"] = str(self.application)
+            metadata["application"] = str(self.application)
         if self.status is not None:
-            facts["status"] = str(int(self.status))
-        return facts
+            metadata["status"] = str(int(self.status))
+        return metadata
 
     @classmethod
-    def from_facts(cls, facts: Mapping[str, str]) -> RecordedState:
+    def from_metadata(cls, metadata: Mapping[str, str]) -> RecordedState:
         """Return the state that a metadata record describes.
 
         Raises:
             ValueError: the texts contain no valid state.
         """
-        application, status = facts.get("application"), facts.get("status")
-        camera, endian = facts.get("camera", ""), facts.get("endian", "0")
+        application, status = metadata.get("application"), metadata.get("status")
+        camera, endian = metadata.get("camera", ""), metadata.get("endian", "0")
         if not 1 <= len(camera) <= MAX_NAME_CHARACTERS or endian not in {"0", "1"}:
             raise ValueError(f"a state of camera {camera!r:.60}, endian {endian!r:.20}")
         return cls(
             camera,
-            facts.get("connected") == "yes",
+            metadata.get("connected") == "yes",
             None if application is None else int(application),
             None if status is None else Status(int(status)),
             int(endian),
-            time_of(facts.get("at", "")),
+            time_of(metadata.get("at", "")),
         )

@@ -65,7 +65,7 @@ def test_record_has_triggers_sent_and_results_read(url: str, tmp_path: Path) -> 
     assert [set(result.value) for result in results] == [{"n"}] * 3
     first, *_, last = results
     assert (last.received_at - first.received_at).total_seconds() > 0.05  # one may come late
-    assert recording.camera().facts["application"] == "2"
+    assert recording.camera().metadata["application"] == "2"
 
 
 def test_record_ends_after_so_many_seconds(url: str, tmp_path: Path) -> None:

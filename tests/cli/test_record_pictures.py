@@ -39,7 +39,10 @@ def cell_of(folder: Path) -> Path:
 
 
 def pictures_in(found: Recording) -> list[np.ndarray[Any, Any] | None]:
-    return [None if one.picture is None else one.picture.array() for one in found.judged(NAME)]
+    return [
+        None if one.picture is None else one.picture.array()
+        for one in found.results_with_pictures(NAME)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -54,7 +57,7 @@ def test_a_software_camera_is_recorded_with_its_pictures_or_without(
     found = load_recording(file)
     assert (found.counts.results, found.counts.pictures) == (3, count)
     assert sum(one is not None for one in pictures_in(found)) == count
-    assert all(one.linked for one in found.judged(NAME)) == (count > 0)
+    assert all(one.linked for one in found.results_with_pictures(NAME)) == (count > 0)
 
 
 def test_none_goes_with_a_bag(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ async def test_each_of_equal_results_has_its_own_picture_in_a_recording(
                 assert camera.last_picture is not None
                 judged.append(camera.last_picture.frame)
     assert (recorder.counts.results, recorder.counts.pictures) == (5, 5)
-    found = [*load_recording(file).judged()]
+    found = [*load_recording(file).results_with_pictures()]
     assert [one.result.value["level"] for one in found] == [10, 10, 10, 220, 10]
     assert all(one.linked for one in found)
     for one, frame in zip(found, judged, strict=True):
@@ -88,7 +88,7 @@ async def test_replay_gives_results_from_recorded_pictures(tmp_path: Path, desk:
                 desk.level = level
                 await camera.trigger(timeout=PATIENCE)
     recording = load_recording(file)
-    pictures = {one.result.raw: one.picture for one in recording.judged()}
+    pictures = {one.result.raw: one.picture for one in recording.results_with_pictures()}
     async with replay(recording) as emulator:
         layout = "ok: bool, reason: string[80], level: int32, input: string[8], angle: real32 deg"
         async with smartcam.connect(emulator.url, interpret_as=layout, **LIMITS) as camera:

@@ -190,7 +190,7 @@ async def test_outlines_of_located_parts_are_in_a_fleets_frames(tmp_path: Path) 
                 async with asyncio.timeout(PATIENCE):
                     shown.append(await anext(frames))
         assert all(outlined(one.array()) for one in shown)
-    judged = [*load_recording(tmp_path / "rec").judged("cam")]
+    judged = [*load_recording(tmp_path / "rec").results_with_pictures("cam")]
     pictures = [one.picture for one in judged if one.picture is not None]
     assert len(judged) == 3
     assert pictures

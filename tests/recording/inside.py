@@ -6,7 +6,6 @@ from smartcam.recording import _recorder
 from smartcam.recording._folder import FileName, RecordingFolder, files_of
 from smartcam.recording._folders import files, pictures, writer
 from smartcam.recording._folders.files import FolderFiles, Limits
-from smartcam.recording._judged import PictureMatcher
 from smartcam.recording._mcap import form, records
 from smartcam.recording._mcap.form import (
     FORMAT,
@@ -21,6 +20,7 @@ from smartcam.recording._mcap.form import (
     message_of,
     nanoseconds,
 )
+from smartcam.recording._picture_matching import PictureMatcher
 from smartcam.recording._pictures import messages
 from smartcam.recording._pictures.messages import picture_message
 from smartcam.recording._recorder import MAX_WAITING_BYTES

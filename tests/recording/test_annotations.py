@@ -115,7 +115,7 @@ def test_marks_are_read_by_the_schema_in_their_file(tmp_path: Path) -> None:
         reader = make_reader(stream, decoder_factories=[decoder.DecoderFactory()])
         marks, first, second = (message for *_, message in reader.iter_decoded_messages())
     assert [one.role for one in marks.points] == ["region", "wrong", "hint"]
-    assert (first.sequence, first.annotations_from, second.annotations_from) == (1, 1, 0)
+    assert (first.sequence, first.annotations_number, second.annotations_number) == (1, 1, 0)
 
 
 @given(st.lists(drawings, max_size=8).map(tuple))

@@ -327,7 +327,7 @@ async def test_bag_result_that_cannot_be_read_is_there_with_its_bytes_and_why(
 ) -> None:
     counts = await both(tmp_path, interpret_as="a: int64")
     made = write_bag(load_recording(tmp_path / "run.mcap"), tmp_path / "made")
-    assert (counts.results, counts.unread, counts.localizations) == (3, 3, 0)
+    assert (counts.results, counts.uninterpreted, counts.localizations) == (3, 3, 0)
     assert made == counts
     for folder in ("live", "made"):
         told = [one.message for one in on("/table/results", read(tmp_path / folder))]
@@ -346,7 +346,7 @@ async def test_bag_result_that_could_not_be_read_is_read_again(tmp_path: Path) -
     await both(tmp_path, interpret_as="a: int64")
     recording = load_recording(tmp_path / "run.mcap")
     counts = write_bag(recording, tmp_path / "made", interpret_as="localizations")
-    assert (counts.results, counts.unread, counts.localizations) == (3, 0, 3)
+    assert (counts.results, counts.uninterpreted, counts.localizations) == (3, 0, 3)
     messages = read(tmp_path / "made")
     came = [one.at for one in recording.frames() if one.message == "ResultContainer"]
     assert [one.at for one in on("/table/localizations", messages)] == [*map(recorded_time, came)]
@@ -368,7 +368,7 @@ def test_bag_error_claims_no_bytes_where_several_containers_came(tmp_path: Path)
         ("InterpretationError: which?", b"", 0),
         ("InterpretationError: this", b"\4", 5),
     ]
-    assert bag.bag_counts.unread == 2
+    assert bag.bag_counts.uninterpreted == 2
 
 
 # ---------------------------------------------------------------------- of a recording
@@ -464,7 +464,7 @@ async def test_bag_interpreted_again_is_what_the_client_would_have_had(tmp_path:
     await both(_folder(tmp_path / "other"), y_down=True)
     recording = load_recording(tmp_path / "run.mcap")
     counts = write_bag(recording, tmp_path / "made", interpret_as="localizations", y_down=True)
-    assert (counts.unread, counts.localizations) == (0, 3)
+    assert (counts.uninterpreted, counts.localizations) == (0, 3)
     made, live = (
         [[_plain(pose) for pose in one.message.poses] for one in on("/table/localizations", found)]
         for found in (read(tmp_path / "made"), read(tmp_path / "other/live"))

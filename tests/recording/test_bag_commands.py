@@ -48,7 +48,7 @@ def recorded(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "bag": to[3],
         "messages": len(messages),
         "results": found,
-        "unread": 0,
+        "uninterpreted": 0,
         "localizations": found,
         "errors": 0,
     }
@@ -64,8 +64,8 @@ def test_bag_command_makes_of_the_file_what_was_recorded_beside_it(
     results = sum(one.topic == "/table/results" for one in made)
     assert results >= 3
     assert done.out == (
-        f"{tmp_path / 'bag'}: messages {len(made)}, results {results}, unread 0, localizations "
-        f"{results}, errors 0\n"
+        f"{tmp_path / 'bag'}: messages {len(made)}, results {results}, uninterpreted 0, "
+        f"localizations {results}, errors 0\n"
     )
     assert done.err == ""
 
@@ -74,14 +74,14 @@ def test_bag_command_tells_what_could_not_be_read(recorded: Path, tmp_path: Path
     command = ["bag", str(recorded / "run.mcap"), "-o", str(tmp_path / "bag"), "--json"]
     done = run(*command, "--interpret-as", "n: int32")
     (told,) = done.lines
-    assert told["unread"] == told["results"] >= 3
+    assert told["uninterpreted"] == told["results"] >= 3
     assert done.code == 0
     assert done.err == (
-        f"smartcam: note: {told['unread']} of {told['results']} results could not be read: "
+        f"smartcam: note: {told['uninterpreted']} of {told['results']} results could not be read: "
         "their messages say why\n"
     )
     (again,) = run(*command, "--interpret-as", "localizations", "--force").done().lines
-    assert (again["unread"], again["localizations"]) == (0, told["results"])
+    assert (again["uninterpreted"], again["localizations"]) == (0, told["results"])
 
 
 @pytest.mark.long

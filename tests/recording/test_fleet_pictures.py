@@ -96,7 +96,7 @@ async def test_each_result_has_the_first_picture_of_its_trigger(
             await until(lambda: device.given[-1].utc > device.given[0].utc + 0.1)
         assert recorder.counts[NAME].lost == 0
     found = load_recording(tmp_path / "rec")
-    judged = [*found.judged(NAME)]
+    judged = [*found.results_with_pictures(NAME)]
     assert len(judged) == 8
     for made, picture, told in judged:
         assert made.triggered_at is not None
@@ -246,7 +246,7 @@ async def test_replayed_fleet_shows_the_picture_of_each_result(
             last = device.given[-1]
             await until(lambda: device.given[-1].utc > last.utc)
     found = load_recording(tmp_path / "rec")
-    judged = [*found.judged(NAME)]
+    judged = [*found.results_with_pictures(NAME)]
     assert any(one.picture is not None for one in judged)
     shown = 0
     async with FleetReplay(found) as played, smartcam.connect(played.server.urls[NAME]) as camera:

@@ -24,7 +24,7 @@ from smartcam.observers import RawFrame
 from smartcam.protocols import BVS
 from smartcam.protocols.messages import Sender
 from smartcam.recording import FleetRecorder, Recorder, load_recording
-from smartcam.recording._folders.track import CameraTrack
+from smartcam.recording._folders.camera_recording import CameraRecording
 from smartcam.recording._state import RecordedState
 from tests.fleet.fleetkit import NumberedCamera, trigger_request
 from tests.recording.folderkit import (
@@ -171,10 +171,10 @@ def test_names_sort_also_where_the_clock_goes_back(tmp_path: Path) -> None:
         files_of = RecordingFolder(folder)
         writer = FolderFiles(files_of, Limits(1e9, 60.0, 1e9), compress, ages.__next__)
         writer.enter()
-        track = CameraTrack(NAME, lambda given: iter([given]))
+        recording = CameraRecording(NAME, lambda given: iter([given]))
         for one in seconds:
-            writer.write(track, [frame(one, "> Query")._replace(camera=NAME)])
-        writer.finish(track)
+            writer.write(recording, [frame(one, "> Query")._replace(camera=NAME)])
+        writer.finish(recording)
         files_of.leave()
     found = [load_recording(path) for path in files(tmp_path)]
     assert [entry.at for one in found for entry in one.frames()] == [
@@ -190,22 +190,24 @@ def test_trigger_behind_which_a_file_is_damaged_gets_no_others_result(tmp_path: 
     folder = RecordingFolder(tmp_path / "rec")
     writer = FolderFiles(folder, Limits(1e9, 1e9, 1e9), compress, lambda: 0.0)
     writer.enter()
-    track = CameraTrack(NAME, lambda given: iter([given]))
+    recording = CameraRecording(NAME, lambda given: iter([given]))
 
     def write(*items: Any) -> None:
-        writer.write(track, [item._replace(camera=NAME) for item in items])
+        writer.write(recording, [item._replace(camera=NAME) for item in items])
 
-    writer.write(track, [Connected(camera=NAME, at=at(0), url=URL)])
-    writer.write(track, [ApplicationChanged(camera=NAME, at=at(0), application=5, previous=None)])
+    writer.write(recording, [Connected(camera=NAME, at=at(0), url=URL)])
+    writer.write(
+        recording, [ApplicationChanged(camera=NAME, at=at(0), application=5, previous=None)]
+    )
     waits = Status.RUNNING | Status.WAITING_FOR_TRIGGER
-    writer.write(track, [StatusChanged(camera=NAME, at=at(0), status=waits, previous=None)])
+    writer.write(recording, [StatusChanged(camera=NAME, at=at(0), status=waits, previous=None)])
     write(*session()[:4], frame(1, "> Trigger"), container(1.5, b"one"), frame(2, "> Trigger"))
     first = files(tmp_path)[0]
     size = first.stat().st_size
     write(container(2.5, b"lost"))
-    writer.finish(track)
+    writer.finish(recording)
     write(container(3, b"by itself"), frame(4, "> Trigger"), container(4.25, b"two"))
-    writer.finish(track)
+    writer.finish(recording)
     folder.leave()
     os.truncate(first, size)
     app = plan_replay(load_recording(tmp_path / "rec")).applications[5]
@@ -411,7 +413,7 @@ def test_disk_that_is_really_full(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["told"].endswith("No space left on device")
-    ours = [line for line in found["lines"] if "has no end" not in line]
+    ours = [line for line in found["lines"] if "its index could not" not in line]
     assert ours == [
         f"{found['told']}; nothing is recorded until the disk works again",
         f"recordings {tmp_path / 'rec'}: records are written again",

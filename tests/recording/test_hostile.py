@@ -126,7 +126,7 @@ def test_load_recording_chunk_of_another_size_than_said_is_damaged(
 @pytest.mark.parametrize("small", [message(RESULT), record(0x77, b"")])
 def test_load_recording_more_records_than_bytes_is_refused(tmp_path: Path, small: bytes) -> None:
     path = written(tmp_path / "bomb.mcap", chunk(small * 200_000))
-    assert path.stat().st_size < bounds.MIN_RECORDS
+    assert path.stat().st_size < bounds.RECORD_ALLOWANCE
     with pytest.raises(RecordingError, match=r"10001 records in the first \d+ bytes of the file"):
         load_recording(path)
 
@@ -134,7 +134,7 @@ def test_load_recording_more_records_than_bytes_is_refused(tmp_path: Path, small
 def test_load_recording_many_chunks_of_nothing_new_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bounds, "MIN_UNPACKED_BYTES", 1 << 20)
+    monkeypatch.setattr(bounds, "UNPACKED_BYTES_ALLOWANCE", 1 << 20)
     padding = record(0x77, bytes(1 << 22))
     with pytest.raises(RecordingError, match=r"bytes of the file unpack to .*, expected 10000 for"):
         load_recording(written(tmp_path / "bomb.mcap", *[chunk(padding)] * 2))
@@ -143,7 +143,7 @@ def test_load_recording_many_chunks_of_nothing_new_are_refused(
 def test_load_recording_results_of_one_frame_again_and_again_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bounds, "MIN_UNPACKED_BYTES", 1 << 20)
+    monkeypatch.setattr(bounds, "UNPACKED_BYTES_ALLOWANCE", 1 << 20)
     large = message(message_of("frames", container(0, bytes(1 << 16))), 2)
     small = {**RESULT, "raw_from": 0}
     del small["raw"]
@@ -162,7 +162,7 @@ def test_load_recording_message_of_too_many_values_ends_it(tmp_path: Path) -> No
 def test_load_recording_more_values_than_the_file_can_have_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "MIN_VALUES", 1000)
+    monkeypatch.setattr(reader, "VALUE_ALLOWANCE", 1000)
     many = message({**RESULT, "value": [0] * 100_000})
     with pytest.raises(RecordingError, match=r"values in the messages of the first \d+ bytes"):
         load_recording(written(tmp_path / "bomb.mcap", chunk(many)))
@@ -204,9 +204,9 @@ def test_load_recording_real_ones_stay_far_below_the_bounds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, container: bytes, seconds: int
 ) -> None:
     # nothing but zeros, and a minute that is nothing but statuses and containers
-    for name in ("MIN_RECORDS", "MIN_UNPACKED_BYTES"):
+    for name in ("RECORD_ALLOWANCE", "UNPACKED_BYTES_ALLOWANCE"):
         monkeypatch.setattr(bounds, name, getattr(bounds, name) >> 8)
-    monkeypatch.setattr(reader, "MIN_VALUES", 1 << 14)
+    monkeypatch.setattr(reader, "VALUE_ALLOWANCE", 1 << 14)
     items: list[Any] = session()
     for number in range(seconds * 3):
         items += [status(number / 3, "RUNNING")] * 4
@@ -310,7 +310,7 @@ def test_load_recording_message_that_is_no_object_is_told(tmp_path: Path, body: 
         record(4, b"x"),
         record(6, b"x" * 30),
         record(12, b"\xff\xff\xff\xff"),
-        record(12, bytes(bounds.MAX_FACTS_BYTES + 1)),
+        record(12, bytes(bounds.MAX_METADATA_BYTES + 1)),
         struct.pack("<BQ", 6, 1 << 60),
         chunk(message(RESULT)[:-3]),
         chunk(b"\x05\x00"),

@@ -45,7 +45,7 @@ from smartcam.recording import (
     load_recording,
     replay,
 )
-from smartcam.recording._inside import JudgedPictures
+from smartcam.recording._inside import ResultPictures
 from tests.frames.drivers import ShowingDriver
 from tests.recording.picturekit import BEGIN, VARIED, result, same, shot
 from tests.recording.recordingkit import at, session, write
@@ -523,7 +523,7 @@ async def test_trigger_waits_for_the_first_picture_of_those_that_results_are_mad
 ) -> None:
     driver = _Late([shot(1)])
     with Recorder(tmp_path / "run.mcap") as recorder:
-        found = JudgedPictures(recorder)
+        found = ResultPictures(recorder)
         async with FrameSource(driver) as source:
             recording = asyncio.create_task(found.record(source, "left"))
             waiting = asyncio.create_task(found.wait_streaming())
@@ -542,7 +542,7 @@ def test_result_has_the_picture_that_the_recorder_was_told(tmp_path: Path) -> No
             recorder.on_result(result(number, number))
             if number != 2:
                 recorder.add_picture(shot(number), result=result(number, number))
-    found = [*load_recording(path).judged("left")]
+    found = [*load_recording(path).results_with_pictures("left")]
     numbers = [
         (one.result.number, one.picture and one.picture.sequence, one.linked) for one in found
     ]
@@ -556,7 +556,7 @@ def test_result_of_a_later_client_never_has_the_picture_of_an_earlier_ones(tmp_p
             made = result(1, seconds)
             recorder.on_result(made)
             recorder.add_picture(shot(number, utc=BEGIN + seconds + 1.5), result=made)
-    found = [*load_recording(path).judged("left")]
+    found = [*load_recording(path).results_with_pictures("left")]
     assert [one.picture and one.picture.sequence for one in found] == [1, 2]
     assert all(one.linked for one in found)
 
@@ -576,7 +576,7 @@ def test_triggered_result_has_the_first_picture_surely_exposed_after_the_trigger
         recorder.add_picture(shot(5, utc=BEGIN + 2.4))
         recorder.on_result(result(3, 3.3, triggered=3.0))
         recorder.add_picture(shot(6, utc=BEGIN + 3.4))
-    found = [*load_recording(path).judged()]
+    found = [*load_recording(path).results_with_pictures()]
     numbers = [(one.result.number, one.picture and one.picture.sequence) for one in found]
     assert numbers == [(1, 2), (2, 4), (3, None)]
     assert not any(one.linked for one in found)
@@ -588,7 +588,7 @@ def test_result_that_nobody_triggered_has_no_picture_by_the_times(tmp_path: Path
         recorder.add_picture(shot(1, utc=BEGIN + 1))
         recorder.add_picture(shot(2, utc=BEGIN + 2), camera="right")
         recorder.on_result(result(1, 2.5))
-    ((_, picture, _),) = load_recording(path).judged()
+    ((_, picture, _),) = load_recording(path).results_with_pictures()
     assert picture is None
 
 
@@ -620,7 +620,7 @@ async def test_image_that_a_camera_gave_is_kept_with_its_result(tmp_path: Path) 
             ) as camera:
                 made = await camera.trigger()
                 recorder.add_image("left", await camera.read_image(), result=made)
-    ((kept, picture, told),) = load_recording(path).judged()
+    ((kept, picture, told),) = load_recording(path).results_with_pictures()
     assert told
     assert kept.number == made.number
     assert picture is not None

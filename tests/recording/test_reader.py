@@ -141,7 +141,7 @@ def test_load_recording_of_another_form_is_refused(tmp_path: Path) -> None:
         writer.add_metadata("smartcam", {"format": "9", "version": "8.0"})
         writer.finish()
     with pytest.raises(
-        ConfigurationError, match=r"its form is 9, this version .* by smartcam 8\.0"
+        ConfigurationError, match=r"its format is 9, this version .* by smartcam 8\.0"
     ):
         load_recording(path)
 

@@ -50,7 +50,8 @@ def plan(
 
 def rounded(takes: list[RecordedRun]) -> list[tuple[list[bytes], float, float, int]]:
     return [
-        (take.containers, round(take.seconds, 6), round(take.gap, 6), take.drops) for take in takes
+        (take.containers, round(take.seconds, 6), round(take.pause, 6), take.drops)
+        for take in takes
     ]
 
 
@@ -273,7 +274,7 @@ def test_plan_of_a_fleets_camera_has_its_results_whatever_the_agents_clock_says(
     app = made.applications[5]
     assert rounded(app.triggered) == [([b"a", b"b"], 0.5, 0, 0), ([b"d"], 0.25, 0, 0)]
     assert [take.containers for take in app.untriggered] == [[b"c"]]
-    assert app.untriggered[0].gap == pytest.approx(3.0, abs=0.05)
+    assert app.untriggered[0].pause == pytest.approx(3.0, abs=0.05)
     assert (made.active, made.running, made.endian) == (5, True, 1)
     assert (made.dialect, made.transport) == ("b16", "tcp")
     assert [(one.condition, one.on) for one in made.changes] == [(Status.OVERHEAT, True)]
@@ -284,7 +285,7 @@ def test_plan_of_a_fleets_free_run_counts_from_the_one_before(tmp_path: Path) ->
     items = [*met(Status.RUNNING), shared(-0.001, b"a"), shared(0.1, b"b"), shared(0.3, b"c")]
     app = plan_replay(write(tmp_path / "run.mcap", items)).applications[5]
     assert not app.waits
-    gaps = [take.gap for take in app.untriggered]
+    gaps = [take.pause for take in app.untriggered]
     assert gaps == pytest.approx([0.0, 0.101, 0.2], abs=1e-6)
 
 
@@ -307,7 +308,7 @@ def test_plan_unasked_under_a_constant_waiting_are_each_for_itself(tmp_path: Pat
     assert [take.containers for take in app.untriggered] == [
         [place.to_bytes(4, "little")] for place in range(200)
     ]
-    assert {round(take.gap, 6) for take in app.untriggered[1:]} == {0.001}
+    assert {round(take.pause, 6) for take in app.untriggered[1:]} == {0.001}
     assert (app.triggered, app.waits) == ([], True)
 
 

@@ -41,7 +41,7 @@ def plant_of(folder: Path, desk: Desk, pictures: str = "judged") -> Path:
 def checked(found: Recording, count: int) -> list[int]:
     """Return the levels in a recording, whose results each have the picture of that level."""
     levels: list[int] = []
-    for result, picture, told in found.judged(NAME):
+    for result, picture, told in found.results_with_pictures(NAME):
         assert told
         assert picture is not None
         assert picture.format.name == "Mono8"

@@ -18,7 +18,7 @@ from smartcam.exceptions import (
 from smartcam.observers import TraceEntry
 from smartcam.protocols import BVS
 from smartcam.protocols.messages import ResultContainer
-from smartcam.recording._bags.items import BagCounts, BagItems, ReadResult, parts_from_json
+from smartcam.recording._bags.items import BagCounts, BagItems, BagResult, localizations_from_json
 from smartcam.recording._bags.recorder import DISTRIBUTION, open_bag
 from smartcam.recording._bags.writer import remove_folder
 from smartcam.recording._reader import check_recording
@@ -103,13 +103,12 @@ class BagConversion:
             [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
         )
         interprets_again = self.interpret_as is not None or self.calibration is not None
-        self._readers = (
-            {camera.name: self._reader(camera) for camera in chosen} if interprets_again else {}
-        )
-        self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
+        reinterpreted = chosen if interprets_again else []
+        self._interpreters = {camera.name: self._interpreter(camera) for camera in reinterpreted}
+        self._items = BagItems(RosTypes(DISTRIBUTION), self._interpret)
         for camera in chosen:
-            facts = {"interpret_as": self._spec(camera)} if interprets_again else camera.facts
-            self._items.describe({**facts, "camera": camera.name})
+            metadata = {"interpret_as": self._spec(camera)} if interprets_again else camera.metadata
+            self._items.describe({**metadata, "camera": camera.name})
 
     @property
     def counts(self) -> BagCounts:
@@ -149,43 +148,43 @@ class BagConversion:
             return self.interpret_as
         return camera.interpret_as or "localizations"
 
-    def _reader(self, camera: RecordedCamera) -> _ResultReader:
+    def _interpreter(self, camera: RecordedCamera) -> _ResultInterpreter:
         if camera.dialect not in BVS.dialects and camera.protocol != "bvs":
             raise UnsupportedError(
                 f"bag: camera {camera.name!r} speaks {camera.protocol or 'no known protocol'} "
                 f"(dialect {camera.dialect}): only results of bvs can be interpreted again; "
                 "without interpret_as and calibration the recorded values are used"
             )
-        y_down = camera.facts.get("y_down") == "True" if self.y_down is None else self.y_down
+        y_down = camera.metadata.get("y_down") == "True" if self.y_down is None else self.y_down
         spec = self._spec(camera)
         interpretation = Interpretation(
             spec,
-            lenient=camera.facts.get("lenient") == "True",
+            lenient=camera.metadata.get("lenient") == "True",
             y_down=y_down,
             calibration=self.calibration,
             strict_calibration=self.interpret_as is not None,
         )
-        endian = camera.facts.get("endian", "0")
+        endian = camera.metadata.get("endian", "0")
         if endian not in {"0", "1"}:
             raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
-        return _ResultReader(interpretation, int(endian))
+        return _ResultInterpreter(interpretation, int(endian))
 
     def _track_byte_order(self, item: Item) -> None:
-        if isinstance(item, TraceEntry) and item.message == "StatusReport" and self._readers:
-            self._readers[item.camera].set_byte_order(item)
+        if isinstance(item, TraceEntry) and item.message == "StatusReport" and self._interpreters:
+            self._interpreters[item.camera].set_byte_order(item)
 
-    def _read(self, result: Result) -> ReadResult:
+    def _interpret(self, result: Result) -> BagResult:
         """Return a result as it is written to the bag."""
-        if self._readers:
-            return self._readers[result.camera].read(result)
+        if self._interpreters:
+            return self._interpreters[result.camera].interpret(result)
         if result.value == result.raw.hex():  # a recording has bytes as hexadecimal text
-            return ReadResult(result._replace(value=result.raw))
-        parts = parts_from_json(result.value)
-        return ReadResult(result if parts is None else result._replace(value=parts))
+            return BagResult(result._replace(value=result.raw))
+        localizations = localizations_from_json(result.value)
+        return BagResult(result if localizations is None else result._replace(value=localizations))
 
 
 @dataclass(eq=False)
-class _ResultReader:
+class _ResultInterpreter:
     """Interprets one camera's results again."""
 
     _interpretation: Interpretation
@@ -197,7 +196,7 @@ class _ResultReader:
         if isinstance(endian, int):
             self._endian = endian
 
-    def read(self, result: Result) -> ReadResult:
+    def interpret(self, result: Result) -> BagResult:
         """Return the result with the value of its bytes, or the error."""
         container = ResultContainer(application=result.application, data=result.raw)
         try:
@@ -209,5 +208,5 @@ class _ResultReader:
                 at=result.received_at,
             )
         except InterpretationError as exc:
-            return ReadResult(result, f"{type(exc).__name__}: {exc}", was_reinterpreted=True)
-        return ReadResult(result._replace(value=value, sequence=sequence), was_reinterpreted=True)
+            return BagResult(result, f"{type(exc).__name__}: {exc}", was_reinterpreted=True)
+        return BagResult(result._replace(value=value, sequence=sequence), was_reinterpreted=True)

@@ -61,7 +61,7 @@ _DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
 _MAX_CONTAINERS = 64
 """Largest number of containers kept until their results come; many containers may come at once."""
 
-UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
+NOT_INTERPRETED = frozenset({"InterpretationError", "WrongApplicationError"})
 """Errors of containers that could not be interpreted."""
 
 
@@ -71,14 +71,14 @@ class BagCounts(NamedTuple):
     Attributes:
         messages: all messages.
         results: results, each on the topic ``results``, also results that could not be interpreted.
-        unread: results that could not be interpreted; their messages have the error.
+        uninterpreted: results that could not be interpreted; their messages have the error.
         localizations: results that are localizations; each is also on two more topics.
         errors: other errors, on ``/diagnostics``.
     """
 
     messages: int = 0
     results: int = 0
-    unread: int = 0
+    uninterpreted: int = 0
     localizations: int = 0
     errors: int = 0
 
@@ -91,7 +91,7 @@ class BagMessage(NamedTuple):
     message: Any
 
 
-class ReadResult(NamedTuple):
+class BagResult(NamedTuple):
     """A result as it is written to the bag.
 
     ``error`` says why the result could not be interpreted, or is "". ``was_reinterpreted`` is True
@@ -109,24 +109,24 @@ class BagItems:
 
     Args:
         types: types of the messages.
-        read: function that each result goes through; default: results stay as they are.
+        interpret: function that each result goes through; default: results stay as they are.
     """
 
     _types: RosTypes
-    _read: Callable[[Result], ReadResult] = ReadResult
+    _interpret: Callable[[Result], BagResult] = BagResult
     _cameras: dict[str, _BagCamera] = field(init=False, default_factory=dict[str, "_BagCamera"])
 
     def __post_init__(self) -> None:
         self.counts: BagCounts = BagCounts()
         self._titles: set[str] = set()
 
-    def describe(self, facts: Mapping[str, Any]) -> None:
-        """Keep facts about a camera, as from ``Recorder.describe``."""
-        if {"interpret_as", "pixels"} & facts.keys():
-            camera = self._camera_of(facts["camera"])
-            camera.facts.update(facts)
-            pixels = camera.facts.get("pixels") == "True"
-            spec = camera.facts.get("interpret_as", "")
+    def describe(self, metadata: Mapping[str, Any]) -> None:
+        """Keep metadata of a camera, as from ``Recorder.describe``."""
+        if {"interpret_as", "pixels"} & metadata.keys():
+            camera = self._camera_of(metadata["camera"])
+            camera.metadata.update(metadata)
+            pixels = camera.metadata.get("pixels") == "True"
+            spec = camera.metadata.get("interpret_as", "")
             camera.interpreters = RecordedInterpreters(spec, pixels=pixels)
 
     def messages(self, item: object) -> Iterator[BagMessage]:
@@ -140,7 +140,7 @@ class BagItems:
             case Result():
                 camera = self._camera_of(item.camera)
                 camera.remove_container(item.raw)
-                yield from self._result(camera, *self._read(item)[:2])
+                yield from self._result(camera, *self._interpret(item)[:2])
             case TraceEntry():
                 self._camera_of(item.camera).keep_container(item)
             case RecordedError():
@@ -169,33 +169,33 @@ class BagItems:
         at, messages = nanoseconds(result.received_at), camera.result_messages
         if result.application < 0:  # the result's application is unknown
             result = result._replace(application=0)
-        parts = None if error else camera.interpreters.localizations(result)
-        frames = {part.pose.header.frame_id for part in parts or ()}
-        self._count(results=1, unread=bool(error), localizations=parts is not None)
+        found = None if error else camera.interpreters.localizations(result)
+        frames = {item.pose.header.frame_id for item in found or ()}
+        self._count(results=1, uninterpreted=bool(error), localizations=found is not None)
         if error:
             message = messages.result(result._replace(value=result.raw), None)
             message.error = utf8(error)
         else:
-            message = messages.result(result, parts)
+            message = messages.result(result, found)
         yield BagMessage(camera.results, at, message)
         if len(frames) > 1:  # a PoseArray has only one frame
             text = f"result {result.number}: poses in several frames: {', '.join(sorted(frames))}"
             yield camera.warning_message(result.received_at, text)
-        elif parts is not None:
-            yield BagMessage(camera.localizations, at, messages.poses(result, parts))
-            yield BagMessage(camera.detections, at, messages.detections(result, parts))
+        elif found is not None:
+            yield BagMessage(camera.localizations, at, messages.poses(result, found))
+            yield BagMessage(camera.detections, at, messages.detections(result, found))
 
     def _error(self, camera: _BagCamera, item: RecordedError) -> Iterator[BagMessage]:
         text = f"{item.error}: {item.text}"
-        if item.error not in UNREADABLE:
+        if item.error not in NOT_INTERPRETED:
             self._count(errors=1)
             yield camera.warning_message(item.at, text, triggered_at=item.triggered_at)
             return
-        application, raw, at = camera.take_unread() or (0, b"", item.at)
+        application, raw, at = camera.take_uninterpreted() or (0, b"", item.at)
         result = Result(item.camera, application, None, 0, item.triggered_at, at, None, raw, None)
-        read = self._read(result) if raw else ReadResult(result)
-        error = read.error if read.was_reinterpreted else text
-        yield from self._result(camera, read.result, error)
+        interpreted = self._interpret(result) if raw else BagResult(result)
+        error = interpreted.error if interpreted.was_reinterpreted else text
+        yield from self._result(camera, interpreted.result, error)
 
     def _count(self, **increments: int) -> None:
         totals = {name: getattr(self.counts, name) + by for name, by in increments.items()}
@@ -211,7 +211,7 @@ class _BagCamera:
     result_messages: ResultMessages
     url: str = ""
     state: KnownState = field(init=False)  # state, as far as it was recorded
-    facts: dict[str, Any] = field(default_factory=dict[str, Any])  # facts that were recorded
+    metadata: dict[str, Any] = field(default_factory=dict[str, Any])  # as recorded
     interpreters: RecordedInterpreters = field(default_factory=RecordedInterpreters)
 
     def __post_init__(self) -> None:
@@ -241,6 +241,7 @@ class _BagCamera:
     def state_messages(self, at: datetime) -> Iterator[BagMessage]:
         """Yield the messages of the state for its topic and, if they changed, the diagnostics."""
         state = self.state
+        # no reason: there was no session yet, which is no error
         condition = health(state, session_alive=bool(state.why))
         fields = {"header": header_fields(at, self.name), **status_fields(state)}
         yield BagMessage(self._status, nanoseconds(at), fields)
@@ -284,7 +285,7 @@ class _BagCamera:
                     self._containers.popleft()
                 return
 
-    def take_unread(self) -> tuple[int, bytes, datetime] | None:
+    def take_uninterpreted(self) -> tuple[int, bytes, datetime] | None:
         """Remove all containers; return application, bytes and time of the one an error is about.
 
         If several containers wait, it is not known which one: None.
@@ -307,18 +308,18 @@ def topic_of_camera(name: str) -> str:
     return "/".join(part for part in as_name(name).split("/") if part) or "camera"
 
 
-def parts_from_json(value: object) -> list[Localization] | None:
+def localizations_from_json(value: object) -> list[Localization] | None:
     """Return the localizations of recorded JSON; None if it has other values."""
     if not isinstance(value, list):
         return None
     items: list[Any] = value
     try:
-        return [_part(item) for item in items]
+        return [_localization(item) for item in items]
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
 
-def _part(fields: Mapping[str, Any]) -> Localization:
+def _localization(fields: Mapping[str, Any]) -> Localization:
     """Return a localization from JSON; raise if it is not valid."""
     if set(fields) != set(Localization._fields):
         raise ValueError("these are not the fields of a localization")
@@ -328,7 +329,7 @@ def _part(fields: Mapping[str, Any]) -> Localization:
         raise TypeError("no text")
     if type(photo) is not int:
         raise TypeError("no index")
-    camera_pose = Pose(
+    localized_pose = Pose(
         Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
         Position(*(_number(pose["position"][name]) for name in "xyz")),
         Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
@@ -338,8 +339,8 @@ def _part(fields: Mapping[str, Any]) -> Localization:
         errors: dict[str, Any] = {
             name: None if value is None else _number(value) for name, value in sigma.items()
         }
-        camera_pose = camera_pose.with_sigma(PoseSigma(**errors))
-    return Localization(feature, _number(fields["quality"]), photo, camera_pose)
+        localized_pose = localized_pose.with_sigma(PoseSigma(**errors))
+    return Localization(feature, _number(fields["quality"]), photo, localized_pose)
 
 
 def _number(value: object) -> float:

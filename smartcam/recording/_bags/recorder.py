@@ -48,7 +48,7 @@ class BagRecorder(Recorder):
                 ...
 
     Each camera has its topics, ``/CAMERA/results``, ``localizations``, ``detections`` and
-    ``status``; ``/diagnostics`` has the errors. A bag does not contain frames.
+    ``status``; ``/diagnostics`` has the errors. A bag has no protocol messages and no pictures.
 
     Args:
         path: the bag's folder.
@@ -94,7 +94,7 @@ class _BagFile:
     def add(self, item: RecorderInput, /) -> None:
         """Write one item; raise ValueError if no message can be made from it."""
         if isinstance(item, Description):
-            self.items.describe(item.facts)
+            self.items.describe(item.metadata)
             return
         try:
             for message in self.items.messages(item):

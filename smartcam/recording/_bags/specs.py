@@ -1,4 +1,4 @@
-"""Find out from recorded facts whether results were interpreted as poses in metres."""
+"""Find out from recorded metadata whether results were interpreted as poses in metres."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ class RecordedInterpreters:
         specs: Any = spec if hasattr(spec, "items") else {None: spec}
         self._by_application = {key: _resolved(spec) for key, spec in specs.items()}
         self._pixels = pixels
-        self._with_parts: set[int] = set()  # applications that had localizations
+        self._with_localizations: set[int] = set()  # applications that had localizations
 
     def localizations(self, result: Result) -> list[Localization] | None:
         """Return a result's localizations in metres; None without any, or if they are in pixels.
 
         An empty list counts as localizations if its application had some.
         """
-        parts, application = localizations_of(result.value), result.application
+        found, application = localizations_of(result.value), result.application
         interpreter = self._by_application.get(application, self._by_application.get(None))
         pixels = self._pixels or has_pixel_positions(interpreter)
-        if parts:
-            self._with_parts.add(application)
-            calibrated = parts[0].pose.header.frame_id != result.camera
-            return None if pixels and not calibrated else parts
+        if found:
+            self._with_localizations.add(application)
+            calibrated = found[0].pose.header.frame_id != result.camera
+            return None if pixels and not calibrated else found
         has_poses = (
             interpreter is not None and name_without_poses(interpreter) is None and not pixels
         )
-        return parts if has_poses or application in self._with_parts else None
+        return found if has_poses or application in self._with_localizations else None
 
 
 def _resolved(spec: Any) -> Interpreter | None:

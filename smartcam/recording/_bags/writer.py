@@ -170,7 +170,7 @@ class BagWriter:
     def start(self) -> None:
         """Write the beginning of the file, after which it can be read even if it is cut off."""
         self._writer.start("ros2", f"smartcam {smartcam.__version__}")
-        # a file that is cut off has only this record, which has the format of the policies
+        # a file that is cut off has no later one; readers need it for the format of QoS policies
         self._write_metadata_record()
         self.flush()
 

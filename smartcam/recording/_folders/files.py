@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import FrameFormatError
 from smartcam.recording._exclusive_files import open_exclusively
-from smartcam.recording._folders.track import Gap
+from smartcam.recording._folders.camera_recording import Gap
 from smartcam.recording._recorder import Description, RecordingFile
 from smartcam.recording._state import STATE_METADATA
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from smartcam.recording._folder import RecordingFolder
-    from smartcam.recording._folders.track import CameraTrack
+    from smartcam.recording._folders.camera_recording import CameraRecording
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
@@ -70,7 +70,7 @@ class FolderFiles:
         self._folder.enter()
         self._listed_at = self._clock()
 
-    def write(self, track: CameraTrack, entries: list[Any]) -> None:
+    def write(self, recording: CameraRecording, entries: list[Any]) -> None:
         """Write records of a camera, and remove those on the disk from ``entries``.
 
         Raises:
@@ -79,68 +79,69 @@ class FolderFiles:
         done_count = written = 0
         try:
             for index, entry in enumerate(entries):
-                if track.file is None or (not index % ITEMS_PER_CHECK and self._must_end(track)):
-                    self._flush(track, written)
+                must_end = not index % ITEMS_PER_CHECK and self._must_end(recording)
+                if recording.file is None or must_end:
+                    self._flush(recording, written)
                     done_count, written = index, 0
-                    self._begin_file(track, entry)
-                written += self._add(track, entry)
-            self._flush(track, written)
+                    self._begin_file(recording, entry)
+                written += self._add(recording, entry)
+            self._flush(recording, written)
             done_count = len(entries)
         except BaseException:
-            self._cut_file(track)
+            self._cut_file(recording)
             raise
         finally:
             del entries[:done_count]
 
-    def _must_end(self, track: CameraTrack) -> bool:
-        aged = self._clock() - track.begun_at >= self._limits.age
-        return track.file is not None and (aged or track.file.size >= self._limits.size)
+    def _must_end(self, recording: CameraRecording) -> bool:
+        aged = self._clock() - recording.begun_at >= self._limits.age
+        return recording.file is not None and (aged or recording.file.size >= self._limits.size)
 
-    def _add(self, track: CameraTrack, entry: Any) -> int:
+    def _add(self, recording: CameraRecording, entry: Any) -> int:
         """Add an entry's records to the file; return their number."""
-        file = track.file
+        file = recording.file
         if file is None:  # cannot happen: the file was begun
             return 0
-        if track.gap is not None and not track.gap_written:
-            self._add_gap(track, file, track.gap)
-            track.gap_written = True
+        if recording.gap is not None and not recording.gap_written:
+            self._add_gap(recording, file, recording.gap)
+            recording.gap_written = True
         if isinstance(entry, Gap):
-            track.update_state_from_gap(entry)
-            self._add_gap(track, file, entry)
+            recording.update_state_from_gap(entry)
+            self._add_gap(recording, file, entry)
             return 0
         if isinstance(entry, Description):
-            track.facts |= entry.facts
-            file.add(Description(track.facts))
+            recording.metadata |= entry.metadata
+            file.add(Description(recording.metadata))
             return 0
-        track.update_state(entry)
+        recording.update_state(entry)
         written = 0
         try:
-            items = [*track.make_items(entry)]
+            items = [*recording.make_items(entry)]
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:  # noqa: BLE001 - an interpreter may raise anything
-            track.count_one_lost(f"unexpected {exc!r}")
+            recording.count_one_lost(f"unexpected {exc!r}")
             return 0
-        track.extra_records += len(items) - 1  # a bad result makes an error, too
+        recording.extra_records += len(items) - 1  # a bad result makes an error, too
         for item in items:
             try:
                 file.add(item)
             except FrameFormatError as exc:  # an OSError, but not from the disk
-                track.count_one_lost(str(exc))
+                recording.count_one_lost(str(exc))
             except OSError:
                 raise
-            except Exception as exc:  # noqa: BLE001 - the record could not be read again
-                track.count_one_lost(str(exc))
+            except Exception as exc:  # noqa: BLE001 - the record cannot be encoded
+                recording.count_one_lost(str(exc))
             else:
                 written += 1
         return written
 
     @staticmethod
-    def _add_gap(track: CameraTrack, file: RecordingFile, gap: Gap) -> None:
-        file.add(gap.error(track.camera))
-        file.add_facts(STATE_METADATA, track.state.to_facts(track.endian, gap.until))
+    def _add_gap(recording: CameraRecording, file: RecordingFile, gap: Gap) -> None:
+        file.add(gap.error(recording.camera))
+        file.add_metadata(STATE_METADATA, recording.state.to_metadata(recording.endian, gap.until))
 
-    def _begin_file(self, track: CameraTrack, first: Any) -> None:
+    def _begin_file(self, recording: CameraRecording, first: Any) -> None:
         """End a camera's file, if any, and begin the next one, whose first record is ``first``.
 
         Raises:
@@ -151,12 +152,12 @@ class FolderFiles:
             self._folder.list_files()
             self._listed_at = now
         at = _time_of(first)
-        path = self._folder.next_path(track.camera, at)
+        path = self._folder.next_path(recording.camera, at)
         file = RecordingFile(open_exclusively(path, overwrite=False), self._compress, path)
         try:
             file.start()
-            file.add(Description(track.facts))
-            file.add_facts(STATE_METADATA, track.state.to_facts(track.endian, at))
+            file.add(Description(recording.metadata))
+            file.add_metadata(STATE_METADATA, recording.state.to_metadata(recording.endian, at))
             file.flush()
         except BaseException:
             file.close()
@@ -164,52 +165,52 @@ class FolderFiles:
                 path.unlink()
             raise
         self._folder.add(path)
-        self.finish(track)
-        track.file, track.begun_at, track.synced_bytes = file, now, file.size
+        self.finish(recording)
+        recording.file, recording.begun_at, recording.synced_bytes = file, now, file.size
 
-    def _flush(self, track: CameraTrack, written: int) -> None:
+    def _flush(self, recording: CameraRecording, written: int) -> None:
         """Sync the added records to the disk, and count them."""
-        file = track.file
+        file = recording.file
         if file is None:
             return
         file.flush()
         file.check_path()
-        track.synced_bytes = file.size
-        track.written += written
-        if track.gap_written:
-            track.gap, track.gap_written = None, False
+        recording.synced_bytes = file.size
+        recording.written += written
+        if recording.gap_written:
+            recording.gap, recording.gap_written = None, False
         self._folder.set_size(file.path, file.size)
 
-    def _cut_file(self, track: CameraTrack) -> None:
+    def _cut_file(self, recording: CameraRecording) -> None:
         """Close a file, cut to the last whole chunk."""
-        file, track.file = track.file, None
-        track.gap_written = False
+        file, recording.file = recording.file, None
+        recording.gap_written = False
         if file is not None:
-            file.cut_to(track.synced_bytes)
-            self._folder.set_size(file.path, track.synced_bytes)
+            file.cut_to(recording.synced_bytes)
+            self._folder.set_size(file.path, recording.synced_bytes)
 
-    def finish(self, track: CameraTrack) -> None:
+    def finish(self, recording: CameraRecording) -> None:
         """End a camera's file, if any; without an index if that cannot be written."""
-        file, track.file = track.file, None
+        file, recording.file = recording.file, None
         if file is None:
             return
         try:
             file.finish()
         except (OSError, ValueError) as exc:
-            file.cut_to(track.synced_bytes)
-            logger.warning("%s has no end: %s", file.path, exc)
+            file.cut_to(recording.synced_bytes)
+            logger.warning("%s: its index could not be written: %s", file.path, exc)
         file.close()
         self._folder.set_size(file.path, file.size)
 
-    def end_old(self, tracks: Iterable[CameraTrack]) -> None:
+    def end_old(self, recordings: Iterable[CameraRecording]) -> None:
         """End files that are old enough, also of silent cameras."""
-        for track in tracks:
-            if self._must_end(track) and self._clock() - track.begun_at >= self._limits.age:
-                self.finish(track)
+        for recording in recordings:
+            if self._must_end(recording) and self._clock() - recording.begun_at >= self._limits.age:
+                self.finish(recording)
 
     # ------------------------------------------------------------------ the bound on the disk
 
-    def delete_old(self, tracks: Sequence[CameraTrack]) -> None:
+    def delete_old(self, recordings: Sequence[CameraRecording]) -> None:
         """Delete the oldest files until all files together are within ``keep``."""
         folder = self._folder
         while folder.total_bytes > self._limits.keep:
@@ -219,9 +220,9 @@ class FolderFiles:
             if not old_files:
                 return
             oldest = min(old_files)
-            for track in tracks:
-                if track.file is not None and track.file.path.name == oldest.name:
-                    self.finish(track)  # the camera's next record begins a new file
+            for recording in recordings:
+                if recording.file is not None and recording.file.path.name == oldest.name:
+                    self.finish(recording)  # the camera's next record begins a new file
             try:
                 folder.delete(oldest.name)
             except OSError as exc:

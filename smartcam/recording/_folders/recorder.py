@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from smartcam.fleet._inside import RecordSection
     from smartcam.frames import Frame
     from smartcam.observers import RawFrame
+    from smartcam.recording._folders.camera_recording import CameraRecording, RecordingCounts
     from smartcam.recording._folders.pictures import FleetPictures
-    from smartcam.recording._folders.track import CameraTrack, RecordingCounts
     from smartcam.recording._mcap.form import Item
 
 
@@ -195,62 +195,63 @@ class _SessionObserver(Observer):
     ) -> None:
         self._server, self._section, self._writer = server, section, writer
         self._pictures = pictures
-        # track of each camera; None for a camera that is not recorded
-        self._tracks: dict[str, CameraTrack | None] = {}
+        # recording of each camera; None for a camera that is not recorded
+        self._recordings: dict[str, CameraRecording | None] = {}
 
     def on_state(self, event: CameraEvent) -> None:
         """Pass on an event."""
-        track = self._track(event.camera)
-        if track is not None:
+        recording = self._recording_of(event.camera)
+        if recording is not None:
             if isinstance(event, StatusChanged):
-                track.endian = self._endian(event.camera) or 0
-            self._writer.put(track, event, 0, event=True)
+                recording.endian = self._endian(event.camera) or 0
+            self._writer.put(recording, event, 0, event=True)
             if self._pictures is not None:
-                self._pictures.start_recording(track)
+                self._pictures.start_recording(recording)
 
     def on_results(self, results: Sequence[Result]) -> None:
         """Pass on results that came together."""
         camera = results[0].camera
-        track = self._track(camera)
-        if track is None:
+        recording = self._recording_of(camera)
+        if recording is None:
             return
         endian = self._endian(camera)
         for result in results:
-            self._writer.put(track, _ResultWithEndian(result, endian), 4 * len(result.raw))
+            self._writer.put(recording, _ResultWithEndian(result, endian), 4 * len(result.raw))
             if self._pictures is not None:
-                self._pictures.add_result(track, result)
+                self._pictures.add_result(recording, result)
 
     def on_picture(self, result: Result, frame: Frame) -> None:
         """Pass on the picture of a software camera's result."""
-        track = self._track(result.camera)
-        if track is not None and self._pictures is not None:
-            self._pictures.add_reported(track, result, frame)
+        recording = self._recording_of(result.camera)
+        if recording is not None and self._pictures is not None:
+            self._pictures.add_reported(recording, result, frame)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Pass on an error."""
-        track = self._track(camera)
-        if track is not None:
+        recording = self._recording_of(camera)
+        if recording is not None:
             text = str(error)
             error_name = type(error).__name__
             recorded = RecordedError(camera, datetime.now(UTC), error_name, text, triggered_at)
-            self._writer.put(track, recorded, len(text))
+            self._writer.put(recording, recorded, len(text))
 
     def _endian(self, camera: str) -> int | None:
         host = self._server.hosts.get(camera)
         return None if host is None else host.camera.endian
 
-    def _track(self, camera: str) -> CameraTrack | None:
-        if camera not in self._tracks and camera in self._server.hosts:
-            self._tracks[camera] = self._new_track(camera)
-        return self._tracks.get(camera)
+    def _recording_of(self, camera: str) -> CameraRecording | None:
+        if camera not in self._recordings and camera in self._server.hosts:
+            self._recordings[camera] = self._new_recording(camera)
+        return self._recordings.get(camera)
 
-    def _new_track(self, camera: str) -> CameraTrack | None:
+    def _new_recording(self, camera: str) -> CameraRecording | None:
         if not self._section.chooses(camera):
             return None
         settings = self._server.hosts[camera].settings
         spec, y_down, lenient = settings.interpret_as, settings.y_down, settings.lenient
-        track = self._writer.new_track(camera, _ItemMaker(camera, spec, y_down, lenient).items)
-        facts_given = {
+        maker = _ItemMaker(camera, spec, y_down, lenient)
+        recording = self._writer.new_recording(camera, maker.items)
+        given = {
             "fleet": self._server.file.fleet,
             "interpret_as": spec,
             "application": settings.application,
@@ -258,9 +259,9 @@ class _SessionObserver(Observer):
             "lenient": lenient or None,
             "frames": None if self._section.frames else "no",
         }
-        facts = {name: str(fact) for name, fact in facts_given.items() if fact is not None}
-        self._writer.describe(track, facts)
-        return track
+        metadata = {name: str(value) for name, value in given.items() if value is not None}
+        self._writer.describe(recording, metadata)
+        return recording
 
 
 class _SessionAndFrameObserver(_SessionObserver):
@@ -268,9 +269,9 @@ class _SessionAndFrameObserver(_SessionObserver):
 
     def on_raw_frame(self, frame: RawFrame) -> None:
         """Pass on a frame; the writer's thread decodes it."""
-        track = self._track(frame.camera)
-        if track is not None:
-            self._writer.put(track, frame, 2 * frame.size)
+        recording = self._recording_of(frame.camera)
+        if recording is not None:
+            self._writer.put(recording, frame, 2 * frame.size)
 
 
 class _ItemMaker:

@@ -44,8 +44,8 @@ class FleetReplay(Server):
             recording.
 
     Attributes:
-        skipped: reason why a camera is not replayed, by its name: it had no session, or its make
-            has no emulated camera.
+        skipped: reason why a camera is not replayed, by its name: it had no session, or there is
+            no emulated camera of its maker.
 
     Raises:
         ConfigurationError: an argument is wrong, or none of the cameras can be replayed.
@@ -99,13 +99,13 @@ class FleetReplay(Server):
 
     @property
     def server(self) -> FleetServer:
-        """The agent.
+        """The server of the agent.
 
         Raises:
             ConfigurationError: the agent is not started.
         """
         if self._server is None:
-            raise ConfigurationError(f"recording {self._recording.path}: it is not being played")
+            raise ConfigurationError(f"recording {self._recording.path}: the agent is not started")
         return self._server
 
     async def start(self) -> None:
@@ -127,7 +127,7 @@ class FleetReplay(Server):
             for name, camera in self._cameras.items():
                 await stack.enter_async_context(camera)
                 recorded = self._recording.camera(name)
-                fleet = fleet or recorded.facts.get("fleet")
+                fleet = fleet or recorded.metadata.get("fleet")
                 entries[name] = {"url": camera.url, **_camera_options(recorded)}
                 if isinstance(camera, ReplayedCamera):
                     pictures = camera._prepare_pictures(self._recording, name)  # noqa: SLF001
@@ -159,6 +159,6 @@ def _camera_options(camera: RecordedCamera) -> dict[str, Any]:
             with contextlib.suppress(ValueError, SyntaxError, MemoryError, RecursionError):
                 options["interpret_as"] = ast.literal_eval(spec)
     for name in ("y_down", "lenient"):
-        if camera.facts.get(name) == "True":
+        if camera.metadata.get(name) == "True":
             options[name] = True
     return options

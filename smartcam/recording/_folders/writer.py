@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import CameraEvent
+from smartcam.recording._folders.camera_recording import CameraRecording, Gap
 from smartcam.recording._folders.files import FolderFiles, Limits
-from smartcam.recording._folders.track import CameraTrack, Gap
 from smartcam.recording._recorder import (
     CHUNK,
     CLOSE_TIMEOUT,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from smartcam.recording._folder import RecordingFolder
-    from smartcam.recording._folders.track import RecordingCounts
+    from smartcam.recording._folders.camera_recording import RecordingCounts
     from smartcam.recording._mcap.form import Item
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
@@ -65,7 +65,7 @@ class _Trouble:
 class _DiskQueue:
     """The records that wait for the thread."""
 
-    entries: list[tuple[CameraTrack, Any]] = field(default_factory=list[tuple[CameraTrack, Any]])
+    entries: list[tuple[CameraRecording, Any]] = field(default_factory=list)
     bytes: int = 0
 
 
@@ -97,7 +97,7 @@ class FolderWriter:
         self._condition = threading.Condition()
         self._waiting = _DiskQueue()
         self._is_closing = False
-        self._tracks: dict[str, CameraTrack] = {}
+        self._recordings: dict[str, CameraRecording] = {}
         self._trouble: _Trouble | None = None
         self._thread: threading.Thread | None = None
         notify_of_forks(self)
@@ -118,56 +118,61 @@ class FolderWriter:
     def counts(self) -> dict[str, RecordingCounts]:
         """Counts of each camera's records, by the camera's name."""
         with self._condition:
-            return {name: track.counts for name, track in self._tracks.items()}
+            return {name: recording.counts for name, recording in self._recordings.items()}
 
-    def new_track(self, camera: str, make_items: Callable[[Any], Iterator[Item]]) -> CameraTrack:
-        """Return a new track of a camera."""
+    def new_recording(
+        self, camera: str, make_items: Callable[[Any], Iterator[Item]]
+    ) -> CameraRecording:
+        """Return a new recording of a camera."""
         with self._condition:
-            track = self._tracks[camera] = CameraTrack(camera, make_items)
-        return track
+            recording = self._recordings[camera] = CameraRecording(camera, make_items)
+        return recording
 
-    def describe(self, track: CameraTrack, facts: dict[str, str]) -> None:
-        """Write facts about a camera to each of its files."""
+    def describe(self, recording: CameraRecording, metadata: dict[str, str]) -> None:
+        """Write metadata of a camera to each of its files."""
         with self._condition:
-            self._waiting.entries.append((track, Description({"camera": track.camera, **facts})))
+            description = Description({"camera": recording.camera, **metadata})
+            self._waiting.entries.append((recording, description))
 
     @property
     def waiting_bytes(self) -> int:
         """Bytes that wait for the disk."""
         return self._waiting.bytes
 
-    def put(self, track: CameraTrack, entry: Any, size: int, *, event: bool = False) -> bool:
+    def put(
+        self, recording: CameraRecording, entry: Any, size: int, *, event: bool = False
+    ) -> bool:
         """Put an entry into the list, or leave it out and count it if too much waits. Never wait.
 
         Return whether the entry is in the list.
 
         Args:
-            track: track of the camera that the entry is about.
-            entry: object that ``make_items`` of the track makes items of.
+            recording: recording of the camera that the entry is about.
+            entry: object that ``make_items`` of the recording makes items of.
             size: bytes for which the entry counts while it waits; below 0: the entry is too large.
             event: whether the entry is an event; events have more room to wait.
         """
         with self._condition:
             waiting = self._waiting
-            track.offered += 1
+            recording.offered += 1
             room = MAX_WAITING_BYTES * EVENT_ROOM_FACTOR if event else MAX_WAITING_BYTES
             if self._is_closing or waiting.bytes > room or size < 0:
-                self._leave_out(track, entry)
+                self._leave_out(recording, entry)
                 return False
             before = waiting.bytes
-            waiting.entries.append((track, entry))
+            waiting.entries.append((recording, entry))
             waiting.bytes += size + ITEM_OVERHEAD_BYTES
             if not before or before < CHUNK <= waiting.bytes:
                 self._condition.notify()
             return True
 
-    def _leave_out(self, track: CameraTrack, entry: Any) -> None:
+    def _leave_out(self, recording: CameraRecording, entry: Any) -> None:
         at = datetime.now(UTC)
-        track.left_out += 1
-        if track.overflow is None:
-            track.overflow = Gap(at, at, 0, "the disk is too slow")
-            self._waiting.entries.append((track, track.overflow))
-        gap = track.overflow
+        recording.left_out += 1
+        if recording.overflow is None:
+            recording.overflow = Gap(at, at, 0, "the disk is too slow")
+            self._waiting.entries.append((recording, recording.overflow))
+        gap = recording.overflow
         gap.until, gap.count = at, gap.count + 1
         if isinstance(entry, CameraEvent):
             gap.events.pop(type(entry), None)
@@ -214,11 +219,11 @@ class FolderWriter:
                 batches, is_last = self._take_batches()
                 self._write(batches)
         finally:
-            for track in self._all_tracks():
-                self._files.finish(track)
+            for recording in self._all_recordings():
+                self._files.finish(recording)
             self._folder.leave()
 
-    def _take_batches(self) -> tuple[dict[CameraTrack, list[Any]], bool]:
+    def _take_batches(self) -> tuple[dict[CameraRecording, list[Any]], bool]:
         """Wait for records; return them by camera, and whether they were the last."""
         with self._condition:
             self._condition.wait_for(lambda: self._waiting.entries or self._is_closing, INTERVAL)
@@ -227,23 +232,23 @@ class FolderWriter:
                     lambda: self._is_closing or self._waiting.bytes > CHUNK, INTERVAL
                 )
             taken, self._waiting = self._waiting, _DiskQueue()
-            for track in self._tracks.values():
-                track.overflow = None
+            for recording in self._recordings.values():
+                recording.overflow = None
             is_last = self._is_closing
-        batches: dict[CameraTrack, list[Any]] = {}
-        for track, entry in taken.entries:
-            batches.setdefault(track, []).append(entry)
+        batches: dict[CameraRecording, list[Any]] = {}
+        for recording, entry in taken.entries:
+            batches.setdefault(recording, []).append(entry)
         return batches, is_last
 
-    def _write(self, batches: dict[CameraTrack, list[Any]]) -> None:
+    def _write(self, batches: dict[CameraRecording, list[Any]]) -> None:
         """Write records, or count them as lost; never raises."""
         try:
             if self._should_try(batches):
-                for track, entries in batches.items():
-                    self._files.write(track, entries)
-                tracks = self._all_tracks()
-                self._files.end_old(tracks)
-                self._files.delete_old(tracks)
+                for recording, entries in batches.items():
+                    self._files.write(recording, entries)
+                recordings = self._all_recordings()
+                self._files.end_old(recordings)
+                self._files.delete_old(recordings)
                 if batches:
                     self._report_recovery()
         except (OSError, ConfigurationError) as exc:
@@ -253,10 +258,10 @@ class FolderWriter:
             self._fail(exc)
         trouble = self._trouble
         if trouble is not None:
-            for track, entries in batches.items():
-                track.count_lost(entries, trouble.reason)
+            for recording, entries in batches.items():
+                recording.count_lost(entries, trouble.reason)
 
-    def _should_try(self, batches: dict[CameraTrack, list[Any]]) -> bool:
+    def _should_try(self, batches: dict[CameraRecording, list[Any]]) -> bool:
         """Return True if the disk should be tried now; check its free space after it was full.
 
         Raises:
@@ -273,9 +278,9 @@ class FolderWriter:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return True
 
-    def _all_tracks(self) -> list[CameraTrack]:
+    def _all_recordings(self) -> list[CameraRecording]:
         with self._condition:
-            return [*self._tracks.values()]
+            return [*self._recordings.values()]
 
     # ------------------------------------------------------------------ trouble
 

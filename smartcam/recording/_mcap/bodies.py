@@ -1,4 +1,4 @@
-"""Remember the last frames' data, so that a result can refer to its bytes instead of a copy."""
+"""Remember the data of the last frames, so that a result can refer to a frame with its bytes."""
 
 from __future__ import annotations
 

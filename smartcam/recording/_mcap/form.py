@@ -52,7 +52,7 @@ FILE_METADATA = "smartcam"
 """Name of the metadata record about the file: ``format``, ``version`` (of smartcam), ``began``."""
 
 CAMERA_METADATA = "smartcam.camera"
-"""Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and other facts; a
+"""Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and others; a
 later one overrides an earlier one."""
 
 GAP = "RecordingGap"
@@ -70,7 +70,7 @@ MAX_VALUES = 3_000_000
 object of a hundred times its size. A container of 1 MiB with one field per byte has two million."""
 
 MAX_CAMERAS = 10_000
-"""Largest number of cameras in a file: the facts about all cameras are kept while it is read."""
+"""Largest number of cameras in a file: the metadata of all cameras are kept while it is read."""
 
 MAX_NAME_CHARACTERS = 1000
 """Largest number of characters of a camera's name: a client allows 200, and HOST:PORT has fewer
@@ -199,27 +199,27 @@ def count_values(data: bytes) -> int:
     return values
 
 
-def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
+def message_of(kind: str, item: Item, raw_frame: int | None = None) -> bytes:
     """Return an item's message.
 
     Args:
         kind: name of the kind of item, a key of ``KINDS``.
         item: item to write.
-        raw_from: number of the frame with the ``raw`` of a result, which is then not written
-            again.
+        raw_frame: number of the frame with the ``raw`` of a result, which is then not
+            written again.
 
     Raises:
-        ValueError: the message could not be read again.
+        ValueError: the message exceeds the bounds for reading.
     """
     to_text = KINDS[kind].to_text
-    return checked_bytes(to_text(item) if raw_from is None else to_text(item, raw_from))
+    return checked_bytes(to_text(item) if raw_frame is None else to_text(item, raw_frame))
 
 
 def checked_bytes(text: str) -> bytes:
     """Return a message's text as bytes, after checking its bounds.
 
     Raises:
-        ValueError: the message could not be read again.
+        ValueError: the message exceeds the bounds for reading.
     """
     data = text.encode()
     size = len(data)
@@ -479,7 +479,7 @@ KINDS: dict[str, MessageKind] = {
             "message": _text_schema("name of the message, or what is wrong with the bytes"),
             "fields": {"type": "object", "properties": {}, "description": "the decoded body"},
             "hex": _text_schema("the bytes"),
-            "data_from": _integer_schema("at which of the bytes data begins, which fields has not"),
+            "data_from": _integer_schema("byte at which data begins, if fields leaves it out"),
         },
         ("at", "camera", "direction", "message", "hex"),
         frame_text,
@@ -499,7 +499,7 @@ KINDS: dict[str, MessageKind] = {
             "latency": {"type": "number", "description": "seconds from trigger to arrival"},
             "raw": _text_schema("the container's bytes behind the application id, as hex"),
             "raw_from": _integer_schema(
-                "the frame that has them as its data: its sequence in its topic"
+                "number, in /CAMERA/frames, of the frame whose data are raw"
             ),
             "value_from": _text_schema("raw: the value is these bytes"),
         },
@@ -518,7 +518,7 @@ KINDS: dict[str, MessageKind] = {
             ),
             "camera": _CAMERA,
             "at": _AT,
-            "url": _text_schema("Connected, Reconnected: the address, with everything pinned"),
+            "url": _text_schema("Connected, Reconnected: the URL with dialect, transport and port"),
             "reason": _text_schema("Disconnected: why"),
             "expected": {
                 "type": "boolean",
@@ -561,7 +561,7 @@ PICTURES = "pictures"
 """Last part of the topic of pictures."""
 
 PICTURE_SCHEMAS = ("foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CompressedVideo")
-"""Schemas of pictures, which another distribution of smartcam reads."""
+"""Schemas of pictures; to read them, the distribution of frames is needed."""
 
 ANNOTATIONS = "annotations"
 """Last part of the topic of marks on pictures."""

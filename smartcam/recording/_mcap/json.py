@@ -121,12 +121,12 @@ def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[
     return {**(fields or {}), "data": end}
 
 
-def result_text(result: Result[Any], raw_from: int | None = None) -> str:
+def result_text(result: Result[Any], raw_frame: int | None = None) -> str:
     """Return a result's text, without bytes that are elsewhere in the file.
 
     Args:
         result: result to write.
-        raw_from: number of the frame whose ``data`` is :attr:`~smartcam.Result.raw`; None:
+        raw_frame: number of the frame whose ``data`` is :attr:`~smartcam.Result.raw`; None:
             write ``raw`` itself.
     """
     camera, application, sequence, number, triggered_at, received_at, latency, raw, value = result
@@ -139,7 +139,7 @@ def result_text(result: Result[Any], raw_from: int | None = None) -> str:
     text += f',"received_at":{text_of(received_at)}'
     if latency is not None and (field_text := text_of(latency)) != NULL:
         text += f',"latency":{field_text}'
-    if raw_from is None:
+    if raw_frame is None:
         text += f',"raw":{text_of(raw)}'
     if value is raw:
         end = f',"value_from":{VALUE_IS_RAW}}}'
@@ -148,6 +148,6 @@ def result_text(result: Result[Any], raw_from: int | None = None) -> str:
         field_text = text_of(value)
         if field_text != NULL:
             text += f',"value":{field_text}'
-    if raw_from is not None:
-        text += f',"raw_from":{raw_from}'
+    if raw_frame is not None:
+        text += f',"raw_from":{raw_frame}'
     return text + end

@@ -1,7 +1,7 @@
 """Read the records of an MCAP file within bounds, since any length in a file may be wrong.
 
 Chunks are inflated piece by piece within a bound, lengths are compared with the available bytes,
-and indexes and attachments are skipped. If a file has the number of its messages, the number must
+and indexes and attachments are skipped. If a file says how many messages it has, the number must
 be right: damage can make a chunk look like a record that is skipped.
 """
 
@@ -26,16 +26,16 @@ MAX_CHUNK_BYTES = MAX_MESSAGE_BYTES + (1 << 21)
 """Largest number of bytes to which a chunk may unpack. A recorder ends its chunk after 1 MiB, so
 the largest chunk has 1 MiB and one more message. 2 kB of zstd can unpack to as much as this."""
 
-MAX_FACTS_BYTES = 1 << 20
-"""Largest number of bytes of a schema, a channel or a metadata record: smartcam's have 2 kB."""
+MAX_METADATA_BYTES = 1 << 20
+"""Largest number of bytes of a record of metadata or statistics; smartcam's have 2 kB."""
 
-MIN_RECORDS = 10_000
-"""Number of records that every file may have; a larger file may have as many as it has bytes. A
-recorder indexes each message with 16 bytes after its chunk, and a chunk of 1 MiB has fewer
+RECORD_ALLOWANCE = 10_000
+"""Number of records that a file of any size may have; a larger file may have as many as it has
+bytes. A recorder indexes each message with 16 bytes after its chunk, and a chunk of 1 MiB has fewer
 records."""
 
-MIN_UNPACKED_BYTES = 1 << 29
-"""Number of bytes to which the chunks of every file may unpack together: seconds of work."""
+UNPACKED_BYTES_ALLOWANCE = 1 << 29
+"""Number of bytes to which the chunks of a file of any size may unpack: seconds of work."""
 
 UNPACKED_PER_BYTE = 10_000
 """Number of bytes to which a larger file may unpack for each byte of the file. Containers of zeros
@@ -85,7 +85,7 @@ class Metadata(NamedTuple):
     """A metadata record: texts by their keys, under a name."""
 
     name: str
-    facts: dict[str, str]
+    texts: dict[str, str]
 
 
 Record: TypeAlias = Schema | Channel | McapMessage | Metadata
@@ -111,7 +111,7 @@ class RecordReader:
         Raises:
             CutOffError: the file ends before its last record.
             RecordingError: the file exceeds a bound.
-            ValueError: the file is damaged at this place.
+            ValueError: the file is damaged at this offset.
         """
         self._check_magic()
         while True:
@@ -151,11 +151,11 @@ class RecordReader:
             RecordingError: their sum exceeds the bound.
         """
         self._unpacked_bytes += size
-        if self._unpacked_bytes > max(MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE * self.offset):
+        if self._unpacked_bytes > max(UNPACKED_BYTES_ALLOWANCE, UNPACKED_PER_BYTE * self.offset):
             raise RecordingError(
                 f"recording {self._name}: the first {self.offset} bytes of the file unpack to "
                 f"{self._unpacked_bytes}, expected {UNPACKED_PER_BYTE} for each at most, or "
-                f"{MIN_UNPACKED_BYTES}"
+                f"{UNPACKED_BYTES_ALLOWANCE}"
             )
 
     def _unpack(self, body: memoryview) -> Iterator[Record]:
@@ -210,10 +210,10 @@ class RecordReader:
 
     def _count_record(self) -> None:
         self._record_count += 1
-        if self._record_count > MIN_RECORDS and self._record_count > self.offset:
+        if self._record_count > RECORD_ALLOWANCE and self._record_count > self.offset:
             raise RecordingError(
                 f"recording {self._name}: {self._record_count} records in the first {self.offset} "
-                f"bytes of the file, expected one a byte at most, or {MIN_RECORDS}"
+                f"bytes of the file, expected one a byte at most, or {RECORD_ALLOWANCE}"
             )
 
     # ------------------------------------------------------------------ the file
@@ -274,8 +274,8 @@ class _FieldReader:
 
 
 def _checked_length(length: int) -> int:
-    if length > MAX_FACTS_BYTES:
-        raise ValueError(f"a record of {length} bytes, expected {MAX_FACTS_BYTES} at most")
+    if length > MAX_METADATA_BYTES:
+        raise ValueError(f"a record of {length} bytes, expected {MAX_METADATA_BYTES} at most")
     return length
 
 
@@ -298,12 +298,12 @@ def _message(data: memoryview) -> McapMessage:
 
 def _metadata(fields: _FieldReader) -> Metadata:
     name = fields.text()
-    facts = _FieldReader(fields.read(fields.number(4)))
-    metadata: dict[str, str] = {}
-    while facts.remaining:
-        key = facts.text()
-        metadata[key] = facts.text()
-    return Metadata(name, metadata)
+    pairs = _FieldReader(fields.read(fields.number(4)))
+    texts: dict[str, str] = {}
+    while pairs.remaining:
+        key = pairs.text()
+        texts[key] = pairs.text()
+    return Metadata(name, texts)
 
 
 _PARSERS: dict[int, Callable[[memoryview], Record]] = {

@@ -18,7 +18,7 @@ from smartcam.recording._pictures.protobuf import (
     WireField,
     encode_message,
     encode_timestamp,
-    file_set,
+    file_descriptor_set,
     parse_message,
 )
 
@@ -58,9 +58,9 @@ _MESSAGES: Final[dict[str, Fields]] = {
         "outline_colors": WireField(5, "message", _COLOUR, repeated=True),
         "fill_color": WireField(6, "message", _COLOUR),
         "thickness": WireField(7, "double"),
-        "place": WireField(101, "uint64"),
+        "mark_number": WireField(101, "uint64"),
         "role": WireField(102, "string"),
-        "word": WireField(103, "string"),
+        "label": WireField(103, "string"),
     },
     "TextAnnotation": {
         "timestamp": _STAMP,
@@ -69,7 +69,7 @@ _MESSAGES: Final[dict[str, Fields]] = {
         "font_size": WireField(4, "double"),
         "text_color": WireField(5, "message", _COLOUR),
         "background_color": WireField(6, "message", _COLOUR),
-        "place": WireField(101, "uint64"),
+        "mark_number": WireField(101, "uint64"),
         "role": WireField(102, "string"),
     },
     "ImageAnnotations": {
@@ -78,8 +78,8 @@ _MESSAGES: Final[dict[str, Fields]] = {
         "texts": WireField(3, "message", ".foxglove.TextAnnotation", repeated=True),
     },
 }
-"""Foxglove's messages and their fields. ``place`` is the number of a mark in its picture, from 1.
-``word`` is the text beside a mark's first point, which viewers get as a text without a place."""
+"""Foxglove's messages and their fields. ``mark_number`` counts the marks of a picture from 1.
+``label`` is the text beside a mark's first point, which viewers get as a text without a number."""
 
 _TYPES: Final = ("UNKNOWN", "POINTS", "LINE_LOOP", "LINE_STRIP", "LINE_LIST")
 _KINDS: Final[dict[int, Kind]] = {1: "points", 2: "polygon", 3: "line"}
@@ -89,7 +89,7 @@ _TYPE_OF: Final = {kind: number for number, kind in _KINDS.items()}
 @cache
 def schema_data(name: str) -> bytes:
     """Return the message's schema in MCAP's form: a FileDescriptorSet."""
-    return file_set(name, _MESSAGES, {"PointsAnnotation": {"Type": _TYPES}})
+    return file_descriptor_set(name, _MESSAGES, {"PointsAnnotation": {"Type": _TYPES}})
 
 
 def annotations_message(frame: Frame) -> bytes:
@@ -104,7 +104,7 @@ def annotations_message(frame: Frame) -> bytes:
         points = drawing.points[:MAX_POINTS]
         if not points or not all(math.isfinite(x) and math.isfinite(y) for x, y in points):
             continue
-        common = {"timestamp": stamp, "place": number, "role": drawing.role}
+        common = {"timestamp": stamp, "mark_number": number, "role": drawing.role}
         text = drawing.text[:MAX_TEXT_CHARACTERS]
         if drawing.kind != "text":
             values = {
@@ -113,7 +113,7 @@ def annotations_message(frame: Frame) -> bytes:
                 "points": [_point(*point) for point in points],
                 "outline_color": _colour(drawing.role),
                 "thickness": line_width * (3.0 if drawing.kind == "points" else 1.0),
-                "word": text,
+                "label": text,
             }
             annotations["points"].append(encode_message(_MESSAGES["PointsAnnotation"], values))
             common = {"timestamp": stamp}
@@ -144,10 +144,11 @@ def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
         if kind is None:
             raise ValueError(f"type: {values.get('type', 0)} came, expected 1 to 3")
         points = tuple(map(_coordinates, values.get("points", ())))
-        drawings[_mark_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
+        label = _text(values, "label")
+        drawings[_mark_number(values)] = Drawing(kind, points, _role(values), label)
     for annotation in lists.get("texts", ()):
         values = parse_message(_MESSAGES["TextAnnotation"], annotation, 100)
-        if "place" in values:  # texts without a place are the words beside points
+        if "mark_number" in values:  # texts without a number are the labels of points
             point = _coordinates(values.get("position", memoryview(b"")))
             text = _text(values, "text")
             drawings[_mark_number(values)] = Drawing("text", (point,), _role(values), text)
@@ -164,7 +165,7 @@ def _coordinates(data: memoryview) -> tuple[float, float]:
 
 
 def _colour(role: Role | None) -> bytes:
-    """Return the colour of a role; without a role transparent black, as for a background."""
+    """Return the colour of a role; without a role half-transparent black, for a background."""
     red, green, blue = (0, 0, 0) if role is None else COLOURS[role]
     opacity = 0.5 if role is None else 1.0
     values = {"r": red / 255, "g": green / 255, "b": blue / 255, "a": opacity}
@@ -172,9 +173,9 @@ def _colour(role: Role | None) -> bytes:
 
 
 def _mark_number(values: dict[str, Any]) -> int:
-    number: int = values.get("place", 0)
+    number: int = values.get("mark_number", 0)
     if not 1 <= number <= MAX_DRAWINGS:
-        raise ValueError(f"place: {number} came, expected 1 to {MAX_DRAWINGS}")
+        raise ValueError(f"mark_number: {number} came, expected 1 to {MAX_DRAWINGS}")
     return number
 
 

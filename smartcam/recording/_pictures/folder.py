@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import RecordingError
     from smartcam.frames import FrameSource
     from smartcam.frames._inside import ReaderStatistics
-    from smartcam.recording._folders.track import RecordingCounts
+    from smartcam.recording._folders.camera_recording import RecordingCounts
 
 MIN_FILE_BYTES: Final = 1e5
 MAX_FILE_BYTES: Final = 1e15
@@ -84,10 +84,10 @@ class RotatingRecorder:
         self._limits = Limits(size, age, keep)
         self._on_trouble = on_trouble
         self._writer: FolderWriter | None = None
-        self._tracks: dict[str, Any] = {}
+        self._recordings: dict[str, Any] = {}
 
     def open(self) -> Self:
-        """Enter the folder and start the thread that writes it.
+        """Take the folder over and start the thread that writes it.
 
         Raises:
             ConfigurationError: another recorder writes in the folder.
@@ -132,7 +132,7 @@ class RotatingRecorder:
 
         Args:
             frame: picture of a source of frames; its bytes are kept until they are written.
-            camera: name of the camera; default made of the frame's source by :func:`file_name`.
+            camera: name of the camera; default: :func:`name_in_recording` of the frame's source.
 
         Returns:
             True if the picture was added.
@@ -144,19 +144,19 @@ class RotatingRecorder:
         camera = check_text(camera, "camera", "recordings", most=MAX_NAME_CHARACTERS)
         if self._writer is None:
             return False
-        name = camera or file_name(frame.source)
-        track = self._tracks.get(name)
-        if track is None:
+        name = camera or name_in_recording(frame.source)
+        recording = self._recordings.get(name)
+        if recording is None:
             example = FileName(name, datetime.now(UTC))
             if FileName.parse(str(example)) is None:
                 raise ConfigurationError(
                     f"recordings {self.path}: camera {name!r:.60}: expected a name of small "
                     "letters, digits, _ and -, since the files' names contain it"
                 )
-            track = self._tracks[name] = self._writer.new_track(name, _single_item)
+            recording = self._recordings[name] = self._writer.new_recording(name, _single_item)
         size = memoryview(frame.data).nbytes
         return self._writer.put(
-            track,
+            recording,
             RecordedPicture(name, captured_at(frame), frame),
             size if size <= MAX_PICTURE_SIZE_BYTES else -1,
         )
@@ -181,8 +181,8 @@ class RotatingRecorder:
         return await never
 
 
-def file_name(name: str) -> str:
-    """Return the name of a source in a recording: lower case letters, digits and hyphens."""
+def name_in_recording(name: str) -> str:
+    """Return the name of a source in a recording: lower case letters, digits, _ and hyphens."""
     return re.sub(r"[^a-z0-9_]+", "-", name.lower()).strip("-")[:100] or "camera"
 
 

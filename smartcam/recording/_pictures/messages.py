@@ -23,7 +23,7 @@ from smartcam.recording._pictures.protobuf import (
     encode_field,
     encode_message,
     encode_timestamp,
-    file_set,
+    file_descriptor_set,
     parse_message,
     tag,
     varint,
@@ -80,7 +80,7 @@ _SMARTCAM_FIELDS: Final = {
     "result_number": WireField(114, "uint64"),
     "stride": WireField(115, "fixed32"),
     "result_received": WireField(116, "double"),
-    "annotations_from": WireField(117, "uint64"),
+    "annotations_number": WireField(117, "uint64"),
 }
 """smartcam's fields: attributes of a frame, pictures that the recorder left out before it, number
 and arrival of its result, and the number of the message in ``/CAMERA/annotations`` with its
@@ -127,7 +127,7 @@ def schema_of(picture: RecordedPicture) -> str:
 
 
 def check_readable(frame: Frame) -> None:
-    """Check that the message of a frame can be read again.
+    """Check that the message of a frame is within the bounds for reading.
 
     Raises:
         FrameFormatError: the message could not be read, and neither could the rest of the
@@ -155,15 +155,15 @@ def check_readable(frame: Frame) -> None:
     form.check(frame.data, frame.width, frame.height, frame.stride)
 
 
-def picture_message(picture: RecordedPicture, annotations_from: int | None = None) -> bytes:
+def picture_message(picture: RecordedPicture, annotations_number: int | None = None) -> bytes:
     """Return the message of a picture.
 
     Args:
         picture: the picture.
-        annotations_from: number of the message with its marks, which is right before it.
+        annotations_number: number of the message with its marks, which is right before it.
 
     Raises:
-        FrameFormatError: the message could not be read again.
+        FrameFormatError: the message exceeds the bounds for reading.
     """
     check_readable(picture.frame)
     frame, received = picture.frame, picture.result_received_at
@@ -188,7 +188,7 @@ def picture_message(picture: RecordedPicture, annotations_from: int | None = Non
         "result_number": picture.result_number,
         "stride": frame.stride,
         "result_received": received and received.timestamp(),
-        "annotations_from": annotations_from,
+        "annotations_number": annotations_number,
     }
     padding = b""
     if name == RAW:
@@ -201,7 +201,7 @@ def picture_message(picture: RecordedPicture, annotations_from: int | None = Non
         values["format"] = _COMPRESSIONS.get(frame.format.name, frame.format.name)
     fields = SCHEMAS[name]
     fields_bytes = encode_message(fields, values)
-    if frame.device_time == 0:  # a time, but 0 is left out of messages
+    if frame.device_time == 0:  # a valid time, but encoding leaves out zeros
         fields_bytes += encode_field(fields["device_time"], 0.0)
     fields_bytes += tag(fields["data"].number, BYTES) + varint(data.nbytes + len(padding))
     return b"".join((fields_bytes, data, padding))
@@ -213,7 +213,7 @@ def picture_message(picture: RecordedPicture, annotations_from: int | None = Non
 @cache
 def schema_data(name: str) -> bytes:
     """Return the schema of a message for MCAP: a FileDescriptorSet."""
-    return file_set(name, {name.partition(".")[2]: SCHEMAS[name]}, {})
+    return file_descriptor_set(name, {name.partition(".")[2]: SCHEMAS[name]}, {})
 
 
 # ---------------------------------------------------------------------- reading
@@ -237,7 +237,7 @@ def picture_of(
     fields = _Values(values)
     try:
         pixel_format = find_format(fields.text("pixel_format", 100))
-        marks = drawings if number and fields.integer("annotations_from") == number else ()
+        marks = drawings if number and fields.integer("annotations_number") == number else ()
         frame = _new_frame(fields, pixel_format, marks)
         pixel_format.check(frame.data, frame.width, frame.height, frame.stride)
         at = datetime.fromtimestamp(frame.utc, UTC)
@@ -253,7 +253,7 @@ def _new_frame(fields: _Values, pixel_format: PixelFormat, drawings: tuple[Drawi
     moment = fields.text("moment", 100)
     if moment not in Moment.__members__:
         raise ValueError(f"moment: {moment!r:.60} came, expected {', '.join(Moment.__members__)}")
-    duration = fields.real("duration", endless=True)
+    duration = fields.real("duration", allow_infinite=True)
     if duration < 0:
         raise ValueError(f"duration: {duration} came, expected 0 or more seconds")
     width, height = fields.side("picture_width"), fields.side("picture_height")
@@ -289,10 +289,10 @@ class _Values:
         data: memoryview = self._values.get("data", memoryview(b""))
         return data
 
-    def text(self, name: str, most: int) -> str:
+    def text(self, name: str, max_characters: int) -> str:
         text = self._values.get(name, memoryview(b""))
-        if len(text) > 4 * most:
-            raise ValueError(f"{name}: {len(text)} bytes, expected {4 * most} at most")
+        if len(text) > 4 * max_characters:
+            raise ValueError(f"{name}: {len(text)} bytes, expected {4 * max_characters} at most")
         return str(text, "utf-8")
 
     def integer(self, name: str) -> int:
@@ -305,9 +305,9 @@ class _Values:
             raise ValueError(f"{name}: {side} came, expected 1 to {MAX_SIDE_PX} pixels")
         return side
 
-    def real(self, name: str, *, endless: bool = False) -> float:
+    def real(self, name: str, *, allow_infinite: bool = False) -> float:
         number: float = self._values.get(name, 0.0)
-        if math.isnan(number) or (math.isinf(number) and not endless):
+        if math.isnan(number) or (math.isinf(number) and not allow_infinite):
             raise ValueError(f"{name}: {number} came, expected seconds")
         return number
 

@@ -101,13 +101,13 @@ def varint(value: int) -> bytes:
 # ---------------------------------------------------------------------- reading
 
 
-def parse_message(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
+def parse_message(fields: Fields, data: memoryview, max_fields: int) -> dict[str, Any]:
     """Return the values of a message's known fields; a repeated field has a list of them.
 
     Args:
         fields: the known fields; other fields are skipped.
         data: bytes of the message.
-        most: largest number of fields that the message may have.
+        max_fields: largest number of fields that the message may have.
 
     Raises:
         ValueError: the message is not valid, has too many fields, or a field of another type.
@@ -115,8 +115,8 @@ def parse_message(fields: Fields, data: memoryview, most: int) -> dict[str, Any]
     known = {field.number: (name, field) for name, field in fields.items()}
     values: dict[str, Any] = {}
     for count, (number, wire_type, value) in enumerate(_wire_fields(data)):
-        if count >= most:
-            raise ValueError(f"a message of more than {most} fields")
+        if count >= max_fields:
+            raise ValueError(f"a message of more than {max_fields} fields")
         name, field = known.get(number, ("", None))
         if field is None:
             continue
@@ -184,7 +184,7 @@ def _read_varint(data: memoryview, offset: int) -> tuple[int, int]:
 # ---------------------------------------------------------------------- schemas
 
 
-def file_set(
+def file_descriptor_set(
     name: str, messages: dict[str, Fields], enums: dict[str, dict[str, tuple[str, ...]]]
 ) -> bytes:
     """Return a message's schema in MCAP's form: a FileDescriptorSet.

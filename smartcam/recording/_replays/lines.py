@@ -207,7 +207,7 @@ def is_trigger(codec: LineCodec, line: bytes) -> bool:
 
 
 def line_text(codec: LineCodec, data: bytes) -> bytes:
-    """Return a client's line without its end, and without parts that differ each time."""
+    """Return a client's line without its end and without a ticket."""
     return codec.text(data).encode(codec.encoding, "replace")
 
 
@@ -237,17 +237,17 @@ class ReplayedLines(LineCamera):
         super().__init__(**{"name": recorded.name, **options})
         if recording.since is not None:
             raise ConfigurationError(
-                f"recording {recording.path}: camera {recorded.name!r} has a protocol of lines; "
-                "such a recording is played from its beginning, not from a time on"
+                f"recording {recording.path}: camera {recorded.name!r} has a protocol of text "
+                "lines; such a recording is played from its beginning, not from a time on"
             )
         self.plan: LinesPlan = plan_lines(recording.items(recorded.name), self.lines)
         if not self.plan.answers:
             raise ConfigurationError(
                 f"recording {recording.path}: it has no line to camera {recorded.name!r}"
             )
-        self._speed, self._loop = speed, loop
+        self._speed, self._repeats = speed, loop
         dialect = next(iter(self.protocol.dialects.values()))
-        self._at_once = isinstance(dialect, LineDialect) and dialect.at_once
+        self._accepts_lines_at_once = isinstance(dialect, LineDialect) and dialect.at_once
         self._on_over = None if loop else on_over
         self._line_counts: dict[LineClient, int] = {}
         self._trigger_count = 0  # number of triggers so far
@@ -265,7 +265,7 @@ class ReplayedLines(LineCamera):
         return super().make_client(link, server)
 
     def begun(self, client: LineClient, message: HeardLine) -> None:
-        """Keep the key of a client's line: its answer goes to the line of the same key."""
+        """Store the key of a client's line: the recorded answer with this key is sent to it."""
         if isinstance(client, TicketedClient):
             client.ticket = self.lines.request_key(message.data)
 
@@ -286,7 +286,7 @@ class ReplayedLines(LineCamera):
                 triggers += is_trigger(self.lines, line_text(self.lines, bytes.fromhex(item.hex)))
         images: dict[int, bytes] = {}
         size = 0
-        for result, picture, _ in recording.judged(camera):
+        for result, picture, _ in recording.results_with_pictures(camera):
             if picture is None:
                 continue
             answer = self._camera_class.image_answer(eight_bits(picture))
@@ -317,7 +317,7 @@ class ReplayedLines(LineCamera):
         )
 
     def begins_session(self, message: HeardLine) -> bool:
-        """Return True: an unrecorded line ends the connection."""
+        """Return True: any line begins the session, as one that was not recorded ends the link."""
         return True
 
     def greet(self, client: LineClient) -> None:
@@ -331,7 +331,7 @@ class ReplayedLines(LineCamera):
         """Answer a line with its recorded answer."""
         index = self._line_counts[client]
         self._line_counts[client] += 1
-        if self._at_once:
+        if self._accepts_lines_at_once:
             client = client.answer_later()
         data = line.encode(self.lines.encoding, "replace")
         answers = self.plan.secrets.get(index) or self.plan.answers.get(data)
@@ -341,17 +341,17 @@ class ReplayedLines(LineCamera):
         if answers is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")
             return
-        triggers = is_trigger(self.lines, data)
-        self._trigger_count += triggers
-        if triggers and not answers.remaining and not self._loop:
+        is_trigger_line = is_trigger(self.lines, data)
+        self._trigger_count += is_trigger_line
+        if is_trigger_line and not answers.remaining and not self._repeats:
             client.answer(None)
             return
         if index + 1 in self.plan.secrets:
             client.hide_next_line()
         pieces = self._answer_for(data, answers)
-        on_sent = self._on_answer_sent(client, is_trigger=triggers and bool(pieces))
+        on_sent = self._on_answer_sent(client, is_trigger=is_trigger_line and bool(pieces))
         self._send_pieces(client, pieces, on_sent)
-        if triggers and self._on_over is not None and not self.remaining:
+        if is_trigger_line and self._on_over is not None and not self.remaining:
             on_over, self._on_over = self._on_over, None
             on_over()
 
@@ -362,13 +362,13 @@ class ReplayedLines(LineCamera):
             or not self.plan.triggers
             or answers is not self.plan.answers.get(line)
         ):
-            return answers.next_answer(loop=self._loop)
+            return answers.next_answer(loop=self._repeats)
         return answers.next_answer_at(self._moment())
 
     def _moment(self) -> int:
         """Return the moment of the recording that is played, see :class:`LineAnswers`."""
         number = self._trigger_count
-        if self._loop and number:
+        if self._repeats and number:
             number = (number - 1) % self.plan.triggers + 1
         return 2 * number - (self._last_answered < self._trigger_count)
 

@@ -69,7 +69,7 @@ class ReplayedPictures:
 
     def source(self) -> FrameSource:
         """Return a source of the pictures, not open."""
-        return FrameSource(_ResultPictures(self), timeout=None, stall=None, linger=2.0)
+        return FrameSource(_ResultPictureDriver(self), timeout=None, stall=None, linger=2.0)
 
     def start_inspection(self) -> None:
         """Start an inspection now; its picture is not exposed earlier."""
@@ -105,7 +105,7 @@ def _pictures_by_result(
     """
     pictures: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
     size = 0
-    for result, picture, _ in recording.judged(camera):
+    for result, picture, _ in recording.results_with_pictures(camera):
         row = pictures.setdefault((result.application, result.raw), [])
         size += 0 if picture is None else memoryview(picture.data).nbytes
         if picture is None or size > MAX_REPLAY_BYTES:
@@ -142,8 +142,8 @@ def _counts_in_certain_order(
     }
 
 
-class _ResultPictures(FrameDriver):
-    """Delivers the picture of each result that a replay sends, beginning with the last one."""
+class _ResultPictureDriver(FrameDriver):
+    """Delivers the picture of each result that a replay sends; the last sent one's comes first."""
 
     sets_captured: ClassVar[bool] = True  # the frames already have their times of capture
 

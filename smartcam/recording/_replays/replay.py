@@ -50,7 +50,7 @@ MAX_SPEED = 1000.0
 """Largest factor of the speed; timers, which count milliseconds, are too coarse for more."""
 
 MIN_INSPECTION_TIME = 1e-6
-"""Shortest replayed inspection, seconds: its recorded run is chosen only after it has begun."""
+"""Duration, seconds, with which an inspection begins, until its recorded run is chosen."""
 
 FREE_RUN_RATE = 0.0001
 """Rate of a free-running application, per second; the replay itself sends its containers."""
@@ -64,7 +64,7 @@ class _PendingRuns:
     """A list of runs that is played once, or over and over."""
 
     _runs: list[RecordedRun]
-    _loop: bool
+    _repeats: bool
     _next_index: int = 0
 
     @property
@@ -81,7 +81,7 @@ class _PendingRuns:
         """Remove and return the next run."""
         run = self.next_run
         self._next_index += run is not None
-        if self._loop and self._next_index >= len(self._runs):
+        if self._repeats and self._next_index >= len(self._runs):
             self._next_index = 0
         return run
 
@@ -211,7 +211,7 @@ class ReplayedCamera(EmulatedCamera):
         on_over = None if on_over is None else check_callable(on_over, "on_over", "replay")
         self.plan: ReplayPlan = plan_replay(recording, camera)
         self.speed: float = speed
-        self._loop = loop
+        self._repeats = loop
         self._on_over = None if loop else on_over
         self._tracks = {
             number: _ApplicationTrack(
@@ -252,7 +252,7 @@ class ReplayedCamera(EmulatedCamera):
         self._armed_run: RecordedRun | None = None
         # application that may send without a trigger now
         self._free_application: int | None = None
-        self._gap_start = 0.0  # time from which the gap of the next untriggered run is counted
+        self._pause_start = 0.0  # time from which the pause before the next untriggered run counts
         self._run_timer: TimerHandle | None = None  # timer of the next untriggered run
         self._is_run_due = False  # whether an untriggered run should begin as soon as possible
         self._round_start: float | None = None  # time at which this round of changes began
@@ -363,7 +363,7 @@ class ReplayedCamera(EmulatedCamera):
         application = self.device.active_application if is_free else None
         if application != self._free_application:
             self._pause()
-            self._free_application, self._gap_start = application, self.clock.now
+            self._free_application, self._pause_start = application, self.clock.now
         run = track.untriggered.next_run
         if application is None or run is None:
             return
@@ -371,7 +371,7 @@ class ReplayedCamera(EmulatedCamera):
             self._begin_untriggered(track, run)
             run = track.untriggered.next_run
         if run is not None and self._run_timer is None and not self._is_run_due:
-            when = self._gap_start + run.gap / self.speed
+            when = self._pause_start + run.pause / self.speed
             self._run_timer = self.clock.call_at(max(when, self.clock.now), self._on_run_timer)
 
     def _begin_untriggered(self, track: _ApplicationTrack, run: RecordedRun) -> None:
@@ -384,7 +384,7 @@ class ReplayedCamera(EmulatedCamera):
         else:
             return  # the device accepts no trigger now; try later
         self._is_run_due = False
-        self._gap_start += (run.gap + run.seconds) / self.speed
+        self._pause_start += (run.pause + run.seconds) / self.speed
         track.untriggered.pop()
 
     def _on_run_timer(self) -> None:
@@ -406,7 +406,7 @@ class ReplayedCamera(EmulatedCamera):
         if self._round_start is None:
             self._round_start = self.clock.now
         changes = self.plan.changes
-        if self._change_count == len(changes) and self._loop and changes:
+        if self._change_count == len(changes) and self._repeats and changes:
             self._change_count = 0
             self._round_start += self.plan.seconds / self.speed
         if self._change_count < len(changes):
@@ -464,7 +464,7 @@ def replay(
 ) -> ReplayedCamera | ReplayedLines:
     """Return an emulated camera that replays a recording, for any protocol.
 
-    For a protocol of frames this is a :class:`ReplayedCamera`. With a protocol of lines the n-th
+    For bvs this is a :class:`ReplayedCamera`. With a protocol of text lines the n-th
     trigger gets the n-th recorded answer, after the same time, and other lines get the recorded
     answer of that moment. Of a fleet's camera, which has no recorded frames, results are replayed.
 
@@ -498,7 +498,7 @@ def replay(
         return ReplayedCamera(recording, **common, **options)
     raise ConfigurationError(
         f"recording {recording.path}: cameras of {recorded.protocol} cannot be replayed; "
-        "cameras with protocols of lines, and of bvs, can"
+        "cameras with a protocol of text lines, and of bvs, can"
     )
 
 

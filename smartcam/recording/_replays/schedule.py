@@ -1,4 +1,4 @@
-"""Plan a replay from a recording's frames, or from its results without frames; no I/O.
+"""Plan a replay from recorded protocol messages, or without these from results; no I/O.
 
 A container belongs to the oldest trigger without a container. Other containers have no trigger of
 the client: they come from the digital input, if the application waits for triggers, or from a free
@@ -60,7 +60,7 @@ class RecordedRun:
     seconds: float
     # seconds from the end of the run before, or from when the camera began to run, to this run;
     # only for a run without a trigger
-    gap: float = 0.0
+    pause: float = 0.0
     drops: int = 0  # triggers that the camera dropped before this run
 
 
@@ -69,10 +69,9 @@ class ApplicationRuns:
     """The recorded inspections of an application, in order."""
 
     application: int
-    triggered: list[RecordedRun] = field(
-        default_factory=list[RecordedRun]
-    )  # runs that a client triggered
-    untriggered: list[RecordedRun] = field(default_factory=list[RecordedRun])  # the others
+    # runs that a client triggered, and the others
+    triggered: list[RecordedRun] = field(default_factory=list[RecordedRun])
+    untriggered: list[RecordedRun] = field(default_factory=list[RecordedRun])
     waits: bool = True  # whether the application waits for triggers; otherwise it runs free
     load_time: float | None = None  # seconds of a switch to it; None if none was recorded
 
@@ -95,7 +94,7 @@ class ReplayPlan:
     transport: Literal["tcp", "udp"]
     applications: Mapping[int, ApplicationRuns]  # runs of each application, by id; never empty
     active: int  # id of the application of the first container
-    running: bool  # whether the camera ran
+    running: bool  # whether the emulated camera begins in run mode
     endian: int  # the status message's endian field
     conditions: Status  # conditions at first
     changes: tuple[Change, ...]  # later changes of conditions, in order
@@ -112,10 +111,10 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     recorded = recording.camera(camera)
     dialect, transport = _dialect_of(recording, recorded)
     items = recording.all_items(recorded.name)
-    if is_fleet(recorded.url) or recorded.facts.get("frames") == "no":
-        steps = _steps_without_frames(items, recorded.facts.get("endian", "0"))
+    if is_fleet(recorded.url) or recorded.metadata.get("frames") == "no":
+        steps = _steps_without_frames(items, recorded.metadata.get("endian", "0"))
         free_running = _free_running(steps)
-        steps = _without_single_statuses(steps, free_running)
+        steps = _with_steady_statuses(steps, free_running)
     else:
         steps = list(_steps_of_frames(items, dialect))
         free_running = _free_running(steps)
@@ -175,15 +174,15 @@ def _dialect_of(
         if dialect is None:
             raise ConfigurationError(
                 f"recording {recording.path}: camera {camera.name!r} of a fleet speaks dialect "
-                f"{camera.dialect}, expected one of bvs; the recording has no lines of it that "
-                "could be played"
+                f"{camera.dialect}, expected one of bvs; the recording has none of its "
+                "messages to replay"
             )
         return dialect, "tcp"
     address = parse_address(camera.url)
     if address.protocol != "bvs" or address.dialect is None:
         raise ConfigurationError(
             f"recording {recording.path}: camera {camera.name!r} speaks {address.protocol}, not "
-            "bvs; use smartcam.recording.replay(), which also plays protocols of lines"
+            "bvs; use smartcam.recording.replay(), which also plays protocols of text lines"
         )
     protocol = cast("Protocol", PROTOCOLS.load("bvs"))
     dialect = cast("FramedDialect", protocol.dialects[address.dialect])
@@ -357,7 +356,7 @@ def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) ->
     return _on_one_clock(steps)
 
 
-_BY_AGENT = {_StepKind.TRIGGER, _StepKind.ABORT, _StepKind.CONTAINER}
+_ON_AGENT_CLOCK = {_StepKind.TRIGGER, _StepKind.ABORT, _StepKind.CONTAINER}
 
 
 def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
@@ -365,31 +364,32 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
 
     The times of results are on the agent's clock, the times of other events on the program's.
     """
-    least, most = -math.inf, math.inf  # bounds of the difference between the clocks
-    by_program, by_agent = -math.inf, -math.inf  # time of the last step on each clock
+    min_offset, max_offset = -math.inf, math.inf  # bounds of the difference between the clocks
+    last_by_program, last_by_agent = -math.inf, -math.inf  # time of the last step on each clock
     for step in steps:
         if step.kind is _StepKind.CONTAINER:
-            by_agent = step.at
-            least = max(least, by_program - by_agent)
-        elif step.kind not in _BY_AGENT:
-            by_program = step.at
-            most = min(most, by_program - by_agent)
-    # a status follows most results at once
-    offset = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
+            last_by_agent = step.at
+            min_offset = max(min_offset, last_by_program - last_by_agent)
+        elif step.kind not in _ON_AGENT_CLOCK:
+            last_by_program = step.at
+            max_offset = min(max_offset, last_by_program - last_by_agent)
+    # usually a status follows a result at once, so the upper bound is the better estimate
+    nearest = max_offset if min_offset <= max_offset < math.inf else min_offset
+    offset = 0.0 if min_offset <= 0 <= max_offset else nearest
     fitted: list[_ReplayStep] = []
     last = -math.inf
     for step in steps:
-        at = step.at + offset if step.kind in _BY_AGENT else step.at
+        at = step.at + offset if step.kind in _ON_AGENT_CLOCK else step.at
         if step.kind is not _StepKind.TRIGGER:
             at = last = max(at, last)
         fitted.append(step._replace(at=at, recorded_at=step.at))
     return fitted
 
 
-def _without_single_statuses(
+def _with_steady_statuses(
     steps: Iterable[_ReplayStep], free_running: set[int]
 ) -> list[_ReplayStep]:
-    """Return steps without statuses of single inspections, whose times are too coarse."""
+    """Replace the bits that change with each inspection, since their times are too coarse."""
     adjusted: list[_ReplayStep] = []
     active: int | None = None
     for step in steps:
@@ -473,7 +473,7 @@ class _ScheduleMaker:
         self._open_run: RecordedRun | None = None  # run whose inspection may send more containers
         self._open_run_at = 0.0  # time of the first container of that run
         self._untriggered_start: float | None = None  # start of an inspection without a trigger
-        self._gap_start = 0.0  # time from which the gap of the next untriggered run is counted
+        self._pause_start = 0.0  # time from which the pause before the next untriggered run counts
         # time of the last request to switch, and the id of the requested application
         self._switching: tuple[float, int] | None = None
         self._handlers: Mapping[_StepKind, Callable[[_ReplayStep], None]] = {
@@ -501,7 +501,7 @@ class _ScheduleMaker:
 
     def _on_connected(self, _: _ReplayStep) -> None:
         if self.session_start is None:
-            self.session_start = self._gap_start = self.last_time
+            self.session_start = self._pause_start = self.last_time
         self._session_status = None
 
     def _on_lost(self, _: _ReplayStep) -> None:
@@ -516,7 +516,7 @@ class _ScheduleMaker:
         if self.first_application is None:
             self.endian = step.number
         if Status.RUNNING in risen:
-            self._gap_start = self.last_time
+            self._pause_start = self.last_time
         if Status.WAITING_FOR_TRIGGER in fallen:
             self._waited_until = self.last_time
         if Status.OVERTRIGGERED in risen and self._triggers:
@@ -573,7 +573,8 @@ class _ScheduleMaker:
         runs = self._runs_of(step.number)
         if not runs.waits:
             self._triggers.clear()  # a free-running application ignores them
-            runs.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.last_time)))
+            pause = self._pause(self.last_time)
+            runs.untriggered.append(RecordedRun([step.data], 0.0, pause=pause))
         elif self._triggers:
             start = self._triggers.pop(0)
             self._open_run = RecordedRun([step.data], self.last_time - start, drops=self._drops)
@@ -584,7 +585,7 @@ class _ScheduleMaker:
         else:
             start_seen = self._untriggered_start is not None or not self._waits_for_trigger
             start = self.last_time if self._untriggered_start is None else self._untriggered_start
-            run = RecordedRun([step.data], self.last_time - start, gap=self._gap(start))
+            run = RecordedRun([step.data], self.last_time - start, pause=self._pause(start))
             runs.untriggered.append(run)
             self._open_run = run if start_seen else None
         if self._open_run is not None and len(self._open_run.containers) == 1:
@@ -604,11 +605,11 @@ class _ScheduleMaker:
 
     # ------------------------------------------------------------------ helper methods
 
-    def _gap(self, start: float) -> float:
-        """Return the gap before an untriggered run; the next gap is counted from now on."""
-        gap = max(0.0, start - self._gap_start)
-        self._gap_start = self.last_time
-        return gap
+    def _pause(self, start: float) -> float:
+        """Return the pause before an untriggered run; the next pause counts from now on."""
+        pause = max(0.0, start - self._pause_start)
+        self._pause_start = self.last_time
+        return pause
 
     def _end_inspection(self) -> None:
         """End the running inspection, whose trigger has no result."""

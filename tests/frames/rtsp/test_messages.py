@@ -105,7 +105,7 @@ def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
             413,
             "Content-Length",
         ),
-        (b"OPTIONS * RTSP/1.0\r\n" + b"A: b\r\n" * messages.MAX_LINE_BYTES, 400, "a: expected 4096"),
+        (b"OPTIONS * RTSP/1.0\r\n" + b"A: b\r\n" * messages.MAX_LINE_BYTES, 400, "a: expected"),
         (b"A" * (messages.MAX_LINE_BYTES + 1), 400, "a line"),
         (b"A" * (messages.MAX_LINE_BYTES + 1) + b"\n", 400, "a line"),
         (

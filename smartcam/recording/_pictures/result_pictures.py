@@ -1,4 +1,4 @@
-"""Record the pictures of a shared camera's results."""
+"""Record the pictures of a camera's results, which come from a source of frames."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from smartcam.frames._inside import FrameTap
 from smartcam.observers import Observer
-from smartcam.recording._judged import PictureMatcher
 from smartcam.recording._mcap.form import RecordedPicture, captured_at
+from smartcam.recording._picture_matching import PictureMatcher
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,7 +29,7 @@ LAST_PICTURE_TIMEOUT: Final = 2.0
 """Seconds to wait for the last result's picture at the end of the recording."""
 
 
-class JudgedPictures(Observer):
+class ResultPictures(Observer):
     """Adds the picture of each result to a recording, if it can be found by its time.
 
     This observer gets the results of a camera; the camera's pictures come from a source of frames.

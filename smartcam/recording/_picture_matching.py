@@ -27,7 +27,7 @@ MAX_RESULTS: Final = 1000
 """Largest number of results of a camera that wait for their pictures."""
 
 
-class JudgedResult(NamedTuple):
+class ResultWithPicture(NamedTuple):
     """A result and its picture.
 
     Attributes:
@@ -43,7 +43,7 @@ class JudgedResult(NamedTuple):
     linked: bool
 
 
-def match_pictures(items: Iterable[Item]) -> Iterator[JudgedResult]:
+def match_pictures(items: Iterable[Item]) -> Iterator[ResultWithPicture]:
     """Yield each result with its picture, as soon as no later picture can belong to the result."""
     matchers: dict[str, PictureMatcher] = {}
     for item in items:
@@ -94,7 +94,7 @@ class PictureMatcher:
                 )
             too_many = False
 
-    def take_matched(self, *, at_end: bool = False) -> Iterator[JudgedResult]:
+    def take_matched(self, *, at_end: bool = False) -> Iterator[ResultWithPicture]:
         """Remove and yield the results whose picture is known, or can no longer come.
 
         Args:
@@ -104,24 +104,24 @@ class PictureMatcher:
             result = self.results[0]
             recorded = self._linked_picture(result)
             linked = recorded is not None
-            if not (linked or at_end or self._must_not_wait(result)):
+            if not (linked or at_end or self._need_not_wait(result)):
                 return
             self.results.popleft()
             picture = self._picture_by_time(result) if recorded is None else recorded.frame
-            yield JudgedResult(result, picture, linked)
+            yield ResultWithPicture(result, picture, linked)
 
-    def take_matched_by_time(self) -> Iterator[JudgedResult]:
+    def take_matched_by_time(self) -> Iterator[ResultWithPicture]:
         """Remove and yield the results whose picture is found by its time or can no longer come."""
         while self.results:
             result = self.results[0]
             picture = self._picture_by_time(result)
             can_be_found = result.triggered_at is not None
-            if picture is None and can_be_found and not self._must_not_wait(result):
+            if picture is None and can_be_found and not self._need_not_wait(result):
                 return
             self.results.popleft()
-            yield JudgedResult(result, picture, False)
+            yield ResultWithPicture(result, picture, False)
 
-    def _must_not_wait(self, result: Result[Any]) -> bool:
+    def _need_not_wait(self, result: Result[Any]) -> bool:
         """Return True if a later picture has come, or too many results wait."""
         return (
             self._latest_capture > result.received_at.timestamp() or len(self.results) > MAX_RESULTS
@@ -130,10 +130,7 @@ class PictureMatcher:
     def _linked_picture(self, result: Result[Any]) -> RecordedPicture | None:
         key = result.number, result.received_at
         pictures = reversed(self._pictures)
-        return next(
-            (picture for picture in pictures if _result_key(picture) == key),
-            None,
-        )
+        return next((picture for picture in pictures if _result_key(picture) == key), None)
 
     def _picture_by_time(self, result: Result[Any]) -> Frame | None:
         if result.triggered_at is None:  # the duration of the inspection is unknown

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.models import CameraEvent, Connected, Reconnected
 from smartcam.recording._mcap.form import GAP, RecordedError
-from smartcam.recording._recorder import Description, address_facts
+from smartcam.recording._recorder import Description, address_metadata
 from smartcam.recording._state import RecordedState
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Gap:
         return RecordedError(camera, self.until, GAP, text, None, self.since, self.count)
 
 
-class CameraTrack:
+class CameraRecording:
     """The recording of one camera.
 
     Args:
@@ -69,7 +69,7 @@ class CameraTrack:
 
     Attributes:
         endian: byte order of the last status.
-        offered: entries so far.
+        offered: entries so far; an entry gives one record, or several.
         left_out: entries that were left out: too much waited for the disk, or they were too large.
         written: records on the disk.
         lost: records that waited and could not be written.
@@ -85,7 +85,7 @@ class CameraTrack:
         self.overflow: Gap | None = None
         self.state = RecordedState(camera)
         self.endian = 0
-        self.facts: dict[str, str] = {"camera": camera}
+        self.metadata: dict[str, str] = {"camera": camera}
         self.gap: Gap | None = None  # gap that is not on the disk yet
         self.gap_written = False  # whether the gap is in the file's next chunk
         self.file: RecordingFile | None = None
@@ -102,7 +102,7 @@ class CameraTrack:
         """Count entries that are not written; update the camera's state from them."""
         for entry in entries:
             if isinstance(entry, Description):
-                self.facts |= entry.facts
+                self.metadata |= entry.metadata
             elif isinstance(entry, Gap):
                 self._extend_gap(entry)  # the gap's records are already counted
                 self.update_state_from_gap(entry)
@@ -121,7 +121,7 @@ class CameraTrack:
         if isinstance(entry, CameraEvent):
             self.state = self.state.after(entry)
         if isinstance(entry, (Connected, Reconnected)):
-            self.facts |= address_facts(entry.url)
+            self.metadata |= address_metadata(entry.url)
 
     def update_state_from_gap(self, gap: Gap) -> None:
         """Update the camera's state from the events of a gap."""
