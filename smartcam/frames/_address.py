@@ -111,18 +111,18 @@ class FrameAddress:
             raise self.wrong("size", "WIDTHxHEIGHT, such as 640x480", text)
         return int(match[1]), int(match[2])
 
-    def number(self, name: str, text: str, least: float, most: float) -> float:
+    def number(self, name: str, text: str, minimum: float, maximum: float) -> float:
         """Return a parameter's number.
 
         Raises:
-            ConfigurationError: the value is not valid, or not from ``least`` to ``most``.
+            ConfigurationError: the value is not valid, or not from ``minimum`` to ``maximum``.
         """
         try:
             value = float(text)
         except ValueError:
             value = float("nan")
-        if not least <= value <= most:
-            raise self.wrong(name, f"a number from {least:g} to {most:g}", text)
+        if not minimum <= value <= maximum:
+            raise self.wrong(name, f"a number from {minimum:g} to {maximum:g}", text)
         return value
 
     def wrong(self, name: str, expected: str, actual: str) -> ConfigurationError:

@@ -17,8 +17,7 @@ MIN_EARLY_JUMP_SECONDS: Final = 0.05
 camera's clock jumped."""
 
 MIN_INTERVALS_FOR_JUMP: Final = 4
-"""Number of intervals after which an early frame proves a jump; until then, all frames that have
-come may have been late."""
+"""Number of intervals after which an early frame proves a jump; with fewer, all may be late."""
 
 MIN_DRIFT_DURATION: Final = 4.0
 """Least duration of frames, seconds, to measure a drift."""

@@ -102,8 +102,7 @@ class FrameDriver(ABC):
         sets_captured: whether the driver sets ``captured`` on the host's clock for all its frames;
             else the source computes ``captured`` of frames with a ``device_time``.
         lists_features: whether the device can list its features.
-        changed_format: format of the stream after a feature changed it; None: as :meth:`open`
-            returned it.
+        changed_format: format of the stream after a feature changed it; None: as at the opening.
         awaited_condition: condition that the device awaits before each picture, for error texts,
             such as ``TriggerSource is Line1``; ``""``: the device streams freely. A device that
             awaits a condition is never considered stuck.

@@ -39,10 +39,9 @@ class InSightDriver(FrameDriver):
     - ``name``: name of the source; by default host and port.
 
     The camera does not report when a picture was taken, or whether it is new. A picture with the
-    same bytes as the last is not returned again. If the camera may wait long for a trigger, open
-    the source with ``stall=None``, so that it does not count as stuck. ``captured`` is the arrival
-    of a frame, and ``duration`` the time since the previous request; the first frame's duration is
-    infinite.
+    same bytes as the last is not returned again, and a source without new pictures counts as stuck:
+    use ``stall=None`` if the camera may wait long for a trigger. ``captured`` is the arrival of a
+    frame, and ``duration`` the time since the previous request, infinite for the first frame.
     """
 
     def __init__(self, address: FrameAddress) -> None:

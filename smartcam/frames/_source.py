@@ -539,9 +539,8 @@ class FrameSource(FrameSink):
                 ):
                     return
             elif self._stall is None or self._driver.awaited_condition:
-                await self._wait_until(
-                    partial(self._must_check_again, self._driver.awaited_condition)
-                )
+                condition = self._driver.awaited_condition
+                await self._wait_until(partial(self._must_check_again, condition))
                 self._last_arrival = asyncio.get_running_loop().time()
             else:
                 remaining = self._last_arrival + self._stall - asyncio.get_running_loop().time()

@@ -726,7 +726,7 @@ PARSERS: tuple[Parser, ...] = (
     ),
     Parser(
         "GenICam: formulas",
-        lambda text: _expressions.evaluate(text, {}, as_integers=True),
+        lambda text: _expressions.evaluate(text, {}, integers=True),
         _FORMULAS,
         _expressions.MAX_FORMULA_CHARACTERS,
         "frames._gige.expressions.MAX_FORMULA_CHARACTERS",

@@ -141,7 +141,7 @@ async def test_stream_without_parts_is_left_to_ffmpeg() -> None:
     ("fragment", "error", "message"),
     [
         ("#format=H264", FrameSourceError, "expected H264, got MJPEG"),
-        ("#fps=3", ConfigurationError, "a recording, as live streams have no fps"),
+        ("#fps=3", ConfigurationError, "expected a recording"),
     ],
 )
 async def test_unsupported_options_of_a_stream_of_parts_are_errors(

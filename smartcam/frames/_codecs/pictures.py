@@ -209,12 +209,10 @@ def _decode_lossless(frame: Frame, format_name: str, size: tuple[int, int], deco
     return with_pixels(frame, pixels[..., ::-1] if wanted.name == "BGR8" else pixels, wanted.name)
 
 
-def _format_of_samples(format_name: str, pixels: NDArray[Any]) -> PixelFormat | None:
+def _format_of_samples(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
     """Return the named format, or the default one; None if the pixels do not fit it."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    wanted = find_format(
-        format_name or _DEFAULT_FORMATS.get((channels, pixels.dtype.itemsize), "RGB8")
-    )
+    wanted = find_format(name or _DEFAULT_FORMATS.get((channels, pixels.dtype.itemsize), "RGB8"))
     layout = wanted.layout
     if not isinstance(layout, SampleLayout) or layout.packing is not None:
         return None

@@ -163,8 +163,8 @@ class Block:
         if not (0 < packet < end and 0 < size <= self.full_bytes):
             return False
         if size < self.full_bytes:
-            least = self.highest_packet if self.trailer_packet is None else self.trailer_packet - 1
-            if self.short_packet not in (None, packet) or packet < least:
+            lowest = self.highest_packet if self.trailer_packet is None else self.trailer_packet - 1
+            if self.short_packet not in (None, packet) or packet < lowest:
                 return False  # only the last packet may be short
             self.short_packet, self.last_size = packet, size
         elif self.short_packet is not None and packet > self.short_packet:

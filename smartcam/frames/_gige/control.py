@@ -154,12 +154,8 @@ class ControlChannel(asyncio.DatagramProtocol):
             data = words[: address - begin] + data + words[address - begin + len(data) :]
         for offset in range(begin, end, MAX_BYTES_PER_REQUEST):
             chunk = data[offset - begin :][:MAX_BYTES_PER_REQUEST]
-            await self.request(
-                GvcpCommand.WRITEMEM,
-                writemem_payload(offset, chunk),
-                0,
-                f"{offset:#06x}, {len(chunk)}",
-            )
+            payload, subject = writemem_payload(offset, chunk), f"{offset:#06x}, {len(chunk)}"
+            await self.request(GvcpCommand.WRITEMEM, payload, 0, subject)
 
     def request_resend(self, packets: Resend) -> None:
         """Request packets again; the camera sends the packets, but no other answer."""
@@ -174,14 +170,14 @@ class ControlChannel(asyncio.DatagramProtocol):
             self._transport.sendto(data)
 
     async def request(
-        self, command: GvcpCommand, payload: bytes, least: int, subject: str
+        self, command: GvcpCommand, payload: bytes, min_size: int, subject: str
     ) -> bytes:
         """Send a request and return the payload of the answer.
 
         Args:
             command: command of the request.
             payload: payload of the request.
-            least: least number of bytes of the answer's payload.
+            min_size: smallest number of bytes of the answer's payload.
             subject: subject of the request, for errors.
 
         Raises:
@@ -198,7 +194,7 @@ class ControlChannel(asyncio.DatagramProtocol):
                 for _ in range(MAX_ATTEMPTS):
                     ack = await self._send_once(datagram, command, subject)
                     if ack is not None:
-                        return self._checked_payload(ack, command, least, subject)
+                        return self._check_payload(ack, command, min_size, subject)
             finally:
                 self._expected_id = 0
                 self._drop_answers()
@@ -232,7 +228,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         except TimeoutError:
             return None
 
-    def _checked_payload(self, ack: Ack, command: GvcpCommand, least: int, subject: str) -> bytes:
+    def _check_payload(self, ack: Ack, command: GvcpCommand, min_size: int, subject: str) -> bytes:
         if ack.status != GvcpStatus.SUCCESS:
             raise RequestRefusedError(
                 f"{self.source}: {command.name} {subject}: the camera answers "
@@ -240,10 +236,10 @@ class ControlChannel(asyncio.DatagramProtocol):
                 source=self.source,
                 status=ack.status,
             )
-        if ack.command != command + 1 or len(ack.payload) < least:
+        if ack.command != command + 1 or len(ack.payload) < min_size:
             raise FrameSourceError(
                 f"{self.source}: {command.name} {subject}: expected an answer {command + 1:#06x} "
-                f"of {least} bytes, got {ack.command:#06x} of {len(ack.payload)}",
+                f"of {min_size} bytes, got {ack.command:#06x} of {len(ack.payload)}",
                 source=self.source,
             )
         return ack.payload

@@ -165,7 +165,7 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
 _CONSTANTS: Final = {"E": math.e, "PI": math.pi}
 
 
-def evaluate(formula: str, variables: Mapping[str, Number], *, as_integers: bool) -> Number:
+def evaluate(formula: str, variables: Mapping[str, Number], *, integers: bool) -> Number:
     """Evaluate a formula.
 
     EMVA's GenApi, with which makers test their descriptions, gives operators another precedence
@@ -175,16 +175,16 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, as_integers: bool
     Args:
         formula: text of the formula in the description.
         variables: value of each name in it.
-        as_integers: whether all numbers are integers, as in an ``IntSwissKnife``.
+        integers: whether all numbers are integers, as in an ``IntSwissKnife``.
 
     Raises:
         MessageError: the formula is not valid, has an unknown name, or has no value: it divides by
             zero, a number exceeds its bounds, or the two readings give different values.
     """
     tree, emva_tree = _parse_both_ways(formula)
-    value = _evaluate_tree(formula, tree, variables, as_integers)
+    value = _evaluate_tree(formula, tree, variables, integers)
     if emva_tree != tree:
-        second = _evaluate_tree(formula, emva_tree, variables, as_integers)
+        second = _evaluate_tree(formula, emva_tree, variables, integers)
         if second != value:
             raise MessageError(
                 f"formula {formula[:80]!r}: expected one value, got {value:g} in C's order of "
@@ -194,10 +194,10 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, as_integers: bool
 
 
 def _evaluate_tree(
-    formula: str, tree: Tree, variables: Mapping[str, Number], as_integers: bool
+    formula: str, tree: Tree, variables: Mapping[str, Number], integers: bool
 ) -> Number:
     try:
-        value = _value(tree, variables, as_integers)
+        value = _value(tree, variables, integers)
         if not math.isfinite(value):
             raise OverflowError("not a finite number")
     except RecursionError as exc:
@@ -207,7 +207,7 @@ def _evaluate_tree(
     return value
 
 
-def _value(tree: Tree, variables: Mapping[str, Number], as_integers: bool) -> Number:
+def _value(tree: Tree, variables: Mapping[str, Number], integers: bool) -> Number:
     if isinstance(tree, str):
         value = variables.get(tree, _CONSTANTS.get(tree))
         if value is None:
@@ -215,31 +215,29 @@ def _value(tree: Tree, variables: Mapping[str, Number], as_integers: bool) -> Nu
                 f"formula: unknown name {tree[:80]!r}; known are "
                 f"{', '.join([*variables][:MAX_NAMES_SHOWN]) or 'none'}"
             )
-        return _to_number_type(value, as_integers)
+        return _to_number_type(value, integers)
     if not isinstance(tree, tuple):
-        return _to_number_type(tree, as_integers)
+        return _to_number_type(tree, integers)
     symbol, operands = tree
     if symbol == "?":
         return _value(
-            operands[1 if _value(operands[0], variables, as_integers) else 2],
-            variables,
-            as_integers,
+            operands[1 if _value(operands[0], variables, integers) else 2], variables, integers
         )
-    first = _value(operands[0], variables, as_integers)
+    first = _value(operands[0], variables, integers)
     if symbol in ("||", "&&"):
         if bool(first) == (symbol == "||"):
             return int(bool(first))
-        return int(bool(_value(operands[1], variables, as_integers)))
-    values = [first, *(_value(operand, variables, as_integers) for operand in operands[1:])]
+        return int(bool(_value(operands[1], variables, integers)))
+    values = [first, *(_value(operand, variables, integers) for operand in operands[1:])]
     if symbol in _FUNCTIONS:
-        return _to_number_type(_FUNCTIONS[symbol][1](*values), as_integers)
+        return _to_number_type(_FUNCTIONS[symbol][1](*values), integers)
     return _to_number_type(
-        _UNARY[symbol](*values) if len(values) == 1 else _BINARY[symbol](*values), as_integers
+        _UNARY[symbol](*values) if len(values) == 1 else _BINARY[symbol](*values), integers
     )
 
 
-def _to_number_type(value: Number, as_integers: bool) -> Number:
-    return _wrap_to_64_bits(value) if as_integers else float(value)
+def _to_number_type(value: Number, integers: bool) -> Number:
+    return _wrap_to_64_bits(value) if integers else float(value)
 
 
 @functools.lru_cache(maxsize=1024)

@@ -328,16 +328,16 @@ class GenicamFeatures:
         return number
 
     async def _check_range(self, node: Element, number: float) -> None:
-        least = await self._number_field(node, "Min", 0, -math.inf)
-        most = await self._number_field(node, "Max", 0, math.inf)
+        minimum = await self._number_field(node, "Min", 0, -math.inf)
+        maximum = await self._number_field(node, "Max", 0, math.inf)
         step = await self._number_field(node, "Inc", 0, 0) if node.kind == "Integer" else 0
-        wrong_step = step > 1 and math.isfinite(least) and (number - least) % step
-        if not least <= number <= most or wrong_step:
+        wrong_step = step > 1 and math.isfinite(minimum) and (number - minimum) % step
+        if not minimum <= number <= maximum or wrong_step:
             steps = f" in steps of {step:g}" if step > 1 else ""
             raise self._feature_error(
                 node.name,
-                f"expected {least:g} to {most:g}{steps}, got {number:g}",
-                (f"{least:g} to {most:g}{steps}",),
+                f"expected {minimum:g} to {maximum:g}{steps}, got {number:g}",
+                (f"{minimum:g} to {maximum:g}{steps}",),
             )
 
     # values
@@ -369,9 +369,7 @@ class GenicamFeatures:
         """Count a visited node; raise MessageError beyond the limits of depth and number."""
         self._visited_nodes += 1
         if depth > MAX_LINKED_NODES or self._visited_nodes > MAX_NODES_VISITED:
-            raise MessageError(
-                f"node {node.name}: its value depends on itself, or on too many nodes"
-            )
+            raise MessageError(f"node {node.name}: it depends on itself, or on too many nodes")
         self._count_elements(node, len(node.children))
 
     def _count_elements(self, node: Element, work: int) -> None:
@@ -458,7 +456,7 @@ class GenicamFeatures:
         self, node: Element, formula: str, variables: dict[str, int | float], depth: int
     ) -> int | float:
         """Evaluate a formula with the node's variables."""
-        as_integers = node.kind.startswith("Int")
+        integers = node.kind.startswith("Int")
         self._count_elements(node, len(formula))
         for child in node.children:
             if child.kind == "pVariable":
@@ -467,8 +465,8 @@ class GenicamFeatures:
                 variables[child.name] = _number(child.text)
             elif child.kind == "Expression":
                 self._count_elements(node, len(child.text))
-                variables[child.name] = evaluate(child.text, variables, as_integers=as_integers)
-        return evaluate(formula, variables, as_integers=as_integers)
+                variables[child.name] = evaluate(child.text, variables, integers=integers)
+        return evaluate(formula, variables, integers=integers)
 
     async def _variable(self, variable: Element, depth: int) -> int | float:
         """Return the value of a formula's variable: of its node, or of the node's ``.NAME``."""
@@ -704,8 +702,8 @@ class GenicamFeatures:
         else:
             number = round(value)
             shift, bits = _bit_range(node, length)
-            least = -(1 << bits - 1) if _is_signed(node) else 0
-            if not least <= number < least + (1 << bits):
+            minimum = -(1 << bits - 1) if _is_signed(node) else 0
+            if not minimum <= number < minimum + (1 << bits):
                 raise MessageError(f"{number} does not fit into {bits} bits")
             order = _byte_order(node)
             if bits < 8 * length:

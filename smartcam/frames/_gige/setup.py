@@ -202,12 +202,12 @@ async def read_shape(session: GigESession) -> StreamShape:
         int(await features.number("Width") or 0),
         int(await features.number("Height") or 0),
     )
-    least = (width * height * bits_of(number) + 7) // 8
-    payload = int(await features.number("PayloadSize") or least)
-    if not 0 < least <= payload <= MAX_FRAME_BYTES:
+    min_bytes = (width * height * bits_of(number) + 7) // 8
+    payload = int(await features.number("PayloadSize") or min_bytes)
+    if not 0 < min_bytes <= payload <= MAX_FRAME_BYTES:
         raise FrameSourceError(
-            f"{session.label}: expected a PayloadSize of {least} to {MAX_FRAME_BYTES} bytes for "
-            f"{width}x{height} pixels of {entry}, got {payload}",
+            f"{session.label}: expected a PayloadSize of {min_bytes} to {MAX_FRAME_BYTES} bytes "
+            f"for {width}x{height} pixels of {entry}, got {payload}",
             source=session.label,
         )
     rate = await _first_number(features, _RATES)

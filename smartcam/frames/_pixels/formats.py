@@ -64,7 +64,7 @@ class PixelFormat:
 
     def stride(self, width: int) -> int:
         """Return the bytes of a row without padding; 0: the format is compressed."""
-        return self.layout.least_stride(width)
+        return self.layout.min_stride(width)
 
     def size(self, width: int, height: int, stride: int | None = None) -> int:
         """Return the bytes of a picture; 0: the format is compressed.
@@ -138,16 +138,11 @@ def _pairs(name: str, fourcc: str, code: int, y: int, matrix: str) -> PixelForma
 
 
 def _planes(
-    name: str, fourcc: str, chroma_columns: int, chroma_rows: int, matrix: str, depth: int = 8
+    name: str, fourcc: str, chroma_x: int, chroma_y: int, matrix: str, depth: int = 8
 ) -> PixelFormat:
     """Return a format of planes; U and V are interleaved if its name begins with NV."""
-    layout = Planes(chroma_columns, chroma_rows, name.startswith("NV"), matrix, depth)
-    bits = (
-        8
-        * layout.sample_bytes
-        * (chroma_columns * chroma_rows + 2)
-        // (chroma_columns * chroma_rows)
-    )
+    layout = Planes(chroma_x, chroma_y, name.startswith("NV"), matrix, depth)
+    bits = 8 * layout.sample_bytes * (chroma_x * chroma_y + 2) // (chroma_x * chroma_y)
     return PixelFormat(name, fourcc, bits, 0, depth, layout=layout)
 
 
@@ -223,8 +218,8 @@ PIXEL_FORMATS: Final = (
         for suffix, matrix in _MATRIX_SUFFIXES[3:]
     ),
     *(
-        _planes(f"{name}{suffix}", "" if suffix else fourcc, chroma_columns, chroma_rows, matrix)
-        for name, fourcc, chroma_columns, chroma_rows in (
+        _planes(f"{name}{suffix}", "" if suffix else fourcc, chroma_x, chroma_y, matrix)
+        for name, fourcc, chroma_x, chroma_y in (
             ("NV12", "NV12", 2, 2),
             ("I420", "YU12", 2, 2),
             ("I422", "422P", 2, 1),
@@ -233,8 +228,8 @@ PIXEL_FORMATS: Final = (
         for suffix, matrix in _MATRIX_SUFFIXES
     ),
     *(
-        _planes(f"{name}_{depth}{suffix}", "", chroma_columns, chroma_rows, matrix, depth)
-        for name, chroma_columns, chroma_rows in (("I420", 2, 2), ("I422", 2, 1), ("I444", 1, 1))
+        _planes(f"{name}_{depth}{suffix}", "", chroma_x, chroma_y, matrix, depth)
+        for name, chroma_x, chroma_y in (("I420", 2, 2), ("I422", 2, 1), ("I444", 1, 1))
         for depth in (10, 12, 16)
         for suffix, matrix in _MATRIX_SUFFIXES
     ),

@@ -55,7 +55,7 @@ class PixelLayout(ABC):
         return True
 
     @abstractmethod
-    def least_stride(self, width: int) -> int:
+    def min_stride(self, width: int) -> int:
         """Return the number of bytes of a row without padding; 0 if there are no rows."""
 
     @abstractmethod
@@ -83,9 +83,9 @@ class PixelLayout(ABC):
         _, data, width, height, stride = picture
         if width < 1 or height < 1:
             raise picture.format_error("a width and a height of 1 or more", f"{width}x{height}")
-        least = self.least_stride(width)
-        if stride < least:
-            raise picture.format_error(f"{least} bytes or more from row to row", str(stride))
+        min_stride = self.min_stride(width)
+        if stride < min_stride:
+            raise picture.format_error(f"{min_stride} bytes or more from row to row", str(stride))
         size = self.size(width, height, stride)
         length = memoryview(data).nbytes
         if length < size:
@@ -127,7 +127,7 @@ class SampleLayout(PixelLayout):
         """True if the samples are the brightness."""
         return self.colours.is_grey
 
-    def least_stride(self, width: int) -> int:
+    def min_stride(self, width: int) -> int:
         """Return the bytes of a row."""
         if self.packing is None:
             return width * self.channels * self.sample_bytes
@@ -136,14 +136,14 @@ class SampleLayout(PixelLayout):
     def size(self, width: int, height: int, stride: int) -> int:
         """Return the bytes up to the last pixel."""
         if self.packing is not None and stride == 0:
-            return self.least_stride(width * height)
-        return stride * (height - 1) + self.least_stride(width)
+            return self.min_stride(width * height)
+        return stride * (height - 1) + self.min_stride(width)
 
     def check(self, picture: RawPicture) -> None:
         """Check that the bytes can be a picture of this layout."""
         if self.packing is not None and picture.stride == 0:
             width = picture.width * picture.height
-            picture = picture._replace(width=width, height=1, stride=self.least_stride(width))
+            picture = picture._replace(width=width, height=1, stride=self.min_stride(width))
         PixelLayout.check(self, picture)
 
     def array(self, picture: RawPicture) -> NDArray[Any]:
@@ -156,7 +156,7 @@ class SampleLayout(PixelLayout):
             view = _view(picture, f"<u{self.sample_bytes}", shape, strides)
             return view if self.channels > 1 else view[..., 0]
         row_count, row_width = (height, width) if stride else (1, width * height)
-        packed = _view(picture, "u1", (row_count, self.least_stride(row_width)), (stride, 1))
+        packed = _view(picture, "u1", (row_count, self.min_stride(row_width)), (stride, 1))
         unpacked = unpack(packed, row_width, self.packing).reshape(height, width)
         unpacked.flags.writeable = False
         return unpacked
@@ -186,13 +186,13 @@ class YuvPairs(PixelLayout):
     y: int
     matrix: str
 
-    def least_stride(self, width: int) -> int:
+    def min_stride(self, width: int) -> int:
         """Return the bytes of all pairs of a row."""
         return (width + 1) // 2 * 4
 
     def size(self, width: int, height: int, stride: int) -> int:
         """Return the bytes up to the last pair."""
-        return stride * (height - 1) + self.least_stride(width)
+        return stride * (height - 1) + self.min_stride(width)
 
     def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return (H, W, 2): Y and alternating U and V, in the order of the format."""
@@ -232,16 +232,16 @@ class Planes(PixelLayout):
     """Planes of Y, U and V; up to four pixels share U and V. All strides follow from Y's stride.
 
     Attributes:
-        chroma_columns: pixels along a row that share a U and a V.
-        chroma_rows: rows that share a U and a V.
+        chroma_x: pixels along a row that share a U and a V.
+        chroma_y: rows that share a U and a V.
         interleaved: whether U and V alternate in one plane with the stride of Y; else they have
             separate planes.
         matrix: name of the matrix in ``MATRICES``.
         depth: bits of a sample; a sample of more than 8 bits takes two bytes, the low byte first.
     """
 
-    chroma_columns: int
-    chroma_rows: int
+    chroma_x: int
+    chroma_y: int
     interleaved: bool
     matrix: str
     depth: int = 8
@@ -251,26 +251,19 @@ class Planes(PixelLayout):
         """Bytes of a sample."""
         return 1 if self.depth == 8 else 2
 
-    def least_stride(self, width: int) -> int:
+    def min_stride(self, width: int) -> int:
         """Return the number of bytes of a row of Y, or of U and V if that is larger."""
-        return self.sample_bytes * (
-            -(-width // self.chroma_columns) * 2 if self.interleaved else width
-        )
+        return self.sample_bytes * (-(-width // self.chroma_x) * 2 if self.interleaved else width)
 
     def _chroma_shape(self, width: int, height: int, stride: int) -> tuple[int, int, int]:
         """Return the width, height and stride of U and V."""
-        return (
-            -(-width // self.chroma_columns),
-            -(-height // self.chroma_rows),
-            self.chroma_stride(stride),
-        )
+        rows = -(-height // self.chroma_y)
+        return -(-width // self.chroma_x), rows, self.chroma_stride(stride)
 
     def chroma_stride(self, stride: int) -> int:
         """Return the bytes from row to row of U and V."""
         samples = stride // self.sample_bytes
-        return (
-            stride if self.interleaved else self.sample_bytes * -(-samples // self.chroma_columns)
-        )
+        return stride if self.interleaved else self.sample_bytes * -(-samples // self.chroma_x)
 
     def size(self, width: int, height: int, stride: int) -> int:
         """Return the bytes of all planes."""
@@ -305,9 +298,8 @@ class Planes(PixelLayout):
         else:
             self.check(picture)
         _, _, width, height, stride = picture
-        return _view(
-            picture, f"<u{self.sample_bytes}", (height, width), (stride, self.sample_bytes)
-        )
+        size = self.sample_bytes
+        return _view(picture, f"<u{size}", (height, width), (stride, size))
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
@@ -334,7 +326,7 @@ class Compressed(PixelLayout):
         """Always False."""
         return False
 
-    def least_stride(self, width: int) -> int:
+    def min_stride(self, width: int) -> int:
         """Return 0."""
         return 0
 

@@ -218,9 +218,10 @@ class RateControl:
 
     def _adjust(self, seconds: float) -> None:
         """Lower the quality and the frame rate to their targets at once; raise them slowly."""
-        least, best = self._qualities
+        min_quality, max_quality = self._qualities
         target_size, target_fps, reason = self._target()
-        quality = min(best, max(least, _quality_for(self._normalized_size.value / target_size)))
+        quality = _quality_for(self._normalized_size.value / target_size)
+        quality = min(max_quality, max(min_quality, quality))
         max_growth = self._max_rise ** min(seconds, STEADY_AVERAGING_TIME)
         if target_fps < self._fps * (1 - MIN_DEVIATION_SHARE):
             self._fps, self._max_rise = target_fps, MAX_RISE_PER_SECOND
@@ -235,39 +236,32 @@ class RateControl:
         if reason in {"bit rate", "latency"}:
             if self._fps < self._rates[1]:  # while the frame rate recovers
                 reason = f"{reason}, at the lowest quality"
-            elif self._quality >= best:
+            elif self._quality >= max_quality:
                 reason = "at the highest quality"
         self._reason = reason
         self._log_change()
 
     def _target(self) -> tuple[float, float, str]:
         """Return the target size of a frame, bytes, the frame rate, and the reason."""
-        fewest, most = self._rates
+        min_fps, max_fps = self._rates
         smallest = self._frame_bytes(self._qualities[0])
         limits: list[tuple[float, float, str]] = []
         if self._bitrate is not None:
-            source_fps = min(most, max(fewest, self._source_fps or most))
+            source_fps = min(max_fps, max(min_fps, self._source_fps or max_fps))
             limits.append(
                 (self._bitrate / 8 / source_fps, self._bitrate / 8 / smallest, "bit rate")
             )
         if self._latency is not None:
             size = max(1.0, (self._latency - self._age.value) / self._time_per_byte.value)
-            limits.append(
-                (
-                    size,
-                    max(
-                        most * size / smallest, MAX_BUSY_SHARE_WHEN_FREE / self._transit_time.value
-                    ),
-                    "latency",
-                )
-            )
+            unqueued_fps = MAX_BUSY_SHARE_WHEN_FREE / self._transit_time.value
+            limits.append((size, max(max_fps * size / smallest, unqueued_fps), "latency"))
         size, _, name = min(limits)
         if size >= smallest:
-            return size, most, name
+            return size, max_fps, name
         fps = min(fps for limit, fps, _ in limits if limit < smallest)
-        if fps < fewest:
-            return size, fewest, f"{name}, at the lowest quality and frame rate"
-        return size, min(most, fps), f"{name}, at the lowest quality"
+        if fps < min_fps:
+            return size, min_fps, f"{name}, at the lowest quality and frame rate"
+        return size, min(max_fps, fps), f"{name}, at the lowest quality"
 
     def _frame_bytes(self, quality: float) -> float:
         return self._normalized_size.value / float(_step_scale(quality) ** SIZE_EXPONENT)
@@ -301,7 +295,7 @@ def _check(
         raise ConfigurationError("RateControl: expected a bit rate or a latency, got neither")
     _check_pair(quality, "quality")
     _check_pair(fps, "fps")
-    for name, value, least, most in (
+    for name, value, minimum, maximum in (
         ("bitrate", bitrate, 1e3, 1e11),
         ("latency", latency, 1e-3, 60.0),
         ("quality", quality[0], 1, quality[1]),
@@ -310,7 +304,7 @@ def _check(
         ("fps", fps[1], 0.01, 1000.0),
     ):
         if value is not None:
-            check_number(value, name, least, most, "RateControl")
+            check_number(value, name, minimum, maximum, "RateControl")
 
 
 def _check_pair(value: tuple[float, float], name: str) -> None:

@@ -169,8 +169,8 @@ class CaptureDevice:
         """Return the sizes of a format as texts."""
         for _, _, size_type, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
             if size_type != abi.DISCRETE:
-                least, most = f"{numbers[0]}x{numbers[3]}", f"{numbers[1]}x{numbers[4]}"
-                return [f"{least} to {most} in steps of {numbers[2]}x{numbers[5]}"]
+                smallest, largest = f"{numbers[0]}x{numbers[3]}", f"{numbers[1]}x{numbers[4]}"
+                return [f"{smallest} to {largest} in steps of {numbers[2]}x{numbers[5]}"]
             break
         return [f"{width}x{height}" for width, height in self.sizes(code)]
 

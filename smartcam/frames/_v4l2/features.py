@@ -118,10 +118,10 @@ class ControlFeature:
             number = round(float(value) / self._sfnc.factor)
         except (ValueError, OverflowError):
             return None
-        least, step = self.control.minimum, max(1, self.control.step)
-        if not least <= number <= self.control.maximum:
+        minimum, step = self.control.minimum, max(1, self.control.step)
+        if not minimum <= number <= self.control.maximum:
             return None
-        return least + (number - least) // step * step
+        return minimum + (number - minimum) // step * step
 
     def to_feature(self) -> Feature:
         """Return the feature with its range and its present value."""

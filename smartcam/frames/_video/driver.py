@@ -178,9 +178,7 @@ class VideoDriver(FrameDriver):
         if first is None:
             raise FrameFormatError(f"{self.name}: expected a picture, got none", source=self.name)
         if self._fps and reader.is_live:
-            raise self.address.wrong(
-                "fps", "a recording, as live streams have no fps", "a live stream"
-            )
+            raise self.address.wrong("fps", "a recording (for fps)", "a live stream")
         return reader, first
 
     def _open_reader(self) -> PictureReader:

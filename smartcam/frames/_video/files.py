@@ -38,8 +38,7 @@ MIN_REDIRECT_VERSION: Final = (62, 0, 0)
 """First version of libavformat with an option against redirects."""
 
 UNBUFFERED_WAIT_TIME: Final = 0.01
-"""A read that waited at least this many seconds got a packet that had just arrived, not a buffered
-one."""
+"""A read that waited at least this long, seconds, got a new packet, not a buffered one."""
 
 _PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
 """Codecs whose bytes can be passed on unchanged, with smartcam's formats."""
@@ -190,7 +189,7 @@ class VideoReader(PictureReader):
         self._decode_error = ""  # error of the last undecodable picture
 
     def _open_container(self) -> Any:
-        """Return FFmpeg's container for the URL, without access to other places."""
+        """Return FFmpeg's container for the URL, without access to other addresses."""
         plan, scheme = self.plan, self.plan.url.partition(":")[0]
         if plan.allows_other_hosts:
             return self._open(plan.url, {"protocol_whitelist": REMOTE_PROTOCOLS})
@@ -333,9 +332,8 @@ class VideoReader(PictureReader):
             if packet.is_corrupt:
                 self._lost += self._has_returned_picture
             elif packet.size:
-                filtered = (
-                    self._start_code_filter.filter(packet) if self._start_code_filter else [packet]
-                )
+                codes = self._start_code_filter
+                filtered = codes.filter(packet) if codes else [packet]
                 self._pictures.extend((picture, arrived_at) for picture in filtered)
             return
         is_damaged = bool(packet.is_corrupt)

@@ -158,9 +158,8 @@ def from_av_frame(av_frame: Any, *, keep_planes: bool = False) -> Pixels:
         joined: Any = SeparatePlanes(planes) if keep_planes else b"".join(planes)
         return Pixels(pixel_format, av_frame.width, av_frame.height, stride, joined)
     joined = b"".join(_without_padding(plane, pixel_format) for plane in planes)
-    return Pixels(
-        pixel_format, av_frame.width, av_frame.height, pixel_format.stride(av_frame.width), joined
-    )
+    stride = pixel_format.stride(av_frame.width)
+    return Pixels(pixel_format, av_frame.width, av_frame.height, stride, joined)
 
 
 def _with_supported_format(av_frame: Any) -> Any:
@@ -404,7 +403,7 @@ def _lossless_name(pixel_format: PixelFormat) -> str | None:
     if pixel_format.name.startswith("Mono"):
         return "gray" if pixel_format.depth == 8 else f"gray{_DEPTHS[pixel_format.depth]}le"
     if isinstance(layout, Planes) and layout.depth > 8:
-        digits = _SUBSAMPLING[layout.chroma_columns, layout.chroma_rows]
+        digits = _SUBSAMPLING[layout.chroma_x, layout.chroma_y]
         return f"yuv{digits}p{layout.depth}le"
     if pixel_format.name in ("RGBa8", "BGRa8"):
         return "rgba" if pixel_format.name == "RGBa8" else "bgra"
@@ -421,11 +420,8 @@ def _encodable_name(pixel_format: PixelFormat) -> str | None:
     if isinstance(layout, YuvPairs):
         return "uyvy422" if layout.y else "yuyv422"
     if isinstance(layout, Planes) and layout.depth == 8:
-        return (
-            "nv12"
-            if layout.interleaved
-            else f"yuv{_SUBSAMPLING[layout.chroma_columns, layout.chroma_rows]}p"
-        )
+        digits = _SUBSAMPLING[layout.chroma_x, layout.chroma_y]
+        return "nv12" if layout.interleaved else f"yuv{digits}p"
     return {"Mono8": "gray", "RGB8": "rgb24", "BGR8": "bgr24"}.get(pixel_format.name)
 
 

@@ -107,8 +107,7 @@ def checked_redirect(url: str, location: str, peer: str, name: str) -> str:
     if target is None or source is None or target[::2] != source[::2] or target[1] not in hosts:
         raise FrameSourceError(
             f"{name}: expected pictures, or a redirect on the same host and port, got one to "
-            f"{re.sub('//[^/]*@', '//***@', location)[:200]!r}; add "
-            "#elsewhere=yes to the URL to follow it",
+            f"{re.sub('//[^/]*@', '//***@', location)[:200]!r}; add #elsewhere=yes to follow it",
             source=name,
         )
     user, at_sign, _ = requested.netloc.rpartition("@")

@@ -55,9 +55,7 @@ class WebDriver(VideoDriver):
             if not self._is_multipart:
                 return await super().open()
             if self._fps:
-                raise self.address.wrong(
-                    "fps", "a recording, as live streams have no fps", "a live stream"
-                )
+                raise self.address.wrong("fps", "a recording (for fps)", "a live stream")
             frame = await first.outcome
         finally:
             await self.stop()
@@ -74,8 +72,7 @@ class WebDriver(VideoDriver):
             await super().start(sink)
         elif not await self._start_multipart(sink):
             raise FrameFormatError(
-                f"{self.name}: expected a multipart stream as when it was opened, got another "
-                "answer; open the source again",
+                f"{self.name}: expected a multipart stream again, got another answer: reopen it",
                 source=self.name,
             )
 

@@ -264,7 +264,7 @@ VARIABLES = {"A": 0, "B": 5, "A.Max": 7}
     ],
 )
 def test_formulas(formula: str, whole: bool, expected: float) -> None:
-    assert evaluate(formula, VARIABLES, as_integers=whole) == expected
+    assert evaluate(formula, VARIABLES, integers=whole) == expected
 
 
 @pytest.mark.parametrize(
@@ -284,10 +284,10 @@ def test_a_formula_of_two_readings_has_no_value_where_they_differ(
     formula: str, by_c: str, by_emva: str
 ) -> None:
     if by_c == by_emva:
-        assert evaluate(formula, VARIABLES, as_integers=True) == int(by_c)
+        assert evaluate(formula, VARIABLES, integers=True) == int(by_c)
         return
     with pytest.raises(MessageError, match=f"got {by_c} in C's order .* {by_emva} in that of EMVA"):
-        evaluate(formula, VARIABLES, as_integers=True)
+        evaluate(formula, VARIABLES, integers=True)
 
 
 @pytest.mark.parametrize(
@@ -298,13 +298,13 @@ def test_a_formula_of_two_readings_has_no_value_where_they_differ(
 )  # fmt: skip
 def test_a_formula_that_has_no_value_is_refused(formula: str) -> None:
     with pytest.raises(MessageError):
-        evaluate(formula, VARIABLES, as_integers=False)
+        evaluate(formula, VARIABLES, integers=False)
 
 
 @given(st.text("0123456789+-*/%&|^~<>=?:(),!AB. eEx", max_size=40), st.booleans())
 def test_any_formula_has_a_number_or_is_refused(formula: str, whole: bool) -> None:
     try:
-        value: Any = evaluate(formula, VARIABLES, as_integers=whole)
+        value: Any = evaluate(formula, VARIABLES, integers=whole)
     except MessageError:
         return
     assert isinstance(value, int if whole else float)

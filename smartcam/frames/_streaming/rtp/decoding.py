@@ -300,13 +300,13 @@ class _UnitPace:
         """
         is_first = self._last_timestamp is None or unit.starts_stream
         since = 0 if is_first else self._ticks_since_last(unit)
-        least = max(unit.damaged_frames, 1 if unit.lost_packets or unit.starts_stream else 0)
-        if not least and 0 < since < MAX_STEP_TICKS:
+        min_lost = max(unit.damaged_frames, 1 if unit.lost_packets or unit.starts_stream else 0)
+        if not min_lost and 0 < since < MAX_STEP_TICKS:
             self._frame_ticks = since
         if self._last_timestamp is None or since >= 0:
             self._last_timestamp = unit.timestamp
         estimate = round(since / self._frame_ticks) - 1 if self._frame_ticks and since > 0 else 0
-        return max(least, min(estimate, unit.damaged_frames + unit.lost_packets))
+        return max(min_lost, min(estimate, unit.damaged_frames + unit.lost_packets))
 
     def _ticks_since_last(self, unit: AccessUnit) -> int:
         since = unit.timestamp - (self._last_timestamp or 0)

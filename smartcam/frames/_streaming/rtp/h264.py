@@ -86,14 +86,15 @@ class H264Packetizer:
     ) -> None:
         ssrc = secrets.randbits(32) if ssrc is None else ssrc
         sequence = secrets.randbits(16) if sequence is None else sequence
-        for name, value, least, most in (
+        for name, value, minimum, maximum in (
             ("payload_type", payload_type, 0, 127),
             ("ssrc", ssrc, 0, 0xFFFFFFFF),
             ("sequence", sequence, 0, 0xFFFF),
             ("mtu_payload", mtu_payload, 64, 65_000),
         ):
-            if not least <= value <= most:
-                raise ConfigurationError(f"RTP: {name}: expected {least} to {most}, got {value!r}")
+            if not minimum <= value <= maximum:
+                expected = f"expected {minimum} to {maximum}, got {value!r}"
+                raise ConfigurationError(f"RTP: {name}: {expected}")
         self.payload_type, self.ssrc, self._mtu = payload_type, ssrc, mtu_payload
         self._sequence = sequence
         self.packets_made = self.octets_made = 0

@@ -61,8 +61,7 @@ class RtpSenderStatistics:
         bytes: bytes of these packets, with the headers of RTP.
         cut: frames that were sent only in part, since the socket was full.
         resent: packets sent again on request.
-        extra_key_frames: key frames encoded because a receiver joined or lost packets, or a frame
-            was cut.
+        extra_key_frames: key frames for receivers that joined or lost packets, and after cuts.
         receivers: last reports of the receivers.
     """
 

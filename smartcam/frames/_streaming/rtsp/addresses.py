@@ -98,17 +98,18 @@ def _parse_transport(text: str, client: str) -> RequestedTransport | None:
         return None
     if is_tcp and "interleaved" not in options:
         return RequestedTransport(True, None, None)
-    least, most = (0, 255) if is_tcp else (1, 65535)
-    pair = _parse_pair(options.get("interleaved" if is_tcp else "client_port", ""), least, most)
+    minimum, maximum = (0, 255) if is_tcp else (1, 65535)
+    numbers = options.get("interleaved" if is_tcp else "client_port", "")
+    pair = _parse_pair(numbers, minimum, maximum)
     return None if pair is None else RequestedTransport(is_tcp, *pair)
 
 
-def _parse_pair(text: str, least: int, most: int) -> tuple[int, int] | None:
+def _parse_pair(text: str, minimum: int, maximum: int) -> tuple[int, int] | None:
     match = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text, re.ASCII)
     if match is None:
         return None
     first = int(match[1])
     second = int(match[2]) if match[2] else first + 1
-    if not (least <= first <= most and least <= second <= most) or first == second:
+    if not (minimum <= first <= maximum and minimum <= second <= maximum) or first == second:
         return None
     return first, second

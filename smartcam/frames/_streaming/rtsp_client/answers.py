@@ -34,8 +34,7 @@ MAX_START_BYTES: Final = 16
 """Number of bytes that suffice to recognize the start of a message."""
 
 USUAL_CHANNELS: Final = range(4)
-"""Channels whose packets are recognized even after bytes outside of messages; on other channels, a
-packet must have come before."""
+"""Channels whose packets are recognized after stray bytes even if none came before."""
 
 
 class ServerAnswer(NamedTuple):
@@ -126,8 +125,7 @@ class AnswerParser:
         """Skip bytes up to a possible start of a message.
 
         Returns:
-            True if a message starts, False if more bytes are needed, None if bytes that resembled
-            a message were skipped.
+            True if a message starts; False: bytes are missing; None: a false start was skipped.
         """
         match = _MESSAGE_START.search(self._data)
         skipped = match.start() if match else max(0, len(self._data) - MAX_START_BYTES)
@@ -165,9 +163,7 @@ class AnswerParser:
         match = _HEADER_END.search(self._data, max(0, self._searched_bytes - 10))
         size = match.end() if match else len(self._data)
         if size > MAX_HEAD_BYTES:
-            raise MessageError(
-                f"RTSP: expected a header of {MAX_HEAD_BYTES} bytes at most, got more"
-            )
+            raise MessageError(f"RTSP: expected a header of {MAX_HEAD_BYTES} bytes at most")
         if match is None:
             self._searched_bytes = size
             return False

@@ -24,14 +24,14 @@ def transport_options(transport: str) -> dict[str, str]:
     return {"": protocol.strip().upper()} | options
 
 
-def parse_pair(text: str, most: int) -> tuple[int, int] | None:
+def parse_pair(text: str, maximum: int) -> tuple[int, int] | None:
     """Parse a pair of channels or ports; a missing second number is the first plus one."""
     match = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
     if match is None:
         return None
     first = int(match[1])
     second = int(match[2]) if match[2] else first + 1
-    return (first, second) if max(first, second) <= most and first != second else None
+    return (first, second) if max(first, second) <= maximum and first != second else None
 
 
 class InterleavedChannels:

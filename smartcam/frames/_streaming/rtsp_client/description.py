@@ -105,14 +105,8 @@ def _track(media_line: list[str], lines: list[str]) -> VideoTrack:
     codec_name = codec_names[payload_type]
     if not codec_name and "sprop-parameter-sets" in parameters:
         codec_name = "H264"
-    return VideoTrack(
-        payload_type,
-        codec_name,
-        _attribute(lines, "control"),
-        parameters,
-        _size(lines),
-        is_encrypted,
-    )
+    control, size = _attribute(lines, "control"), _size(lines)
+    return VideoTrack(payload_type, codec_name, control, parameters, size, is_encrypted)
 
 
 def _codec_name(payload_type: int, lines: list[str]) -> str:

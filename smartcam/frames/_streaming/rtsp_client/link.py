@@ -202,9 +202,8 @@ class RtspLink(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Fail all calls that wait for an answer."""
         reason = getattr(exc, "strerror", None) if exc is not None else None
-        self._end(
-            f"the connection is lost: {reason}" if reason else "the server closed the connection"
-        )
+        lost = f"the connection is lost: {reason}"
+        self._end(lost if reason else "the server closed the connection")
 
     # received messages
 
