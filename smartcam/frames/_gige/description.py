@@ -32,7 +32,7 @@ MAX_ELEMENTS: Final = 400_000
 
 
 class Location(NamedTuple):
-    """The place of a description in the camera's memory.
+    """The file name and the address of a description in the camera's memory.
 
     Attributes:
         name: name of the file, with the suffix ``.zip`` if the file is packed.

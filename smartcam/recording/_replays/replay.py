@@ -11,7 +11,7 @@ The device is the emulator's own. Its applications send the recorded containers,
 
 Sequence numbers differ from the recorded ones if the client sets them, as it does if its layout has
 an ``@sequence`` field. Then containers have the client's numbers in that field; the
-``interpret_as`` in the recording gives its place.
+``interpret_as`` in the recording gives its offset.
 """
 
 from __future__ import annotations
