@@ -321,7 +321,7 @@ def test_judge_camera_that_dies_says_what_could_not_be_put_back(thread: LoopThre
         with camera.session() as client:
             camera.ensure_stopped(client)
             thread.call(emulator.stop)
-            client.fence()
+            client.round_trip()
 
     item = Check(name="dies", about="", sources={"": "x, y"}, run=dies)
     with emulated(thread, running=True) as emulator:

@@ -39,10 +39,10 @@ def wrong_magic(camera: CameraUnderTest) -> bytes:
 def _check_ignored(camera: CameraUnderTest, label: str, *data: bytes) -> None:
     """Check that the camera does not answer these bytes, and answers the next Query once."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         client.write(*data)
-        client.fence()
+        client.round_trip()
         client.listen(camera.options.quiet)
         frames = [
             each for each in client.received[start_index:] if each.message_id != MessageId.STATUS
@@ -105,7 +105,7 @@ def broken_datagram_is_ignored(camera: CameraUnderTest) -> None:
 def only_documented_messages_came(camera: CameraUnderTest) -> None:
     """Messages and their lengths are documented ones."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
     if camera.flaws:
         raise Differs(
             "only messages and lengths that are documented",

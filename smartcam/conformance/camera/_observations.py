@@ -228,7 +228,7 @@ def observe_double_trigger(camera: CameraUnderTest) -> DoubleTrigger:
         camera.ensure_ready(client)
         start_index = len(client.received)
         client.send(m.Trigger(), m.Trigger())
-        client.fence()
+        client.round_trip()
         deadline, index = (
             time.monotonic() + 2 * inspection_seconds + camera.options.quiet,
             start_index,

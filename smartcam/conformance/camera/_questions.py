@@ -157,7 +157,7 @@ def stop_during_inspection(camera: CameraUnderTest) -> str:
         camera.ensure_ready(client)
         start_index = len(client.received)
         client.send(m.Trigger(), m.Stop())
-        client.fence()
+        client.round_trip()
         client.listen(inspection_seconds + camera.silence_timeout)
         frames = client.received[start_index:]
         if all(word & camera.wire.bits.running for word in camera.wire.status_words(frames)):
@@ -214,7 +214,7 @@ def switch_while_running(camera: CameraUnderTest) -> str:
         target = camera.options.other_application or camera.application
         start_index = len(client.received)
         client.send(m.SwitchApplication(application=target))
-        client.fence()
+        client.round_trip()
         answer_codes = _switch_answers(client, start_index)
         if not answer_codes and not _was_busy(camera, client, start_index):
             client.listen(camera.silence_timeout)
@@ -319,7 +319,7 @@ def _trigger_once(camera: CameraUnderTest, client: RawClient) -> None:
 def disconnect_answer(camera: CameraUnderTest) -> str:
     """Answer to Disconnect, if there is one."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         client.send(m.Disconnect())
         client.listen(camera.silence_timeout)
@@ -335,13 +335,13 @@ def disconnect_answer(camera: CameraUnderTest) -> str:
 def bad_message(camera: CameraUnderTest) -> str:
     """Answers to unknown ids and wrong lengths: a code, or none."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         client.write(
             camera.wire.make_frame(UNKNOWN_ID, bytes(2)),
             camera.wire.make_frame(MessageId.SWITCH_APPLICATION),
         )
-        client.fence()
+        client.round_trip()
         answers = [
             (message.message_id, camera.wire.read_numbers(message.body))
             for message in client.received[start_index:-1]
@@ -369,7 +369,7 @@ def second_client(camera: CameraUnderTest) -> str:
         except Differs:
             outcome = "left without an answer"
         try:
-            first.fence()
+            first.round_trip()
             first_continues = True
         except (Differs, LinkClosedError):
             first_continues = False
@@ -407,7 +407,7 @@ def bad_frame(camera: CameraUnderTest) -> str:
 def _react_to_bad_bytes(camera: CameraUnderTest, data: bytes) -> str:
     """Send bytes that are no frame, then a Query; return the camera's reaction in words."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         try:
             client.write(data, camera.wire.encode_request(m.Query()))

@@ -260,7 +260,7 @@ class RawClient:
             MessageId.RESULT_CONTAINER, timeout, expected, start_index=start_index
         )
 
-    def fence(self) -> list[ReceivedFrame]:
+    def round_trip(self) -> list[ReceivedFrame]:
         """Send a Query and return the frames that come before its answer.
 
         Raises:
@@ -298,7 +298,7 @@ class RawClient:
         """
         if self.wire.is_bid:
             self.send(m.GetStatus())
-        self.fence()
+        self.round_trip()
         if self.status is None:
             raise NotObserved("the camera has sent no status")
         return self.status

@@ -123,7 +123,7 @@ def overtriggered_falls_by_itself(camera: CameraUnderTest) -> None:
 def reset_errors_brings_a_status(camera: CameraUnderTest) -> None:
     """Reset errors is answered with the code 0, and a status follows."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         answer = client.ask(m.ResetErrors())
         if camera.wire.read_numbers(answer.body) != (0,):
@@ -177,7 +177,7 @@ def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
             "a result of the application that runs without triggers",
         )
         camera.ensure_stopped(client)
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         frames = client.listen(2 * camera.options.quiet)
         if frames_with_id(frames, MessageId.RESULT_CONTAINER):
@@ -212,7 +212,7 @@ def _check_no_change(camera: CameraUnderTest, message: Message) -> None:
         running_before = camera.is_running(client)
         start_index = len(client.received)
         client.send(message)
-        client.fence()
+        client.round_trip()
         client.listen(camera.options.quiet)
         running_after = camera.is_running(client)
         name = type(message).__name__

@@ -115,7 +115,7 @@ def deaf_before_connect(camera: CameraUnderTest) -> None:
 def silent_after_disconnect(camera: CameraUnderTest) -> None:
     """After Disconnect nothing comes, of a smart camera not even an answer to it."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         client.send(m.Disconnect())
         frames = _without_answer(camera, client.listen(camera.options.quiet))
@@ -127,7 +127,7 @@ def silent_after_disconnect(camera: CameraUnderTest) -> None:
 def deaf_after_disconnect(camera: CameraUnderTest) -> None:
     """Requests after Disconnect are ignored."""
     with camera.session() as client:
-        client.fence()
+        client.round_trip()
         start_index = len(client.received)
         client.send(m.Disconnect())
         client.send(m.Query())
@@ -193,7 +193,7 @@ def newcomer_wins(camera: CameraUnderTest) -> None:
         first.write(camera.wire.encode_request(m.Query()))
         if first.listen(camera.options.quiet):
             raise Differs("silence for the first client", first.describe_received(start_index))
-        second.fence()
+        second.round_trip()
 
 
 @check("SC-C40, derived", transports=("tcp",))

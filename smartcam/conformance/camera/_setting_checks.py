@@ -190,7 +190,7 @@ def _send_setting(
     if not camera.wire.is_bid:
         message_id = camera.wire.dialect.message_id(request)
         client.send(request)
-        if frames_with_id(client.fence(), message_id):
+        if frames_with_id(client.round_trip(), message_id):
             raise Differs(f"no answer to {type(request).__name__}", client.describe_received())
         return
     answer = client.ask(request)
