@@ -212,8 +212,8 @@ TABLE = {
     for method, kinds in CAMERA.items()
 } | _table("""
 connect  url: path or url, model: text or None, observers: list
-find  networks: text, ports: list, protocols: not judged, leave: list, may_disturb: flag, ask: flag,
-    rate: number, at_once: integer, timeout: seconds, max_addresses: integer
+find  networks: text, ports: list, protocols: not judged, exclude: list, may_disturb: flag,
+    ask: flag, rate: number, at_once: integer, timeout: seconds, max_addresses: integer
 examine  url: path or url, application: integer or None, interpret_as: reading, y_down: flag,
     trigger: flag, timeout: seconds or default, seconds: seconds, count: integer,
     trace: function or None
@@ -279,7 +279,7 @@ RtspServer.__init__  sources: object, host: text, port: integer, user: not judge
     keyint: integer, max_connections: integer, max_viewers: integer
 RtspServer.url  name: choice
 ConformanceOptions.__init__  url: text, application: integer or None,
-    other_application: integer or None, allow: object, timeout: seconds, quiet: seconds,
+    other_application: integer or None, allow: object, timeout: seconds, silence: seconds,
     switch_timeout: seconds, reboot_timeout: seconds, sequence_offset: integer or None,
     input_data: bytes or None
 judge  options: object, names: not judged
@@ -404,17 +404,18 @@ NOT_HERE: dict[str, str] = {
         LineCamera TicketedClient TicketedCamera Recorder.describe Recorder.on_error
         Recorder.on_frame Recorder.on_result Recorder.on_raw_frames Recorder.on_results
         Recorder.on_picture BagRecorder.on_picture Tool Recorder.on_state
-        BagRecorder.on_frame ReplayedCamera.received Task ClientConformance
+        BagRecorder.on_frame ReplayedCamera.handle_message Task ClientConformance
         CameraConformance EmulatedCamera.application_of EmulatedCamera.from_scenario
-        EmulatedCamera.lost EmulatedCamera.make_machine EmulatedCamera.mistake
-        EmulatedCamera.received EmulatedCamera.serves EmulatedCamera.state_options
-        WireCamera.arrived WireCamera.connection_ended WireCamera.passed WireCamera.traced
-        WireCamera.mistake WireCamera.application_of WireCamera.state_options
-        WireCamera.from_scenario WireCamera.lost WireCamera.make_machine WireCamera.received
-        WireCamera.serves EmulatedInSight.admits EmulatedInSight.execute
-        EmulatedInSight.image_answer EmulatedInSight.from_scenario EmulatedInSight.greet
-        EmulatedInSight.greeting EmulatedInSight.hear EmulatedInSight.make_client
-        EmulatedInSight.say EmulatedInSight.serves EmulatedInSight.state_options
+        EmulatedCamera.forget_link EmulatedCamera.make_machine EmulatedCamera.mistake
+        EmulatedCamera.handle_message EmulatedCamera.serves EmulatedCamera.state_options
+        WireCamera.connection_begun WireCamera.connection_ended WireCamera.note_frame
+        WireCamera.note_message WireCamera.mistake WireCamera.application_of
+        WireCamera.state_options WireCamera.from_scenario WireCamera.forget_link
+        WireCamera.make_machine WireCamera.handle_message WireCamera.serves
+        EmulatedInSight.admits EmulatedInSight.execute EmulatedInSight.image_answer
+        EmulatedInSight.from_scenario EmulatedInSight.greet EmulatedInSight.greeting
+        EmulatedInSight.hear EmulatedInSight.make_client EmulatedInSight.say
+        EmulatedInSight.serves EmulatedInSight.state_options
     """,
     "judged by their own rooms' tests: layouts, files, pictures, links that break": """
         Layout FleetServer serve ThreadedFleet register_generator Rectifier Undistorter

@@ -409,9 +409,9 @@ async def test_captured_sessions_are_shown_as_the_camera_saw_them(
             said = [one.message for one in camera.log if one.direction == direction]
             place = (camera.transport, camera.port)
             seen = [one for one in shown if (one.transport, one.ports[sender is CLIENT]) == place]
-            assert [one.message(camera.spoken) for one in seen] == said, camera.url
+            assert [one.message(camera.wire_dialect) for one in seen] == said, camera.url
             assert {one.fields["sender"] for one in seen} == {sender.value}
-            assert {one.fields["dialect"] for one in seen} == {camera.spoken.label}
+            assert {one.fields["dialect"] for one in seen} == {camera.wire_dialect.label}
     assert {name for one in shown for name in one.findings} == {"refused"}
     unlinked = [one for one in shown if one.fields["message"] == "QueryAnswer" and not linked(one)]
     assert unlinked == []

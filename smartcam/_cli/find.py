@@ -30,7 +30,7 @@ PERIOD = 1.0
 
 DISTURBANCE_WARNING = (
     "No document says that a camera of {} keeps its client when another one connects and says "
-    "nothing: --leave and --fleet keep away from those at work."
+    "nothing: --exclude and --fleet keep away from those at work."
 )
 """The warning about open ports of cameras that serve one client."""
 
@@ -70,7 +70,7 @@ _EVIDENCE_TEXTS = {
     metavar="FILE",
     help="A fleet file, whose cameras are listed by name, and not touched.",
 )
-@click.option("--leave", multiple=True, metavar="NETWORK", help="Leave these alone; repeatable.")
+@click.option("--exclude", multiple=True, metavar="NETWORK", help="Do not touch these; repeatable.")
 @click.option(
     "--may-disturb",
     is_flag=True,
@@ -118,7 +118,7 @@ async def find(
     ports: tuple[int, ...],
     protocols: tuple[str, ...],
     fleet_file: str | None,
-    leave: tuple[str, ...],
+    exclude: tuple[str, ...],
     port_timeout: float,
     options: Options,
     as_yaml: bool,
@@ -140,7 +140,7 @@ async def find(
         networks,
         ports=ports,
         protocols=protocols or None,
-        leave=[*leave, *fleet_cameras],
+        exclude=[*exclude, *fleet_cameras],
         timeout=port_timeout,
         **search_options,
     )
@@ -151,7 +151,7 @@ async def find(
         if search.has_begun:
             left_alone = {
                 host: fleet_cameras[text]
-                for host, text in search.left_out.items()
+                for host, text in search.excluded.items()
                 if text in fleet_cameras
             }
             if as_yaml:
@@ -225,7 +225,7 @@ def summary(search: CameraSearch) -> str:
     """Return the outcome of the search as text."""
     outcomes = ("open", "refused", "no answer", "unreachable", "failed")
     outcome_counts = [f"{search.counts[name]} {name}" for name in outcomes if search.counts[name]]
-    text = f"{search.opened} of {search.total} ports tried: {', '.join(outcome_counts) or 'none'}"
+    text = f"{search.tried} of {search.total} ports tried: {', '.join(outcome_counts) or 'none'}"
     if search.failure:
         text += f" (failed: {search.failure})"
     text += ". Cameras that are set to UDP do not show."
@@ -281,5 +281,5 @@ async def show_progress_line(search: CameraSearch) -> AsyncIterator[None]:
 async def _show_progress(search: CameraSearch) -> None:
     while True:
         await asyncio.sleep(PERIOD)
-        text = f"{search.opened} of {search.total} ports, {search.counts['open']} open"
+        text = f"{search.tried} of {search.total} ports, {search.counts['open']} open"
         click.echo(f"\r\x1b[K{text}", err=True, nl=False)

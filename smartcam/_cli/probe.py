@@ -10,7 +10,7 @@ import click
 from smartcam._cli.options import CONNECT_WARNING, OUTPUT_OPTIONS, Options, async_command, option
 
 if TYPE_CHECKING:
-    from smartcam.doctor._inside import CameraAnswer, Trial
+    from smartcam.doctor._inside import CameraAnswer, TracedAttempt
     from smartcam.observers import TraceEntry
 
 MAX_HEX_DIGITS = 128
@@ -25,38 +25,38 @@ MAX_HEX_DIGITS = 128
 @click.option("--all", "try_all", is_flag=True, help="Try the rest, too, after one is answered.")
 @option(
     "--timeout",
-    help="Longest time of all tries together (default 10); each gets an equal share of the rest.",
+    help="Longest time of all attempts together (default 10); each gets an equal share.",
 )
 @async_command("--trace", *OUTPUT_OPTIONS)
 async def probe(host_or_url: str, try_all: bool, options: Options) -> None:
     """Try protocols, transports and dialects, one after the other on fresh links.
 
-    Raises ConnectFailedError: no try was answered; the error names each try.
+    Raises ConnectFailedError: no attempt was answered; the error names each attempt.
     """
-    from smartcam.doctor._inside import no_session, trials
+    from smartcam.doctor._inside import no_session, try_ways
     from smartcam.settings import parse_address
 
     address = parse_address(host_or_url)
     answers: list[CameraAnswer] = []
-    failed_trials: list[Trial] = []
+    failed_attempts: list[TracedAttempt] = []
     with options.open_trace(host_or_url) as trace:
         timeout = options.step_timeout(10.0)
-        tries = trials(
+        attempts = try_ways(
             address,
             timeout=timeout,
             trace=trace,
             continue_after_answer=try_all,
             every_protocol=True,
         )
-        async with aclosing(tries):
-            async for trial in tries:
-                _show_trial(trial, options)
-                if trial.answer is not None:
-                    answers.append(trial.answer)
+        async with aclosing(attempts):
+            async for attempt in attempts:
+                _show_attempt(attempt, options)
+                if attempt.answer is not None:
+                    answers.append(attempt.answer)
                 else:
-                    failed_trials.append(trial)
+                    failed_attempts.append(attempt)
     if not answers:
-        raise no_session(host_or_url, address, failed_trials)
+        raise no_session(host_or_url, address, failed_attempts)
     _show_answers(answers, options)
 
 
@@ -71,20 +71,20 @@ def frame_text(entry: TraceEntry) -> str:
     return f"! {entry.message}" + (f"  {data}  '{text}'" if raw else "")
 
 
-def _show_trial(trial: Trial, options: Options) -> None:
+def _show_attempt(attempt: TracedAttempt, options: Options) -> None:
     names = ("transport", "dialect", "step", "outcome", "frames", "omitted")
-    address = {"protocol": trial.address.protocol, "port": trial.address.port}
-    value = {**address, **{name: getattr(trial, name) for name in names}}
-    outcome = f"{trial.step}: {trial.outcome}" if trial.answer is None else "a camera answers"
+    address = {"protocol": attempt.address.protocol, "port": attempt.address.port}
+    value = {**address, **{name: getattr(attempt, name) for name in names}}
+    outcome = f"{attempt.step}: {attempt.outcome}" if attempt.answer is None else "a camera answers"
     of = (
-        f"{trial.address.protocol} at port {trial.address.port}: "
-        if trial.is_other_protocol
+        f"{attempt.address.protocol} at port {attempt.address.port}: "
+        if attempt.is_other_protocol
         else ""
     )
-    lines = [f"{of}{trial.transport} {trial.dialect}: {outcome}"]
-    lines += [f"  {frame_text(entry)}" for entry in trial.frames]
-    if trial.omitted:
-        lines.append(f"  ... and {trial.omitted} more")
+    lines = [f"{of}{attempt.transport} {attempt.dialect}: {outcome}"]
+    lines += [f"  {frame_text(entry)}" for entry in attempt.frames]
+    if attempt.omitted:
+        lines.append(f"  ... and {attempt.omitted} more")
     options.show(value, "\n".join(lines))
 
 

@@ -289,7 +289,7 @@ def _refuse_unsupported_options(context: click.Context, plan: Scenario) -> None:
     """Raise a usage error for an option that a camera of this protocol does not take."""
     from smartcam.emulator._inside import emulated_class
 
-    takes = emulated_class(plan.protocol).takes
+    takes = emulated_class(plan.protocol).accepted_options
     for name, text in _OPTION_NAMES.items():
         is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
         if is_given and name not in takes:

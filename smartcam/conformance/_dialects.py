@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-SMART: tuple[str, ...] = ("handbook", "thesis", "b16")
+SMART_DIALECTS: tuple[str, ...] = ("handbook", "thesis", "b16")
 """The dialects of smart cameras: with a run mode, unasked statuses, and no result codes."""
 
-EVERY_DIALECT: tuple[str, ...] = (*SMART, "bid")
+EVERY_DIALECT: tuple[str, ...] = (*SMART_DIALECTS, "bid")
 """Names of all dialects."""

@@ -16,7 +16,7 @@ FINDING_PROPERTY = "smartcam-client-finding"
 CAMERA_OPTIONS: Mapping[str, str] = {
     "--camera-url": (
         "the camera that smartcam.conformance.camera judges, such as bvs://192.168.0.10; "
-        "it is taken from its client"
+        "the client that it serves now loses it"
     ),
     "--camera-application": (
         "id of the application that may be started and triggered (default: the active one)"
@@ -25,11 +25,11 @@ CAMERA_OPTIONS: Mapping[str, str] = {
         "id of another application, which may be loaded for a moment (default: none is)"
     ),
     "--camera-allow": (
-        "changes of the camera that are allowed beside run, trigger and switch, all undone: "
-        "clock, number, input, errors, reboot, all; 'nothing' forbids the three"
+        "further changes of the camera that are allowed: clock, number, input, errors, reboot, "
+        "all. run, trigger and switch are allowed and are undone; 'nothing' forbids them, too"
     ),
     "--camera-timeout": "seconds that an answer, a status or a result may take (default 5)",
-    "--camera-quiet": "seconds of silence that count as no answer (default 0.5)",
+    "--camera-silence": "seconds of silence that count as no answer (default 0.5)",
     "--camera-switch-timeout": "seconds that loading an application may take (default 30)",
     "--camera-reboot-timeout": "seconds that a restart may take (default 180)",
     "--camera-sequence-offset": (
@@ -42,7 +42,7 @@ CAMERA_OPTIONS: Mapping[str, str] = {
 
 CLIENT_OPTIONS: Mapping[str, str] = {
     "--client-command": (
-        "The client to judge: a command with {task}, and {url} or {host} and {port}. It does the "
+        "The client to judge: a command with {task}, and {url} or {port}. It does the "
         "task and prints each result's bytes as hex or JSON, one line each; exit code 0: done, 77: "
         "it has no such task, anything else: failed."
     ),

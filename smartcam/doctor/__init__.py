@@ -24,7 +24,7 @@ from smartcam.doctor import _result_checks as result_checks
 from smartcam.doctor import _session_checks as session_checks
 from smartcam.doctor import _state_checks as state_checks
 from smartcam.doctor import _trigger_checks as trigger_checks
-from smartcam.doctor._context import DoctorOptions, Examination, Witness
+from smartcam.doctor._context import CameraRecorder, DoctorOptions, Examination
 from smartcam.doctor._findings import Exit, Finding
 from smartcam.doctor._found import may_serve_one_client
 from smartcam.doctor._search import find
@@ -56,19 +56,19 @@ __all__ = [
 EXCLUSIVE_NOTICE = Finding(
     check="notice",
     severity="ok",
-    text="connecting takes the camera from another client, if it serves one: the newcomer wins",
-    cure="A program that uses smartcam takes it back by itself.",
+    text="the camera serves one client: another one that is connected now loses its session",
+    cure="A program that uses smartcam takes the camera back by itself.",
 )
 
 SHARED_NOTICE = Finding(
     check="notice",
     severity="ok",
-    text="the camera's agent shares it: this examination takes it from no program",
+    text="a fleet's agent shares the camera: no other program loses its session",
 )
 SEVERAL_CLIENTS_NOTICE = Finding(
     check="notice",
     severity="ok",
-    text="the camera serves several clients: this examination takes it from none",
+    text="the camera serves several clients: none of them loses its session",
 )
 
 
@@ -93,7 +93,7 @@ def _limit_of_requests(options: DoctorOptions) -> float:
     return options.step_timeout(5.0) + state_checks.MAX_QUERYING_SECONDS
 
 
-def _limit_of_switch(options: DoctorOptions) -> float:
+def _limit_of_application_switch(options: DoctorOptions) -> float:
     return 2 * options.step_timeout(10.0)  # waiting for a free camera, and the switch
 
 
@@ -108,8 +108,8 @@ _WIRE_CHECKS = (
     _DoctorCheck(
         "session",
         session_checks.connect,
-        # a session that fails, tries in all other ways, a session in one of these ways, more
-        # sessions, and the ends of sessions
+        # 4 steps: a session that fails, the other dialects and transports, a session with one of
+        # them, more sessions to measure; then closing each session
         lambda options: (
             4 * options.step_timeout(10.0)
             + session_checks.MAX_CONNECTING_SECONDS
@@ -127,14 +127,14 @@ def _checks_of_fleet_camera(url: str) -> tuple[tuple[_DoctorCheck, ...], Address
 
     fleet_checks = (
         _NAME_CHECK,
-        _DoctorCheck("bus", checks.reach_bus, _limit_of_switch, in_session=False),
+        _DoctorCheck("bus", checks.reach_bus, _limit_of_application_switch, in_session=False),
         _DoctorCheck(
             "agent",
             checks.find_agent,
             lambda options: 5 * checks.AGENT_SEARCH_SECONDS,
             in_session=False,
         ),
-        _DoctorCheck("session", checks.connect, _limit_of_switch, in_session=False),
+        _DoctorCheck("session", checks.connect, _limit_of_application_switch, in_session=False),
         _DoctorCheck("reservation", checks.reserve, _limit_of_one_step),
     )
     return fleet_checks, checks.fleet_camera_address(url)
@@ -145,7 +145,7 @@ _CHECKS = (
     _DoctorCheck(
         "application",
         trigger_checks.look_at_application,
-        lambda options: _limit_of_requests(options) + _limit_of_switch(options),
+        lambda options: _limit_of_requests(options) + _limit_of_application_switch(options),
     ),
     _DoctorCheck("round trip", state_checks.measure_round_trip, _limit_of_requests),
     _DoctorCheck("run state", state_checks.watch, lambda options: options.seconds + 1.0),
@@ -154,7 +154,7 @@ _CHECKS = (
         trigger_checks.send_triggers,
         lambda options: options.count * options.step_timeout(5.0) + 1.0,
     ),
-    _DoctorCheck("application", trigger_checks.restore_application, _limit_of_switch),
+    _DoctorCheck("application", trigger_checks.restore_application, _limit_of_application_switch),
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
     _DoctorCheck("clock", state_checks.look_at_clock, _limit_of_requests),
 )
@@ -177,26 +177,26 @@ async def examine(
 ) -> AsyncGenerator[Finding]:
     """Examine a camera and yield each finding at once.
 
-    Connecting may take the camera from another client: the first finding says so. Without
+    Another client may lose the camera: the first finding says whether it may. Without
     ``trigger``, nothing on the camera is started, stopped, switched, set or triggered.
 
     Args:
         url: the camera's address; for ``gige://HOST``, a source of frames, the network, the
             control, the packets and the pictures are examined.
         application: id that is expected to be active. With ``trigger`` it is loaded and started
-            for the triggers, and the application from before is loaded again afterwards.
+            for the triggers, and the one that was active before is loaded again at the end.
         interpret_as: interpretation of the results; None does not compare them with anything.
         y_down: whether the camera's y axis points down.
         trigger: whether to send triggers.
         timeout: seconds for each step: connect (default 10), request (5), switch (10), trigger (5).
         seconds: time for which a camera that sends results unasked is watched.
         count: number of triggers.
-        trace: function that is called with every frame on the wire.
+        trace: function that is called with every protocol message that is sent or received.
 
     Raises:
         ConfigurationError: an address, a layout or a number cannot work; nothing was tried.
 
-    Cancellation: the session is ended in order, and the application that was loaded before is
+    Cancellation: the session is closed properly, and the application that was active before is
     loaded again. The same happens when the generator is closed: use :func:`contextlib.aclosing`.
     """
     if application is not None:
@@ -238,7 +238,7 @@ async def examine(
     first_checks, address = (
         _checks_of_fleet_camera(url) if in_fleet else (_WIRE_CHECKS, parse_address(url))
     )
-    exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
+    exam = Examination(options, address, trace, CameraRecorder(), wants_trigger=trigger)
     exam.make_camera()  # checks the options
     is_exclusive = not in_fleet and may_serve_one_client(load_protocol(address.protocol))
     yield (
@@ -277,7 +277,7 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
             return False
         exam.fail(
             f"the camera did not get ready in time: {exc}",
-            "Give it more time (--timeout), and see whether somebody works on its pages.",
+            "Give it more time (--timeout), and see whether somebody uses the camera's web page.",
             exit_code=Exit.TIMED_OUT,
         )
     except SmartCamError as exc:

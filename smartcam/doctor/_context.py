@@ -74,7 +74,7 @@ class DoctorOptions:
         return default if self.timeout is None else self.timeout
 
 
-class Witness(Observer):
+class CameraRecorder(Observer):
     """An observer of the camera's messages that keeps the last statuses, times and results.
 
     Attributes:
@@ -182,10 +182,10 @@ class Examination:
     options: DoctorOptions  # options from the user
     address: Address  # address of the camera; with the dialect once it is known
     trace: Callable[[TraceEntry], None] | None  # called with every frame
-    witness: Witness  # observer of the camera's messages
+    recorder: CameraRecorder  # observer of the camera's messages
     # closes the session and the bus at the end
     cleanup: AsyncExitStack = field(default_factory=AsyncExitStack)
-    # loads the application from before the triggers again
+    # loads again the application that was active before the triggers
     application_cleanup: AsyncExitStack = field(default_factory=AsyncExitStack)
     bus: Bus | None = None  # bus of a fleet; None before it answered
     camera: Camera | None = None  # the client, None before the session
@@ -245,7 +245,7 @@ class Examination:
         host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
         return f"{host}:{self.address.port}"
 
-    def pin(self, url: str) -> None:
+    def use_url(self, url: str) -> None:
         """Use protocol, transport and dialect of a URL; a login, which no URL shows, stays."""
         address = parse_address(url)
         if address.protocol != self.address.protocol:
@@ -271,7 +271,7 @@ class Examination:
         if exam_options.interpreter is not None:
             options["interpret_as"] = ReadingInterpreter(exam_options.interpreter)
         frame_observers = [FrameObserver(self.trace)] if self.trace is not None else []
-        observers = [self.witness, *frame_observers]
+        observers = [self.recorder, *frame_observers]
         camera: Camera
         if self.in_fleet:
             camera = connect(self.address.url, observers=observers, **options)

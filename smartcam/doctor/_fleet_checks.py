@@ -41,7 +41,7 @@ AGENT_SEARCH_INTERVAL = 0.1
 MAX_CAMERAS_LISTED = 20
 """Largest number of cameras that a finding names."""
 
-SERVE_CURE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
+SERVE_CURE = "Is smartcam serve running on {host}? What is the entry `listen` of its fleet file? "
 LISTEN_CURE = (
     "Without one it is tcp/127.0.0.1:7447, which only programs on the same computer reach; "
     "tls/0.0.0.0:7447 is for all that have a certificate."
@@ -124,7 +124,7 @@ async def _check_certificates(exam: Examination, address: FleetAddress) -> bool:
         exam.fail(str(exc), f"smartcam fleet certificates makes what belongs into {folder}.")
         return False
     if own_identity.expired_text:
-        exam.fail(own_identity.expired_text, "Until then nothing there takes this program.")
+        exam.fail(own_identity.expired_text, "With this certificate the agent refuses the program.")
         return False
     peer_identity = await shake_hands(address.host, address.port, folder)
     if peer_identity.trouble:
@@ -163,11 +163,11 @@ async def find_agent(exam: Examination) -> None:
         exam.fail(
             f"the bus answers, and no agent{fleet_text} is there",
             "Something is a router there, and no smartcam serve has joined it. Is it running, and "
-            "does the connect: of its fleet file name this router?"
+            "is this router in the entry `connect` of its fleet file?"
             + (
                 ""
                 if fleet_name is None
-                else f" Is it of the fleet {fleet_name} (fleet: {fleet_name})?"
+                else f" Has its fleet file the entry `fleet: {fleet_name}`?"
             ),
         )
         return

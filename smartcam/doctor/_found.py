@@ -33,9 +33,9 @@ class FoundPort:
         protocols: names of the protocols that the port may use, the most probable first; empty if
             the received bytes fit none.
         evidence: ``greeted``: the port sent the greeting of the protocol's cameras; ``silent``: it
-            sent nothing, like cameras of the protocol; ``said``: it sent something, and the
-            cameras' greeting is unknown; ``ended``: it closed the connection at once, as a camera
-            with a client may; ``other``: no camera of a known protocol.
+            sent nothing, like cameras of the protocol; ``said``: it sent something, which cannot be
+            compared, since the cameras' greeting is unknown; ``ended``: it closed the connection at
+            once, as a camera with a client may; ``other``: no camera of a known protocol.
         received: bytes that the port sent without a request, up to 512.
         seconds: time until the connection was open.
         answer: the camera's description of itself, if it was asked and has answered.
@@ -144,7 +144,7 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
             f"find: cameras of {', '.join(names)} serve one client, and asking takes them from it; "
             "so none is asked without consent. Say may_disturb=True (--may-disturb) when a lost "
             "session does no harm, ask other protocols only (protocols, --protocol), or ask none; "
-            "addresses in leave (--leave, --fleet) are not touched"
+            "excluded addresses (exclude, --exclude, --fleet) are not touched"
         )
 
 
@@ -185,7 +185,7 @@ def _may_use(protocol: Protocol, opened: OpenedPort) -> bool:
     """Return True if a camera of the protocol may behave like this port, which sent no greeting."""
     if opened.received:
         return protocol.greeting is None
-    # a device that closes silently may serve as many clients as it accepts
+    # a camera that has a client already may close the connection before its greeting
     return opened.is_closed or not protocol.greeting
 
 

@@ -48,7 +48,7 @@ SPEED_UNKNOWN: Final = 0.0
 
 _SIOCGIFADDR: Final = 0x8915  # linux/sockios.h
 
-MEASURE_HINT: Final = "smartcam frames measure shows the same for as long as you like."
+MEASURE_HINT: Final = "`smartcam frames measure` shows the same for as long as you like."
 
 
 class _ExaminationOverError(Exception):
@@ -125,7 +125,7 @@ async def examine_gige(
         ("subnet", _look_at_networks),
         ("answers", _ask_camera),
         ("control", _look_at_control),
-        ("features", _check_link),
+        ("link", _check_link),
         ("stream", _check_stream),
     )
     for exam.check, check in checks:
@@ -182,7 +182,7 @@ async def _look_at_networks(exam: _GigEExamination) -> None:
     if not networks_of_camera:
         exam.add(
             "warning",
-            f"{exam.host} is of another subnet than this machine, which is {networks_text}",
+            f"{exam.host} is of another subnet than this machine: {networks_text}",
             f"Give the camera an address of a network here, or this machine one of {exam.host}'s: "
             "by the maker's tool (ForceIP), or by ip address add. Through a router a camera is not "
             "found by a search, and its stream rarely comes.",
@@ -234,7 +234,7 @@ async def _ask_camera(exam: _GigEExamination) -> None:
         }
         raise exam.fail(
             f"another application{owner_text} controls it"
-            f"{', on this machine' if is_on_this_machine else ''}: one at a time can",
+            f"{', on this machine' if is_on_this_machine else ''}; only one at a time can",
             "Close the other program: a viewer of the maker, a process of yours that is left over, "
             "an agent. One that was killed loses the camera after its heartbeat's time, some "
             "seconds; while a debugger holds a program, that time can be minutes.",
@@ -304,8 +304,8 @@ async def _look_at_control(exam: _GigEExamination) -> None:
     if mode not in ("", "Continuous"):
         exam.add(
             "hint",
-            f"AcquisitionMode is {mode}: a program that does not set it gets so many pictures, and "
-            "then none",
+            f"AcquisitionMode is {mode}: a program that does not set it gets a picture or a few, "
+            "and then none",
             "smartcam sets Continuous when it opens the camera.",
         )
 
@@ -530,7 +530,7 @@ def _look_at_packets(exam: _GigEExamination, stream: _StreamObservation) -> None
             "error",
             f"packets of {size} bytes are asked for, and this machine's side takes {exam.path_mtu} "
             "(MTU): none of them comes",
-            f"Leave packet_size to the test (gige://{exam.host} alone), write "
+            f"Write gige://{exam.host} without packet_size, so that smartcam finds the size, write "
             f"?packet_size={exam.path_mtu}, or raise the MTU: ip link set DEVICE mtu 9000.",
             Exit.REFUSED,
             details=details,
@@ -575,8 +575,8 @@ async def _explain_silence(exam: _GigEExamination, stream: _StreamObservation) -
             "error",
             f"TriggerMode is On ({triggers}), and no trigger came in {stream.seconds:.1f} s: the "
             "camera waits",
-            "Trigger it, or have it run by itself: ?feature.TriggerMode=Off. Of a line see to its "
-            "wiring, TriggerActivation and the level that the input wants.",
+            "Trigger it, or have it run by itself: ?feature.TriggerMode=Off. If the source is an "
+            "input line, check its wiring, TriggerActivation and the input's level.",
             Exit.TIMED_OUT,
             details={"trigger": triggers},
         )

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from smartcam.doctor._context import FrameObserver
     from smartcam.doctor._findings import Finding, summary
     from smartcam.doctor._found import FoundPort
-    from smartcam.doctor._probing import CameraAnswer, Trial, locate, no_session, trials
+    from smartcam.doctor._probing import CameraAnswer, TracedAttempt, locate, no_session, try_ways
     from smartcam.doctor._search import CameraSearch
 
 __all__ = [
@@ -19,11 +19,11 @@ __all__ = [
     "Finding",
     "FoundPort",
     "FrameObserver",
-    "Trial",
+    "TracedAttempt",
     "locate",
     "no_session",
     "summary",
-    "trials",
+    "try_ways",
 ]
 
 if not TYPE_CHECKING:
@@ -33,7 +33,7 @@ if not TYPE_CHECKING:
             "_found": "FoundPort",
             "_context": "FrameObserver",
             "_findings": "Finding summary",
-            "_probing": "CameraAnswer Trial locate no_session trials",
+            "_probing": "CameraAnswer TracedAttempt try_ways locate no_session",
             "_search": "CameraSearch",
         },
     )

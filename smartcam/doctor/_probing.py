@@ -1,7 +1,7 @@
-"""Find out the protocol, transport and dialect of an address; each try has a new link.
+"""Find out the protocol, transport and dialect of an address; each attempt has a new link.
 
-Every try is a :class:`Trial` with all sent and received bytes, as hex and, if possible, decoded. If
-a camera closes the link without sending a byte, the try is repeated without the Disconnect before
+A :class:`TracedAttempt` has all sent and received bytes, as hex and, if possible, decoded. If a
+camera closes the link without sending a byte, the attempt is repeated without the Disconnect before
 Connect (see :mod:`smartcam._client.handshake`).
 """
 
@@ -13,7 +13,8 @@ import contextlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._client._inside import Attempt, SessionRefusedError, attempt, dialect_names, explain
+from smartcam._client._inside import Attempt, SessionRefusedError, dialect_names, explain
+from smartcam._client._inside import attempt as begin_session
 from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect, Protocol
 
 MAX_FRAMES = 64
-"""Largest number of frames that a trial keeps: a session has six, and a camera may send results at
-once."""
+"""Largest number of frames that an attempt keeps: a session has six, and a camera may send results
+at once."""
 
 CLOSE_TIMEOUT = 1.0
 """Seconds for the orderly end of a session."""
@@ -46,7 +47,7 @@ class CameraAnswer(NamedTuple):
     """A camera's description of itself.
 
     Attributes:
-        url: URL of the camera, with transport and dialect pinned.
+        url: URL of the camera, which names transport and dialect.
         status: first status that the camera sent.
         application: id of the active application.
         protocol_version: protocol version in the answer to Connect.
@@ -59,8 +60,8 @@ class CameraAnswer(NamedTuple):
 
 
 @dataclass(slots=True, kw_only=True)
-class Trial(Attempt):
-    """One try and its outcome; ``outcome`` is ``session`` if a camera answered.
+class TracedAttempt(Attempt):
+    """An attempt and its frames; ``outcome`` is ``session`` if a camera answered.
 
     Attributes:
         address: address that was tried, with the scheme of the transport.
@@ -77,8 +78,8 @@ class Trial(Attempt):
     is_other_protocol: bool = False
 
     def __str__(self) -> str:
-        """Return the try in one line, for an error."""
-        text = super(Trial, self).__str__()
+        """Return the attempt in one line, for an error."""
+        text = super(TracedAttempt, self).__str__()
         return (
             f"{self.address.protocol} at port {self.address.port}: {text}"
             if self.is_other_protocol
@@ -94,7 +95,7 @@ class Trial(Attempt):
 
 
 class Way(NamedTuple):
-    """One way to speak to an address: a protocol, a transport, and its first message."""
+    """One way to begin a session with an address: a transport, and dialects that begin alike."""
 
     address: Address  # address with the scheme of the transport
     transport: Transport  # transport that carries the protocol
@@ -113,12 +114,12 @@ def ways(address: Address) -> list[Way]:
         transport = protocol.schemes[scheme]
         groups = protocol.dialect_groups(transport, parameters=parameters)
         if address.dialect is not None:
-            pinned = protocol.dialect_groups(transport, address.dialect, address.quirks, parameters)
+            given = protocol.dialect_groups(transport, address.dialect, address.quirks, parameters)
             others = [
                 tuple(dialect for dialect in group if dialect.name != address.dialect)
                 for group in groups
             ]
-            groups = pinned + [group for group in others if group]
+            groups = given + [group for group in others if group]
         scheme_address = address._replace(scheme=scheme)
         found += [Way(scheme_address, transport, group) for group in groups]
     return found
@@ -144,17 +145,17 @@ def other_ways(address: Address) -> list[Way]:
     return found
 
 
-async def trials(
+async def try_ways(
     address: Address,
     *,
     timeout: float,
     trace: Callable[[TraceEntry], None] | None = None,
     continue_after_answer: bool = False,
     every_protocol: bool = False,
-) -> AsyncGenerator[Trial]:
-    """Try every way in turn and yield each try; a session is ended before its try is yielded.
+) -> AsyncGenerator[TracedAttempt]:
+    """Try every way in turn and yield each attempt, after the end of its session.
 
-    The pinned options of ``address`` are tried first. ``timeout``: seconds for all tries; each has
+    The options of ``address`` are tried first. ``timeout``: seconds for all attempts; each has
     an equal share of the rest. ``trace``: called with every frame on the wire.
     ``continue_after_answer``: continue after the first way that answers. ``every_protocol``: try
     the other registered protocols, too; a protocol whose greeting was received is next.
@@ -173,22 +174,24 @@ async def trials(
     while remaining:
         way, disconnect_first = remaining.popleft()
         share = max(0.0, deadline - loop.time()) / (len(remaining) + 1)
-        trial = await _try_way(way, share, trace, disconnect_first=disconnect_first)
-        trial.is_other_protocol = trial.address.protocol != address.protocol
-        if trial.hung_up and disconnect_first and way.transport is Transport.TCP:
+        attempt = await _try_way(way, share, trace, disconnect_first=disconnect_first)
+        attempt.is_other_protocol = attempt.address.protocol != address.protocol
+        if attempt.hung_up and disconnect_first and way.transport is Transport.TCP:
             # the camera may have closed because of the Disconnect
             remaining.appendleft((way, False))
-        _put_greeted_first(remaining, trial)
-        yield trial
-        if trial.answer is not None and not continue_after_answer:
+        _put_greeted_first(remaining, attempt)
+        yield attempt
+        if attempt.answer is not None and not continue_after_answer:
             return
 
 
-def _put_greeted_first(remaining: collections.deque[tuple[Way, bool]], trial: Trial) -> None:
-    """If a try has received a protocol's greeting, move the ways of that protocol to the front."""
-    protocol = _greeted_protocol(trial, {way.address.protocol for way, _ in remaining})
+def _put_greeted_first(
+    remaining: collections.deque[tuple[Way, bool]], attempt: TracedAttempt
+) -> None:
+    """If an attempt has received a protocol's greeting, move that protocol's ways to the front."""
+    protocol = _greeted_protocol(attempt, {way.address.protocol for way, _ in remaining})
     if protocol is not None:
-        protocol_and_port = (protocol, trial.address.port)
+        protocol_and_port = (protocol, attempt.address.port)
         reordered = sorted(
             remaining,
             key=lambda pair: (pair[0].address.protocol, pair[0].address.port) != protocol_and_port,
@@ -197,11 +200,11 @@ def _put_greeted_first(remaining: collections.deque[tuple[Way, bool]], trial: Tr
         remaining.extend(reordered)
 
 
-def _greeted_protocol(trial: Trial, names: Iterable[str]) -> str | None:
-    """Return the protocol whose greeting a try has received; None if it has received none."""
-    if trial.answer is not None or trial.transport != Transport.TCP.value:
+def _greeted_protocol(attempt: TracedAttempt, names: Iterable[str]) -> str | None:
+    """Return the protocol whose greeting an attempt has received; None if it has received none."""
+    if attempt.answer is not None or attempt.transport != Transport.TCP.value:
         return None
-    unread = next((entry.hex for entry in trial.frames if entry.direction == "!"), "")
+    unread = next((entry.hex for entry in attempt.frames if entry.direction == "!"), "")
     beginning = bytes.fromhex(unread).lstrip()
     return next((name for name in names if _is_greeting_of(load_protocol(name), beginning)), None)
 
@@ -217,22 +220,23 @@ async def locate(host: str, *, timeout: float) -> str:
 
     Raises:
         ConnectFailedError: the camera answered no protocol; the error has the most informative
-            try, and the cure.
+            attempt, and the cure.
 
     Cancellation: the link is dropped.
     """
-    failed: list[Trial] = []
+    failed: list[TracedAttempt] = []
     address = parse_address(host)
-    async with contextlib.aclosing(trials(address, timeout=timeout, every_protocol=True)) as tries:
-        async for trial in tries:
-            if trial.answer is not None:
-                return trial.answer.url
-            failed.append(trial)
+    attempts = try_ways(address, timeout=timeout, every_protocol=True)
+    async with contextlib.aclosing(attempts):
+        async for attempt in attempts:
+            if attempt.answer is not None:
+                return attempt.answer.url
+            failed.append(attempt)
     raise no_session(host, address, failed) from most_informative_first(failed)[0].error
 
 
-def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectFailedError:
-    """Return the error for failed tries, with the most informative one and the cure."""
+def no_session(host: str, address: Address, failed: Sequence[TracedAttempt]) -> ConnectFailedError:
+    """Return the error for failed attempts, with the most informative one and the cure."""
     ranked = most_informative_first(failed)
     address_tried = ranked[0].address
     explanation = explain(ranked[:1], address_tried, load_protocol(address_tried.protocol))
@@ -244,17 +248,17 @@ def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectF
     )
 
 
-def most_informative_first(failed: Iterable[Trial]) -> list[Trial]:
-    """Return failed tries, the most informative first.
+def most_informative_first(failed: Iterable[TracedAttempt]) -> list[TracedAttempt]:
+    """Return failed attempts, the most informative first.
 
     The order: a refusal, bytes of a frame that is no message, other bytes, silence, no link.
     """
 
-    def rank(trial: Trial) -> tuple[bool, bool, bool, bool]:
-        refused = isinstance(trial.error, (CommandRejectedError, SessionRefusedError))
-        linked = trial.opened and trial.transport == Transport.TCP.value
-        garbage = isinstance(trial.error, ProtocolError)
-        return (not refused, not trial.received, not garbage, not linked)
+    def rank(attempt: TracedAttempt) -> tuple[bool, bool, bool, bool]:
+        refused = isinstance(attempt.error, (CommandRejectedError, SessionRefusedError))
+        linked = attempt.opened and attempt.transport == Transport.TCP.value
+        garbage = isinstance(attempt.error, ProtocolError)
+        return (not refused, not attempt.received, not garbage, not linked)
 
     return sorted(failed, key=rank)
 
@@ -265,36 +269,36 @@ async def _try_way(
     trace: Callable[[TraceEntry], None] | None,
     *,
     disconnect_first: bool,
-) -> Trial:
+) -> TracedAttempt:
     address, transport, dialects = way
-    trial = Trial(dialect_names(dialects), transport.value, address=address)
+    attempt = TracedAttempt(dialect_names(dialects), transport.value, address=address)
 
     def record_frames(frames: Sequence[RawFrame]) -> None:
         for frame in frames:
             entry = frame.entry()
-            trial.keep(entry)
+            attempt.keep(entry)
             if trace is not None:
                 trace(entry)
 
     try:
         async with asyncio.timeout(time_limit):
-            session = await attempt(
+            session = await begin_session(
                 address,
                 dialects,
                 transport,
-                progress=trial,
+                progress=attempt,
                 name=f"{address.host}:{address.port}",
                 max_length=DEFAULT_MAX_LENGTH,
                 trace=record_frames,
                 disconnect_first=disconnect_first,
             )
     except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
-        trial.end(exc, time_limit)
+        attempt.end(exc, time_limit)
     else:
-        trial.outcome = "session"
-        trial.answer = _camera_answer(session)
+        attempt.outcome = "session"
+        attempt.answer = _camera_answer(session)
         await session.link.close(CLOSE_TIMEOUT)
-    return trial
+    return attempt
 
 
 def _camera_answer(session: Session) -> CameraAnswer:

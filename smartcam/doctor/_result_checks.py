@@ -31,12 +31,12 @@ MAX_ROWS = 40
 
 
 class DumpRow(NamedTuple):
-    """One field of the layout, with a container's bytes at its place.
+    """One field of the layout, with a container's bytes at its offset.
 
     Attributes:
-        offset: place of the field's first byte, from the start of the container's data.
+        offset: position of the field's first byte, from the start of the container's data.
         field: name and type of the field.
-        hex: the bytes at its place, as hex, at most 32.
+        hex: the bytes at its offset, as hex, at most 32.
         value: value of the bytes, or a text about missing or extra bytes.
     """
 
@@ -117,8 +117,8 @@ def _size_text(layout: Layout) -> str:
 
 async def look_at_results(exam: Examination) -> None:
     """Check ``layout`` and ``values``: compare the results with ``--interpret-as``."""
-    containers, interpreter = list(exam.witness.last_results), exam.options.interpreter
-    unreadable = exam.witness.read_error
+    containers, interpreter = list(exam.recorder.last_results), exam.options.interpreter
+    unreadable = exam.recorder.read_error
     if unreadable is not None:
         exam.fail(
             f"a result came that cannot be read: {unreadable}",
@@ -241,7 +241,7 @@ PLAUSIBILITY_LIMITS: tuple[_PlausibilityLimit, ...] = (
 
 
 class _ConversionLimit(NamedTuple):
-    """The largest value of a field with a unit that may have been SI before the conversion."""
+    """A bound: if all converted values of a unit are below, the camera may have sent SI units."""
 
     largest: float  # largest such magnitude, SI
     meaning: str  # unit that the camera may send instead
@@ -250,7 +250,7 @@ class _ConversionLimit(NamedTuple):
 
 CONVERSION_LIMITS: dict[str, _ConversionLimit] = {
     "mm": _ConversionLimit(
-        2e-3, "metres", "a camera whose field of view is two metres sends up to 2 for it in metres"
+        2e-3, "metres", "in metres, a camera with a field of view of 2 m sends values up to 2"
     ),
     "deg": _ConversionLimit(
         2 * math.pi * math.pi / 180 + 1e-6, "radians", "a turn is 6.28 in radians, 360 in degrees"
@@ -295,7 +295,7 @@ def _look_at_values(
     for name, value in absurd_values.items():
         exam.report(
             "hint",
-            f"{name} has values such as {value:g}, which nothing measures",
+            f"{name} has values such as {value:g}, which no camera measures",
             "A field before it is missing or has another type, so that all after it are shifted; "
             "or the camera sends no real number there.",
             check="values",

@@ -31,7 +31,7 @@ from smartcam.doctor._found import (
 )
 from smartcam.doctor._networks import AddressSet, Span, parse_host_address, read_span
 from smartcam.doctor._opening import NO_SOCKET_ERRORS, open_port
-from smartcam.doctor._probing import trials
+from smartcam.doctor._probing import try_ways
 from smartcam.exceptions import ConfigurationError
 from smartcam.settings import parse_address
 
@@ -76,7 +76,7 @@ async def find(
     *networks: str,
     ports: Iterable[int] = (),
     protocols: Iterable[str] | None = None,
-    leave: Iterable[str] = (),
+    exclude: Iterable[str] = (),
     may_disturb: bool = False,
     ask: bool = False,
     rate: float = 100.0,
@@ -89,14 +89,14 @@ async def find(
     The protocols' ports are opened, one opening after the other at ``rate``; nothing is sent.
     Cameras that use UDP cannot be found in this way. A camera that serves one client may be
     disturbed by a connection that sends nothing; no document rules this out. Exclude such cameras
-    by ``leave``.
+    by ``exclude``.
 
     Args:
         networks: each ``192.168.0.0/24``, ``192.168.0.10-20``, an address or a host's name. An IPv6
             network has at most 256 addresses.
         ports: further ports to open, which may serve any of the protocols.
         protocols: names of the protocols to look for; default: all that are known.
-        leave: addresses of working cameras that the search leaves out, in the form of
+        exclude: addresses of working cameras that the search does not touch, in the form of
             ``networks``.
         may_disturb: allows asking cameras that serve one client, such as those of ``bvs``.
         ask: also ask the cameras that were found; this takes a camera that serves one client from
@@ -117,7 +117,7 @@ async def find(
         networks,
         ports=ports,
         protocols=protocols,
-        leave=leave,
+        exclude=exclude,
         may_disturb=may_disturb,
         ask=ask,
         rate=rate,
@@ -133,11 +133,11 @@ class CameraSearch:
     """A search. Its results remain after its end, even if it failed. Arguments as in :func:`find`.
 
     Attributes:
-        opened: number of ports that were tried.
+        tried: number of ports that were tried.
         total: number of ports to try, once names are looked up.
         counts: number of tried ports by outcome.
         failure: reason of the first failure of this machine.
-        left_out: addresses that were left out, each with the text that named it.
+        excluded: addresses that were not touched, each with the text that named it.
         has_begun: whether the search has begun to try ports.
     """
 
@@ -147,7 +147,7 @@ class CameraSearch:
         *,
         ports: Iterable[int] = (),
         protocols: Iterable[str] | None = None,
-        leave: Iterable[str] = (),
+        exclude: Iterable[str] = (),
         may_disturb: bool = False,
         ask: bool = False,
         rate: float = 100.0,
@@ -167,12 +167,12 @@ class CameraSearch:
                 f"{excerpt(networks)}"
             )
         networks = [check_text(text, "network", "find", most=MAX_NETWORK_TEXT) for text in networks]
-        leave = [
-            check_text(text, "leave", "find", most=MAX_NETWORK_TEXT)
-            for text in check_all(leave, "leave", "texts of addresses", "find")
+        exclude = [
+            check_text(text, "exclude", "find", most=MAX_NETWORK_TEXT)
+            for text in check_all(exclude, "exclude", "texts of addresses", "find")
         ]
         self._networks = [(text, read_span(text)) for text in networks]
-        self._excluded = [(text, read_span(text, include_ends=True)) for text in leave]
+        self._excluded = [(text, read_span(text, include_ends=True)) for text in exclude]
         self._ports = choose_ports(ports, protocols)
         if ask and not may_disturb:
             check_consent(self._ports)
@@ -184,11 +184,11 @@ class CameraSearch:
         _check_network_sizes(self._networks, max_addresses)
         self._ports_found: dict[tuple[HostAddress, int], FoundPort] = {}
         self._open_count = 0
-        self.opened = 0
+        self.tried = 0
         self.total = 0
         self.counts: collections.Counter[str] = collections.Counter()
         self.failure = ""
-        self.left_out: dict[str, str] = {}
+        self.excluded: dict[str, str] = {}
         self.has_begun = False
 
     @property
@@ -224,7 +224,7 @@ class CameraSearch:
         _check_count(len(addresses), self._max_addresses)
         for text, span in excluded:
             if span.size == 1 and span.first in addresses:
-                self.left_out[str(span.first)] = text
+                self.excluded[str(span.first)] = text
         addresses = addresses.without(AddressSet(span for _, span in excluded))
         self.total = len(addresses) * len(self._ports)
         self.has_begun = True
@@ -263,7 +263,7 @@ class CameraSearch:
             )
         finally:
             self._open_count -= 1
-        self.opened += 1
+        self.tried += 1
         self.counts[opened.outcome] += 1
         self.failure = self.failure or opened.failure
         if opened.outcome == "open":
@@ -340,9 +340,9 @@ async def ask_port(port: FoundPort) -> FoundPort:
     """Ask a found camera in each possible protocol; return the port with the answer or refusal."""
     failed: list[str] = []
     for url in port.urls:
-        async with aclosing(trials(parse_address(url), timeout=ASK_TIMEOUT)) as tries:
-            async for trial in tries:
-                if trial.answer is not None:
-                    return dataclasses.replace(port, answer=trial.answer)
-                failed.append(str(trial))
+        async with aclosing(try_ways(parse_address(url), timeout=ASK_TIMEOUT)) as attempts:
+            async for attempt in attempts:
+                if attempt.answer is not None:
+                    return dataclasses.replace(port, answer=attempt.answer)
+                failed.append(str(attempt))
     return dataclasses.replace(port, refusal="; ".join(failed))

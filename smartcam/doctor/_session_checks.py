@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam._client._inside import dialect_remarks, reason_for, reason_values
 from smartcam.doctor._findings import Exit
-from smartcam.doctor._probing import most_informative_first, trials
-from smartcam.doctor._timing import figures
+from smartcam.doctor._probing import most_informative_first, try_ways
+from smartcam.doctor._timing import time_statistics
 from smartcam.exceptions import (
     ConnectFailedError,
     ProtocolError,
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from smartcam._client._inside import Attempt, Reason
     from smartcam.camera import Camera
     from smartcam.doctor._context import Examination
-    from smartcam.doctor._probing import CameraAnswer, Trial
+    from smartcam.doctor._probing import CameraAnswer, TracedAttempt
     from smartcam.exceptions import SmartCamError
 
 SESSION_COUNT = 5
@@ -77,19 +77,19 @@ async def resolve(exam: Examination) -> None:
 async def connect(exam: Examination) -> None:
     """Check ``session``: make a session, then more to measure the connect time."""
     loop = asyncio.get_running_loop()
-    is_pinned = exam.address.dialect is not None
+    names_dialect = exam.address.dialect is not None
     start = loop.time()
     try:
         camera = await exam.make_camera().open()
     except ConnectFailedError as exc:
-        answered = await _diagnose_failure(exam, exc)
-        if answered is None:
+        found_camera = await _diagnose_failure(exam, exc)
+        if found_camera is None:
             return
-        camera, times, start = answered, list[float](), loop.time()
+        camera, times, start = found_camera, list[float](), loop.time()
     else:
         times = [loop.time() - start]
-    exam.pin(camera.url)
-    first = times[0] if times and not is_pinned else None
+    exam.use_url(camera.url)
+    first = times[0] if times and not names_dialect else None
     try:
         while len(times) < SESSION_COUNT and loop.time() - start < MAX_CONNECTING_SECONDS:
             await camera.close()
@@ -113,14 +113,14 @@ async def connect(exam: Examination) -> None:
 def _report_session(
     exam: Examination, camera: Camera, first: float | None, times: list[float]
 ) -> None:
-    measured = figures(times)
+    measured = time_statistics(times)
     link, dialect = exam.address.scheme, exam.address.dialect
     search = "" if first is None else f"; the first, which found the dialect, {1e3 * first:.1f} ms"
     exam.report(
         "ok",
         f"a camera answers by {link}://, dialect {dialect}, protocol version "
-        f"{camera.protocol_version}; {measured.times} connects: {measured}{search}",
-        "" if first is None else f"Use {camera.url} from now on: it says what was found out.",
+        f"{camera.protocol_version}; {measured.samples} connects: {measured}{search}",
+        "" if first is None else f"Use {camera.url} from now on: it names the dialect.",
         url=camera.url,
         protocol_version=camera.protocol_version,
         connect_time=measured._asdict(),
@@ -134,76 +134,78 @@ def _report_session(
 
 async def _diagnose_failure(exam: Examination, failure: ConnectFailedError) -> Camera | None:
     """Report why there is no session; return a camera if another way leads to one."""
-    given, tries = exam.address, await _try_all(exam)
-    answer = tries[-1].answer
+    given, attempts = exam.address, await _try_all(exam)
+    answer = attempts[-1].answer
     if answer is None:
-        _report_no_session(exam, tries, None)
+        _report_no_session(exam, attempts, None)
         return None
-    exam.pin(answer.url)
+    exam.use_url(answer.url)
     if exam.address.scheme == given.scheme and given.dialect in {None, exam.address.dialect}:
         exam.report(
             "warning",
-            f"no session at first ({failure}), and one a moment later",
+            f"the first attempt failed, the second one had a session: {failure}",
             "Once is no harm: the client tries again. If it happens often, look for another "
             "client.",
             attempts=list(failure.attempts),
         )
     else:
-        _report_no_session(exam, tries, answer)
+        _report_no_session(exam, attempts, answer)
     try:
         return await exam.make_camera().open()
     except ConnectFailedError as exc:
-        exam.fail(f"and it is gone again: {exc}")
+        exam.fail(f"the camera that answered a moment ago is gone: {exc}")
         return None
 
 
-async def _try_all(exam: Examination) -> list[Trial]:
-    """Try every way up to the first one with an answer; return the tries."""
+async def _try_all(exam: Examination) -> list[TracedAttempt]:
+    """Try every way up to the first one with an answer; return the attempts."""
     timeout = exam.options.step_timeout(10.0)
-    tries = trials(exam.address, timeout=timeout, trace=exam.trace, every_protocol=True)
-    async with contextlib.aclosing(tries):
-        return [trial async for trial in tries]
+    attempts = try_ways(exam.address, timeout=timeout, trace=exam.trace, every_protocol=True)
+    async with contextlib.aclosing(attempts):
+        return [attempt async for attempt in attempts]
 
 
-def _report_no_session(exam: Examination, tries: list[Trial], answer: CameraAnswer | None) -> None:
-    address = tries[0].address
-    reason, trial = _find_reason(tries, pinned=address.dialect is not None)
-    texts = reason_values(trial, address, load_protocol(address.protocol))
+def _report_no_session(
+    exam: Examination, attempts: list[TracedAttempt], answer: CameraAnswer | None
+) -> None:
+    address = attempts[0].address
+    reason, attempt = _find_reason(attempts, same_dialect=address.dialect is not None)
+    texts = reason_values(attempt, address, load_protocol(address.protocol))
     if answer is not None:
-        cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
+        cure = f"A camera answers at {answer.url}: use this URL. The next checks were made there."
     else:
-        others = [other for other in most_informative_first(tries) if other is not trial]
-        others_text = f" Also tried: {_tries_text(others)}." if others else ""
+        others = [other for other in most_informative_first(attempts) if other is not attempt]
+        others_text = f" Also tried: {_attempts_text(others)}." if others else ""
         cure = reason.cure.format(**texts) + others_text
     exam.fail(
         reason.text.format(**texts),
         cure,
-        tries=[*map(str, tries)],
-        frames=[tuple(one_try.frames) for one_try in tries],
+        attempts=[*map(str, attempts)],
+        frames=[tuple(attempt.frames) for attempt in attempts],
         answers_at=answer.url if answer is not None else None,
     )
 
 
-def _find_reason(tries: list[Trial], *, pinned: bool) -> tuple[Reason, Attempt]:
-    """Return the reason why the URL gives no session, and the try that shows it."""
-    first = tries[0]
-    similar_tries = [
-        trial
-        for trial in tries
-        if trial.transport == first.transport
-        and not trial.is_other_protocol
-        and (trial.dialect == first.dialect or not pinned)
+def _find_reason(attempts: list[TracedAttempt], *, same_dialect: bool) -> tuple[Reason, Attempt]:
+    """Return the reason why the URL gives no session, and the attempt that shows it."""
+    first = attempts[0]
+    similar_attempts = [
+        attempt
+        for attempt in attempts
+        if attempt.transport == first.transport
+        and not attempt.is_other_protocol
+        and (attempt.dialect == first.dialect or not same_dialect)
     ]
-    return reason_for(similar_tries)
+    return reason_for(similar_attempts)
 
 
-def _tries_text(tries: list[Trial]) -> str:
-    """Return tries in one line; dialects with equal transport and outcome are listed together."""
+def _attempts_text(attempts: list[TracedAttempt]) -> str:
+    """Return attempts in one line; dialects of equal transport and outcome are listed together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
-    for trial in tries:
-        port_text = f" at port {trial.address.port}" if trial.is_other_protocol else ""
-        key = (f"{trial.transport.upper()}{port_text}", trial.step, trial.outcome)
-        groups.setdefault(key, []).append(trial.dialect)
+    for attempt in attempts:
+        port_text = f" at port {attempt.address.port}" if attempt.is_other_protocol else ""
+        key = (f"{attempt.transport.upper()}{port_text}", attempt.step, attempt.outcome)
+        groups.setdefault(key, []).append(attempt.dialect)
     return "; ".join(
         f"{', '.join(dialects)} over {transport}: {step}: {outcome}"
         for (transport, step, outcome), dialects in groups.items()
@@ -251,7 +253,7 @@ async def explain_loss(exam: Examination, error: SmartCamError) -> None:
             **details,
         )
     else:
-        udp_text = " Over UDP a client from which another took the camera is told nothing."
+        udp_text = " Over UDP, a client is not told that another one has taken the camera."
         exam.fail(
             f"the camera fell silent after {age:.1f} s: {error}",
             "Look at cable, switch and power, and for another client."

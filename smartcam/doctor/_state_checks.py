@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.doctor._context import Diagnosis, application_text
 from smartcam.doctor._findings import Exit
-from smartcam.doctor._timing import Figures, figures
+from smartcam.doctor._timing import TimeStatistics, time_statistics
 from smartcam.exceptions import InterpretationError, ResponseTimeoutError
 from smartcam.models import Status
 
 if TYPE_CHECKING:
-    from smartcam.doctor._context import Examination, Witness
+    from smartcam.doctor._context import CameraRecorder, Examination
     from smartcam.doctor._findings import Severity
 
 QUERY_COUNT = 30
@@ -26,7 +26,7 @@ MAX_QUERYING_SECONDS = 3.0
 """Seconds after which no further request is sent, so that a slow link gets fewer requests."""
 
 SLOW_ROUND_TRIP_TIME = 0.05
-"""A round trip of this many seconds or more gives a hint: on a local network one takes
+"""A round trip of more than this many seconds gives a hint: on a local network one takes
 milliseconds."""
 
 MAX_WATCHED_STATUSES = 1000
@@ -54,8 +54,8 @@ _STATUS_FAULTS = (
         Status.SYSTEM_ERROR,
         "error",
         "the camera reports a System Error: it does not work until it is restarted",
-        "Switch it off and on (or camera.reboot() in Python). If it comes back, its log and the "
-        "maker's support are next.",
+        "Switch it off and on (or camera.reboot() in Python). If it comes back, look at its log, "
+        "then ask the maker's support.",
         Exit.REFUSED,
     ),
     _StatusFault(
@@ -75,14 +75,14 @@ _STATUS_FAULTS = (
     _StatusFault(
         Status.OVERTRIGGERED,
         "hint",
-        "the camera has just dropped a trigger: it came while it could not take it",
+        "the camera has just dropped a trigger: it came while the camera could not take one",
         "Trigger more slowly, or from one place only: a sensor or a program.",
     ),
     _StatusFault(
         Status.SIMULATION_MODE,
         "hint",
         "the camera takes its images from files, not from its sensor",
-        "Choose the sensor as the image source, on the camera's pages.",
+        "Choose the sensor as the image source, on the camera's web page.",
     ),
 )
 
@@ -114,9 +114,9 @@ async def measure_round_trip(exam: Examination) -> None:
         sent_at = loop.time()
         await camera.query_application()
         times.append(loop.time() - sent_at)
-    measured = figures(times)
+    measured = time_statistics(times)
     is_slow = measured.median > SLOW_ROUND_TRIP_TIME
-    text = f"{measured.times} requests: {measured}"
+    text = f"{measured.samples} requests: {measured}"
     exam.report(
         "hint" if is_slow else "ok",
         f"{text}; that is slow for a local network" if is_slow else text,
@@ -139,7 +139,7 @@ _DIAGNOSES: tuple[Diagnosis[list[Status]], ...] = (
     Diagnosis(
         lambda statuses: all(Status.BUSY in status for status in statuses),
         "the camera was BUSY for all of the {seconds:g} s",
-        "It loads an application, or somebody works on its pages. If it stays so for minutes, "
+        "It loads an application, or somebody uses its web page. If it stays so for minutes, "
         "restart it.",
         Exit.TIMED_OUT,
     ),
@@ -160,7 +160,7 @@ async def watch(exam: Examination) -> None:
 
     A camera that waits for a trigger is watched only if none will be sent.
     """
-    camera, witness, seconds = exam.connected_camera, exam.witness, exam.options.seconds
+    camera, recorder, seconds = exam.connected_camera, exam.recorder, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
         return  # reported already, and the reason for a missing result
@@ -172,12 +172,12 @@ async def watch(exam: Examination) -> None:
         exam.may_trigger = True
         text = f"{application_text(application)} runs and waits for triggers"
         text += (
-            f"; {witness.result_count} results came in {seconds:g} s"
-            if witness.result_count
+            f"; {recorder.result_count} results came in {seconds:g} s"
+            if recorder.result_count
             else ""
         )
-        exam.report("ok", text, **details, **_rate_details(witness))
-    elif witness.result_count and not is_stopped:
+        exam.report("ok", text, **details, **_rate_details(recorder))
+    elif recorder.result_count and not is_stopped:
         _report_free_run(exam, details)
     else:
         diagnosis = next(diagnosis for diagnosis in _DIAGNOSES if diagnosis.fits(statuses))
@@ -190,13 +190,12 @@ async def watch(exam: Examination) -> None:
 
 
 def _report_free_run(exam: Examination, details: dict[str, Any]) -> None:
-    witness, rate = exam.witness, _rate_details(exam.witness)
+    recorder, rate = exam.recorder, _rate_details(exam.recorder)
     application = application_text(exam.connected_camera.active_application)
-    text = f"{application} runs free: {witness.result_count} results in {exam.options.seconds:g} s"
+    text = f"{application} runs free: {recorder.result_count} results in {exam.options.seconds:g} s"
     if rate:
-        text += (
-            f", {rate['results_per_second']:.1f} a second; intervals: {_interval_figures(witness)}"
-        )
+        intervals = _interval_statistics(recorder)
+        text += f", {rate['results_per_second']:.1f} a second; intervals: {intervals}"
     wants_trigger = exam.wants_trigger
     exam.report(
         "error" if wants_trigger else "ok",
@@ -219,7 +218,7 @@ async def _watch_status(exam: Examination, seconds: float) -> list[Status]:
         statuses.append(status)
         return False
 
-    exam.witness.forget_arrivals()
+    exam.recorder.forget_arrivals()
     # keep a subscription open while watching, since results are made only for subscribers
     async with exam.connected_camera.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
@@ -227,20 +226,20 @@ async def _watch_status(exam: Examination, seconds: float) -> list[Status]:
     return list(statuses)
 
 
-def _interval_figures(witness: Witness) -> Figures:
-    return figures([after - before for before, after in pairwise(witness.arrival_times)])
+def _interval_statistics(recorder: CameraRecorder) -> TimeStatistics:
+    return time_statistics([after - before for before, after in pairwise(recorder.arrival_times)])
 
 
-def _rate_details(witness: Witness) -> dict[str, Any]:
+def _rate_details(recorder: CameraRecorder) -> dict[str, Any]:
     """Return the rate of unasked results and the spread of their intervals; {} for one result."""
-    arrival_times = witness.arrival_times
+    arrival_times = recorder.arrival_times
     if len(arrival_times) < 2:
         return {}
     span = arrival_times[-1] - arrival_times[0]
     return {
-        "results": witness.result_count,
+        "results": recorder.result_count,
         "results_per_second": (len(arrival_times) - 1) / span if span else 0.0,
-        "interval": _interval_figures(witness)._asdict(),
+        "interval": _interval_statistics(recorder)._asdict(),
     }
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.doctor._context import application_text
 from smartcam.doctor._findings import Exit
-from smartcam.doctor._timing import figures
+from smartcam.doctor._timing import time_statistics
 from smartcam.exceptions import (
     CommandRejectedError,
     InterpretationError,
@@ -47,7 +47,7 @@ async def look_at_application(exam: Examination) -> None:
             f"{application_text(active)} is active, not {wanted}; whether the camera has {wanted} "
             "cannot be known without loading it",
             f"smartcam switch '{camera.url}' {wanted} loads it. With --trigger the doctor loads "
-            "it, and the one before again afterwards.",
+            "it, and at the end the present one again.",
             **details,
         )
 
@@ -61,7 +61,7 @@ async def _load_for_triggers(exam: Examination, active: int, wanted: int) -> Non
     except CommandRejectedError as exc:
         exam.fail(
             f"the camera has no application {wanted}: {exc}",
-            "Look up the id on the camera's pages. The camera refuses a damaged one, too.",
+            "Look up the id on the camera's web page. The camera refuses a damaged one, too.",
             exit_code=Exit.REFUSED,
             **details,
         )
@@ -97,7 +97,7 @@ async def send_triggers(exam: Examination) -> None:
     start = end = loop.time()
     async with camera.results(max_queue=1):
         for _ in range(options.count):
-            exam.witness.statuses.clear()
+            exam.recorder.statuses.clear()
             sent_at = loop.time()
             try:
                 result = await camera.trigger(timeout=options.step_timeout(5.0))
@@ -112,15 +112,15 @@ async def send_triggers(exam: Examination) -> None:
             times.append(end - sent_at if result.latency is None else result.latency)
     if not times:
         return
-    measured = figures(times)
+    measured = time_statistics(times)
     rate = len(times) / max(end - start, sum(times))
-    text = f"{measured.times} triggers to their results: {measured}; {rate:.1f} results a second"
+    text = f"{measured.samples} triggers, to the result: {measured}; {rate:.1f} results a second"
     exam.report("ok", text, trigger_time=measured._asdict(), results_per_second=rate)
     extra_count = camera.statistics().extra_results
     if extra_count:
         exam.report(
             "hint",
-            f"{extra_count} results more than triggers came: the application sends several for "
+            f"{extra_count} more results than triggers came: the application sends several for "
             "each",
             "Tell the client how many: camera.trigger(results_per_trigger=...).",
             extra_results=extra_count,
@@ -137,7 +137,7 @@ def _report_failure(exam: Examination, error: SmartCamError, result_count: int) 
             error=type(error).__name__,
         )
         return
-    was_waiting = [Status.WAITING_FOR_TRIGGER in status for status in exam.witness.statuses]
+    was_waiting = [Status.WAITING_FOR_TRIGGER in status for status in exam.recorder.statuses]
     fell = False in was_waiting
     rose = fell and True in was_waiting[was_waiting.index(False) :]
     timeout = exam.options.step_timeout(5.0)

@@ -37,7 +37,7 @@ class Application(EmulatorData):
 
     At most one of ``constant``, ``cycle`` and ``generator`` gives the values of the result
     container; without any of them the application has no "send results" tool and sends nothing.
-    Values are built once when the application is made; a generator is called once for that.
+    As a check, containers are built once when the application is made, so a generator is called.
 
     Raises:
         pydantic.ValidationError: a field is wrong, or its values do not fit the layout.
@@ -101,8 +101,8 @@ class Application(EmulatorData):
         return None if self.input is None else Layout(self.input, lenient=True)
 
     @property
-    def period(self) -> int | None:
-        """Number of runs after which the containers repeat; None if each run makes a new one."""
+    def repeat_after(self) -> int | None:
+        """Number of runs after which the results repeat; None if each run makes a new one."""
         layout = self.result_layout
         if layout is None or layout.sequence_field is not None or self.generator is not None:
             return None
@@ -112,7 +112,7 @@ class Application(EmulatorData):
         self,
         *,
         number: int,
-        turn: int,
+        run_index: int,
         time: float,
         scene: TableScene,
         values: Mapping[str, Any] | None = None,
@@ -122,7 +122,7 @@ class Application(EmulatorData):
 
         Args:
             number: the run's sequence number.
-            turn: number of runs of this application before this one, since it was loaded.
+            run_index: number of runs of this application before this one, since it was loaded.
             time: seconds since the device was made.
             scene: the scene that the camera sees.
             values: values of the input container.
@@ -135,7 +135,7 @@ class Application(EmulatorData):
         layout = self.result_layout
         if layout is None:
             return None
-        run = Run(number, turn, time, layout, scene, values, self.parameters)
+        run = Run(number, run_index, time, layout, scene, values, self.parameters)
         return self.container_of(self._values(run), number=number, byte_order=byte_order)
 
     def container_of(
@@ -172,7 +172,7 @@ class Application(EmulatorData):
         if self.constant is not None:
             return self.constant
         if self.cycle is not None:
-            return self.cycle[run.turn % len(self.cycle)]
+            return self.cycle[run.run_index % len(self.cycle)]
         generator = self.generator
         if generator is None:
             raise ConfigurationError(f"application {self.id} has a layout and no values")
@@ -202,10 +202,10 @@ class Application(EmulatorData):
 
     def _try_values(self) -> None:
         entries = self.cycle or ()
-        for turn in range(max(1, len(entries))):
-            prefix = f"cycle.{turn}: " if entries else ""
+        for index in range(max(1, len(entries))):
+            prefix = f"cycle.{index}: " if entries else ""
             try:
-                self.container(number=0, turn=turn, time=0.0, scene=TableScene())
+                self.container(number=0, run_index=index, time=0.0, scene=TableScene())
             except SmartCamError as exc:
                 raise ValueError(f"{prefix}{exc}") from exc
             except ENDS_PROGRAM:

@@ -86,7 +86,7 @@ class EmulatedCamera(WireCamera):
             the scenario's, else ``handbook``. ``bid`` is a BVS ID: it runs always, and
             answers every request with a result code.
         clock: clock of the camera; a :class:`ManualClock` in tests. Default: real time.
-        quirks: unknown behaviour of real cameras: :class:`Quirks` or a mapping of its fields.
+        quirks: choices where real cameras are unknown: :class:`Quirks` or a mapping of its fields.
         name: name of the camera in logs.
         active: id of the application that is loaded at first; default the first given one, else 1.
         running: True for run mode from the beginning.
@@ -114,7 +114,7 @@ class EmulatedCamera(WireCamera):
         ConfigurationError: an argument is wrong.
     """
 
-    takes: ClassVar[frozenset[str]] = frozenset(
+    accepted_options: ClassVar[frozenset[str]] = frozenset(
         {"scenario", "dialect", "transport", "seed", "web", "replay"}
     )
     states: ClassVar[frozenset[DeviceState]] = frozenset(DeviceState)
@@ -166,7 +166,8 @@ class EmulatedCamera(WireCamera):
             builtins=builtins,
         )
         self.scenario: Scenario = plan
-        self.spoken: FramedDialect = BVS.dialects[plan.dialect].with_quirks(plan.quirks.of_the_wire)
+        wire_quirks = plan.quirks.of_the_wire
+        self.wire_dialect: FramedDialect = BVS.dialects[plan.dialect].with_quirks(wire_quirks)
         self.device: Device = Device(
             plan.all_applications,
             active=plan.active,
@@ -174,10 +175,10 @@ class EmulatedCamera(WireCamera):
             quirks=plan.quirks,
             scene=TableScene(seed=plan.seed),
             clock_time=LOST_CLOCK if isinstance(clock, ManualClock) else datetime.now(UTC),
-            behaviour=behaviour_of(self.spoken, plan.quirks),
+            behaviour=behaviour_of(self.wire_dialect, plan.quirks),
         )
         super().__init__(
-            spoken=self.spoken,
+            codec=self.wire_dialect,
             device=self.device,
             host=host,
             port=plan.port,
@@ -189,9 +190,9 @@ class EmulatedCamera(WireCamera):
             timeline=plan.timeline,
             applications=self.device.applications,
         )
-        self.device.around = self.step
+        self.device.action_context = self.step
         self._session_link: ClientLink | SecondClientSession | None = None
-        self._moved_at = 0.0
+        self._advanced_at = 0.0
         self.queue.add(faults)
 
     @classmethod
@@ -222,7 +223,7 @@ class EmulatedCamera(WireCamera):
 
     @classmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
-        """Return the place of something unsupported in a scenario, and the reason; or None."""
+        """Return the path of an unsupported field in a scenario, and the reason; or None."""
         dialect = BVS.dialects[plan.dialect]
         known = [application.id for application in plan.all_applications]
         for number, application in enumerate(plan.applications):
@@ -239,12 +240,12 @@ class EmulatedCamera(WireCamera):
             asked_text = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
             return ("active",), f"no application has {asked_text}; there are {ids_text}{ellipsis}"
         try:
-            spoken = dialect.with_quirks(plan.quirks.of_the_wire)
+            wire_dialect = dialect.with_quirks(plan.quirks.of_the_wire)
         except ConfigurationError as exc:
             return ("quirks",), str(exc)
         for number, cue in enumerate(plan.timeline):
             for fault_index, fault in enumerate(cue.do):
-                problem = find_unsupported(fault, spoken, known)
+                problem = find_unsupported(fault, wire_dialect, known)
                 if problem is not None:
                     return ("timeline", number, "do", fault_index, problem[0]), problem[1]
         return None
@@ -268,7 +269,7 @@ class EmulatedCamera(WireCamera):
             self.host,
             self.port,
             self.dialect,
-            self.spoken.quirks,
+            self.wire_dialect.quirks,
             ((SHOWS_TRIGGERS, "no"),) if hidden else (),
         ).url
 
@@ -303,7 +304,7 @@ class EmulatedCamera(WireCamera):
         last = self.device.last_report
         if last is None:
             return None
-        return last._replace(time=self._moved_at - (self.device.time - last.time))
+        return last._replace(time=self._advanced_at - (self.device.time - last.time))
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
         """Return the application that describes a result; None without one."""
@@ -351,7 +352,7 @@ class EmulatedCamera(WireCamera):
     def make_machine(self, transport: Transport, trace: Trace) -> Machine:
         """Return the machine of a new link."""
         return Machine(
-            self.spoken,
+            self.wire_dialect,
             Role.CAMERA,
             transport,
             max_length=MAX_INPUT_BYTES,
@@ -367,12 +368,12 @@ class EmulatedCamera(WireCamera):
             policy, reports_malformed=self.device.behaviour.answers_bad_messages
         )
 
-    def received(self, link: ClientLink, message: m.Message) -> None:
+    def handle_message(self, link: ClientLink, message: m.Message) -> None:
         """Handle a message of a link; without the session only Connect has an effect."""
         connects = isinstance(message, m.Connect)
         if not connects and link is not self._session_link:
             return
-        faults = self._fire_before(self.queue.device_on_client, message)
+        faults = self._fire_before(self.queue.client_device_faults, message)
         if connects and not link.closed:
             self._connect(link)
         elif link is self._session_link:  # a fault may have given the session to another
@@ -390,7 +391,7 @@ class EmulatedCamera(WireCamera):
         """Return True if the link has the session."""
         return link is self._session_link
 
-    def lost(self, link: ClientLink) -> None:
+    def forget_link(self, link: ClientLink) -> None:
         """Forget a link that is gone; end its session, if it has the session."""
         if link is self._session_link:
             self._end_session()
@@ -403,7 +404,7 @@ class EmulatedCamera(WireCamera):
             or not self._may_take_over(None)
         ):
             return
-        self._give_session(SecondClientSession(self.spoken, self._note_second_client))
+        self._give_session(SecondClientSession(self.wire_dialect, self._note_second_client))
 
     def _note_second_client(self, frame: Frame) -> None:
         self._log_content(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
@@ -434,7 +435,7 @@ class EmulatedCamera(WireCamera):
     # ------------------------------------------------------------------ steps
 
     def _after_start(self) -> None:
-        self._moved_at = self.clock.now
+        self._advanced_at = self.clock.now
         if self._timeline.watches_states:
             self.device.watch(self._on_state_entered)
 
@@ -450,13 +451,13 @@ class EmulatedCamera(WireCamera):
         self._send_all(self.device.take_output(), fire_faults=False)
 
     def _advance_device(self, now: float) -> None:
-        passed, self._moved_at = now - self._moved_at, now
+        passed, self._advanced_at = now - self._advanced_at, now
         self.device.tick(max(0.0, passed))
 
     def _collect(self) -> None:
         """Put the device's messages into the active link's next write."""
         output = self.device.take_output()
-        if self.queue.device_on_camera:
+        if self.queue.camera_device_faults:
             self._send_all(output, fire_faults=True)
         elif self._session_link is not None:
             for message in output:
@@ -464,9 +465,9 @@ class EmulatedCamera(WireCamera):
 
     def _send_all(self, output: list[m.Message], *, fire_faults: bool) -> None:
         """Send messages to the client that has the session; they may trigger faults."""
-        session = self._session_link
+        session, waiting = self._session_link, self.queue.camera_device_faults
         for message in output:
-            faults = self._fire_before(self.queue.device_on_camera, message) if fire_faults else ()
+            faults = self._fire_before(waiting, message) if fire_faults else ()
             if session is not None and session is self._session_link and self.device.connected:
                 session.send(message)
             self._run_device_faults(faults, "after")
@@ -481,7 +482,7 @@ class EmulatedCamera(WireCamera):
         elif self._is_down and not self.device.rebooting:
             self._come_up()
         delay = self.device.next_event_in()
-        self._timer.set(None if delay is None else nanoseconds(self._moved_at + delay))
+        self._timer.set(None if delay is None else nanoseconds(self._advanced_at + delay))
 
     # ------------------------------------------------------------------ the port
 

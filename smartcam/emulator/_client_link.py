@@ -3,7 +3,7 @@
 The owner of a link makes the link's protocol machine, which has the camera's role. A link has a
 :class:`FaultyLink` only while wire faults wait or hold messages back. Then the camera's messages go
 ``FaultyLink.send -> apply_faults -> DelayLine -> ClientLink.write``, and the client's go
-``FaultyLink.take_bytes -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
+``FaultyLink.take_bytes -> parse -> apply_faults -> DelayLine -> ClientLink.feed``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias
 
 from smartcam.emulator._clock import OneTimer, nanoseconds
 from smartcam.emulator.faults._delay_line import DelayLine
-from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
+from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, parse, parse_one
 from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import Frame, Transport
 from smartcam.protocols import messages as m
@@ -95,11 +95,11 @@ class LinkOwner(Protocol):
         """Return the machine of a new link."""
         ...
 
-    def arrived(self, link: ClientLink) -> None:
+    def connection_begun(self, link: ClientLink) -> None:
         """Note that a connection was made."""
         ...
 
-    def received(self, link: ClientLink, message: m.Message) -> None:
+    def handle_message(self, link: ClientLink, message: m.Message) -> None:
         """Handle a message of a link."""
         ...
 
@@ -107,7 +107,7 @@ class LinkOwner(Protocol):
         """Return True if the link has the session."""
         ...
 
-    def lost(self, link: ClientLink) -> None:
+    def forget_link(self, link: ClientLink) -> None:
         """Forget a link that is gone; a second call does nothing."""
         ...
 
@@ -115,13 +115,13 @@ class LinkOwner(Protocol):
         """Note that a connection has ended."""
         ...
 
-    def traced(
+    def note_frame(
         self, link: ClientLink, sender: m.Sender, content: Frame | RemoteProtocolError
     ) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         ...
 
-    def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
+    def note_message(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
         """Note a message that passed or was lost, in the form that faults gave it."""
         ...
 
@@ -140,7 +140,7 @@ class ClientLink(ABC):
 
     def send(self, message: m.Message) -> None:
         """Add a message to the messages that :meth:`flush` will write."""
-        if self._owner.queue.wire_on_camera and self._faulty is None:
+        if self._owner.queue.camera_wire_faults and self._faulty is None:
             self._enter_faulty()
         try:
             self.machine.send(message)
@@ -165,9 +165,9 @@ class ClientLink(ABC):
         """True if the link has the session, so that it is never closed for a new client."""
         return self._owner.serves(self)
 
-    def close_for(self, why: str) -> None:
+    def close_for(self, reason: str) -> None:
         """End the link for a new client, or because it had no session for too long."""
-        self.close(why)
+        self.close(reason)
 
     @abstractmethod
     def close(self, reason: str) -> None:
@@ -190,14 +190,14 @@ class ClientLink(ABC):
         self.machine.receive_data(data)
         for event in self.machine.events():
             if isinstance(event, m.Message) and not self.closed:
-                self._owner.received(self, event)
+                self._owner.handle_message(self, event)
 
     @abstractmethod
     def write(self, data: bytes) -> bool:
         """Write bytes together; return False if that is not possible."""
 
     @abstractmethod
-    def end_link(self, manner: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], reason: str = "a fault ends it") -> None:
         """End the link after the bytes written so far, or by a reset."""
 
     def set_paused(self, paused: bool) -> None:  # noqa: B027  only TCP keeps unread bytes
@@ -208,7 +208,7 @@ class ClientLink(ABC):
         """Stop reading for good."""
 
     @abstractmethod
-    def heal(self) -> None:
+    def end_fault_effects(self) -> None:
         """End the lasting effects of faults on the link."""
 
     def overflow(self) -> None:
@@ -221,7 +221,7 @@ class ClientLink(ABC):
 
     def _handle_bytes(self, data: bytes) -> None:
         """Handle received bytes: a part of a stream, or one datagram."""
-        if self._faulty is None and not self._owner.queue.wire_on_client:
+        if self._faulty is None and not self._owner.queue.client_wire_faults:
             self.feed(data)
         else:
             self._enter_faulty().take_bytes(data)
@@ -239,7 +239,7 @@ class ClientLink(ABC):
 
     def _trace(self, sender: m.Sender, content: Frame | RemoteProtocolError) -> None:
         if self._faulty is None or sender is m.Sender.CLIENT:
-            self._owner.traced(self, sender, content)
+            self._owner.note_frame(self, sender, content)
 
 
 @dataclass(eq=False)
@@ -272,7 +272,7 @@ class FaultyLink:
     ) -> DelayLine[WireMessage]:
         return DelayLine(
             self._owner.clock,
-            ordered=self.machine.transport is Transport.TCP,
+            keeps_order=self.machine.transport is Transport.TCP,
             wake=wake,
             carry=carry,
             end=self._end_link,
@@ -301,7 +301,7 @@ class FaultyLink:
         self._outgoing.close()
         self._incoming.close()
 
-    def heal(self) -> None:
+    def end_fault_effects(self) -> None:
         """Read and write again."""
         self._revival_timer.set(None)
         self.muted_by, self.is_dead = None, False
@@ -312,7 +312,7 @@ class FaultyLink:
         """Add a message of the camera, and its bytes; call :meth:`run` next."""
         dialect, queue = self._owner.codec, self._owner.queue
         frame = dialect.to_frame(message)
-        faults = queue.by_message(queue.wire_on_camera, message)
+        faults = queue.by_message(queue.camera_wire_faults, message)
         self._add_messages(
             self._outgoing, apply_faults(WireMessage.of(frame, data), faults, dialect)
         )
@@ -328,9 +328,9 @@ class FaultyLink:
             if was_written:
                 message.passed_bytes += data
             elif data:
-                message.faults.append(self._loss_reason)
+                message.effects.append(self._loss_reason)
             if not message.parts:
-                self._owner.passed(self._link, m.Sender.CAMERA, message)
+                self._owner.note_message(self._link, m.Sender.CAMERA, message)
 
     def _wake_outgoing(self) -> None:
         with self._owner.step():
@@ -343,9 +343,9 @@ class FaultyLink:
         """Add bytes of the client: a part of a stream, or one datagram."""
         if self.is_dead:
             return
-        faults_wait = self._owner.queue.wire_on_client
+        faults_wait = self._owner.queue.client_wire_faults
         if self.machine.transport is Transport.UDP:
-            self._add_client_message(cut_datagram(data, self._owner.codec))
+            self._add_client_message(parse_one(data, self._owner.codec))
             return
         if self._framer is None:
             data = self._finish_frame(data) if faults_wait else data
@@ -353,15 +353,16 @@ class FaultyLink:
                 self._link.feed(data)
                 return
             self._framer = self._owner.codec.framer(MAX_INPUT_BYTES)
-        for message in cut(data, self._framer, self._owner.codec):
+        for message in parse(data, self._framer, self._owner.codec):
             if self.is_dead or self._link.closed:
                 return
             self._add_client_message(message)
-        self._stop_cutting()
+        self._stop_parsing()
 
-    def _stop_cutting(self) -> None:
+    def _stop_parsing(self) -> None:
         """Pass an unfinished frame's bytes to the machine, if no fault needs the whole frame."""
-        if self._framer is not None and not self._owner.queue.wire_on_client and not self._incoming:
+        faults_wait = self._owner.queue.client_wire_faults
+        if self._framer is not None and not faults_wait and not self._incoming:
             pending, self._framer = self._framer.pending, None
             self._link.feed(pending)
 
@@ -377,7 +378,7 @@ class FaultyLink:
         queue, frame = self._owner.queue, message.content
         faults: list[Fault] = []
         if isinstance(frame, Frame):
-            faults = queue.by_frame(queue.wire_on_client, frame)
+            faults = queue.by_frame(queue.client_wire_faults, frame)
         self._add_messages(self._incoming, apply_faults(message, faults, self._owner.codec))
         self._incoming.run()
 
@@ -385,19 +386,19 @@ class FaultyLink:
         for message, data in batch:
             is_gone = self.is_dead or self._link.closed
             if is_gone:
-                message.faults.append(self._loss_reason)
-            if is_gone or (message.faults and not data):
-                self._owner.passed(self._link, m.Sender.CLIENT, message)
+                message.effects.append(self._loss_reason)
+            if is_gone or (message.effects and not data):
+                self._owner.note_message(self._link, m.Sender.CLIENT, message)
                 continue
             message.passed_bytes += data
-            self._link.input_faults = ", ".join(message.faults) or None
+            self._link.input_faults = ", ".join(message.effects) or None
             self._link.feed(data)
             self._link.input_faults = None
 
     def _wake_incoming(self) -> None:
         with self._owner.step():
             self._incoming.run()
-            self._stop_cutting()
+            self._stop_parsing()
             self._link.answer_messages()
 
     # ------------------------------------------------------------------ both
@@ -413,8 +414,8 @@ class FaultyLink:
             line.put(sent)
 
     def _report_lost(self, sender: m.Sender, message: WireMessage) -> None:
-        message.faults.append(self._loss_reason)
-        self._owner.passed(self._link, sender, message)
+        message.effects.append(self._loss_reason)
+        self._owner.note_message(self._link, sender, message)
 
     @property
     def _loss_reason(self) -> str:
@@ -439,7 +440,7 @@ class FaultyLink:
 
     def _revive(self) -> None:
         with self._owner.step():
-            self._link.heal()
+            self._link.end_fault_effects()
 
 
 @dataclass(eq=False)

@@ -1,4 +1,4 @@
-"""The base class of several makes' emulated cameras, which evaluate one part after another."""
+"""The base class of emulated cameras of several makes, which evaluate one part after another."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ HandlerT = TypeVar("HandlerT", bound="Handler")
 KindT = TypeVar("KindT")
 
 
-def request(form: str) -> Callable[[HandlerT], HandlerT]:
-    """Mark a method of an :class:`EvaluatingCamera` that answers the requests of a form.
+def request(pattern: str) -> Callable[[HandlerT], HandlerT]:
+    """Mark a method of an :class:`EvaluatingCamera` that answers the requests of a pattern.
 
-    The method gets the client and the groups of the form, and returns the answer, or None for an
+    The method gets the client and the groups of the pattern, and returns the answer, or None for an
     answer that is sent later. The first line of its docstring explains the request.
     """
 
     def mark(method: HandlerT) -> HandlerT:
-        method.form = re.compile(form, re.DOTALL)  # type: ignore[attr-defined]
+        method.pattern = re.compile(pattern, re.DOTALL)  # type: ignore[attr-defined]
         return method
 
     return mark
 
 
 def applications_of(
-    kind: Callable[..., KindT],
+    application_class: Callable[..., KindT],
     given: Iterable[int | Mapping[str, Any]],
     defaults: Mapping[str, Any] | None,
 ) -> list[KindT]:
@@ -46,7 +46,7 @@ def applications_of(
     """
     entries = [{"id": entry} if isinstance(entry, int) else entry for entry in given]
     try:
-        return [kind(**{**(defaults or {}), **fields}) for fields in entries]
+        return [application_class(**{**(defaults or {}), **fields}) for fields in entries]
     except TypeError as exc:
         raise ConfigurationError(f"applications: {exc}") from exc
 
@@ -84,22 +84,22 @@ class EvaluatingCamera(LineCamera):
     def __init_subclass__(cls, **given: Any) -> None:
         """Collect the methods that answer requests, in order."""
         super().__init_subclass__(**given)
-        methods = {method.form: method for method in vars(cls).values() if hasattr(method, "form")}
+        methods = {m.pattern: m for m in vars(cls).values() if hasattr(m, "pattern")}
         cls.requests = {**cls.requests, **methods}
 
-    def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *none: int) -> None:
+    def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *idle: int) -> None:
         """Set the parts of each application by its number.
 
         Args:
             parts: parts of each application, by its number.
             active: number of the active application; None for the first one.
-            none: numbers that mean that no application is active.
+            idle: numbers that mean that no application is active.
 
         Raises:
             ConfigurationError: there is no such application, or one has no parts.
         """
         self.active: int = next(iter(parts), 0) if active is None else active
-        if self.active not in {*none, *parts}:
+        if self.active not in {*idle, *parts}:
             raise ConfigurationError(f"active: one of {[*parts]} was expected, got {active!r}")
         if not all(parts.values()):
             raise ConfigurationError("parts: at least one was expected")
@@ -123,9 +123,9 @@ class EvaluatingCamera(LineCamera):
         return list(self._numbers_of_applications)
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Answer a request of one of the forms, unless its method answers later."""
-        for form, method in self.requests.items():
-            match = form.fullmatch(line)
+        """Answer a request of one of the patterns, unless its method answers later."""
+        for pattern, method in self.requests.items():
+            match = pattern.fullmatch(line)
             if match is not None:
                 answer = method(self, client, *match.groups())
                 if answer is not None:
@@ -134,7 +134,7 @@ class EvaluatingCamera(LineCamera):
         client.answer(self.unknown(line))
 
     def unknown(self, line: str) -> str:
-        """Return the answer to a request of an unknown form."""
+        """Return the answer to a request that no pattern fits."""
         raise NotImplementedError
 
     # ------------------------------------------------------------------ evaluations
@@ -150,11 +150,11 @@ class EvaluatingCamera(LineCamera):
         """Seconds of an evaluation."""
         raise NotImplementedError
 
-    def report_evaluation(self, call: LineClient | None, part: Any) -> None:
+    def report_evaluation(self, client: LineClient | None, part: Any) -> None:
         """Report the values of a part to the client that asked for them, and to others."""
         raise NotImplementedError
 
-    def voided(self, call: LineClient) -> None:
+    def voided(self, client: LineClient) -> None:
         """Answer a request whose evaluation gives no result; nothing unless overridden."""
 
     def overrun(self) -> None:
@@ -168,25 +168,25 @@ class EvaluatingCamera(LineCamera):
         super()._before_stop()
         self.busy, self._asking_client, self._run_number = False, None, self._run_number + 1
 
-    def begin_evaluation(self, call: LineClient | None) -> None:
-        """Begin an evaluation; ``call``: the client that asked for it, None for a trigger input."""
-        self.busy, self._run_number, self._asking_client = True, self._run_number + 1, call
+    def begin_evaluation(self, client: LineClient | None) -> None:
+        """Begin an evaluation; ``client`` asked for it, None: a trigger input."""
+        self.busy, self._run_number, self._asking_client = True, self._run_number + 1, client
         run_number = self._run_number
         self.after(self.evaluation_time, lambda: self._end(run_number))
 
     def _end(self, run_number: int) -> None:
         if run_number != self._run_number:
             return
-        call, self._asking_client, self.busy = self._asking_client, None, False
+        client, self._asking_client, self.busy = self._asking_client, None, False
         self.report_evaluation(
-            None if call is None or call.is_closed else call, next(self.parts[self.active])
+            None if client is None or client.is_closed else client, next(self.parts[self.active])
         )
         self.activated()
 
     def activate(self, application: int) -> None:
         """Make another application the active one; the running evaluation gives no result."""
-        call, self._asking_client, self.busy = self._asking_client, None, False
+        client, self._asking_client, self.busy = self._asking_client, None, False
         self.active, self._run_number = application, self._run_number + 1
-        if call is not None and not call.is_closed:
-            self.voided(call)
+        if client is not None and not client.is_closed:
+            self.voided(client)
         self.activated()

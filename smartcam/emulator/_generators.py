@@ -1,9 +1,9 @@
 """Generators: functions, known by name, that make the values of an application's results.
 
 A generator gets a :class:`Run` and returns a value for ``Layout.build``: a mapping for a record, a
-list of mappings for ``( ... )*``. :func:`register_generator` adds a generator that scenario files
-can name, and so does a plug-in (entry points ``smartcam.generators``); in Python the function
-itself can be given.
+list of mappings if it repeats, ``( ... )*``. :func:`register_generator` adds a generator
+that scenario files can name, and so does a plug-in (entry points ``smartcam.generators``); in
+Python the function itself can be given.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Run(NamedTuple):
 
     Attributes:
         number: the run's sequence number.
-        turn: number of runs of this application before this run, since it was loaded.
+        run_index: number of runs of this application before this run, since it was loaded.
         time: seconds since the device was made.
         layout: layout of the result.
         scene: the table that the camera sees.
@@ -37,7 +37,7 @@ class Run(NamedTuple):
     """
 
     number: int
-    turn: int
+    run_index: int
     time: float
     layout: Layout
     scene: TableScene
@@ -135,7 +135,7 @@ def _localization(observation: Observation, *, x: float, y: float, theta: float)
 
 
 def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Values:
-    """Return the fields that the layout has; ``pieces`` in the parameters picks and orders."""
+    """Return the layout's fields; the parameter ``pieces`` gives the pieces and their order."""
     observations = {observation.name: observation for observation in run.scene.measure()}
     wanted: Sequence[str] = run.parameters.get("pieces", list(observations))
     names = {field.name for field in run.layout.fields}
@@ -150,7 +150,7 @@ def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Value
 
 
 def _sequence(run: Run) -> Values:
-    """The run's number in the ``@sequence`` field, else in ``field`` or the layout's first."""
+    """The run's number in the parameter ``field``, else in the ``@sequence`` or the first field."""
     fields = run.layout.head or run.layout.fields
     number_field = run.layout.sequence_field
     name = run.parameters.get(

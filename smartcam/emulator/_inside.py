@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._scenario.file import load_scenarios, scenario_schema
     from smartcam.emulator._scene import PIECES, TABLE_SIZE, Observation
     from smartcam.emulator._tally import Tally
-    from smartcam.emulator._traffic import LogEntry, Visit
+    from smartcam.emulator._traffic import EndedConnection, LogEntry
     from smartcam.emulator.faults import FiredFault
     from smartcam.emulator.faults._base import MESSAGE_NAMES, BaseFault, DeviceFault, known_name
     from smartcam.emulator.faults._delay_line import DelayLine, Ending, Transmission
@@ -37,6 +37,7 @@ __all__ = [
     "DelayLine",
     "Device",
     "DeviceFault",
+    "EndedConnection",
     "Ending",
     "EvaluatingCamera",
     "FiredFault",
@@ -55,7 +56,6 @@ __all__ = [
     "TimerHandle",
     "Transmission",
     "Values",
-    "Visit",
     "WireCodec",
     "applications_of",
     "check_options",

@@ -66,13 +66,13 @@ class InspectedApplication(Application):
     model_config: ClassVar[ConfigDict] = ConfigDict(arbitrary_types_allowed=True)
 
     load_time: Seconds = Field(
-        default=0.01, description="seconds that a switch to it takes, in which it is BUSY"
+        default=0.01, description="seconds of a switch to it, in which the camera is BUSY"
     )
     inspector: Inspector = Field(description="the program that inspects the pictures")
 
     @property
-    def period(self) -> int | None:
-        """None, since each run makes a new container."""
+    def repeat_after(self) -> int | None:
+        """None: results do not repeat, since each run inspects a picture."""
         return None
 
     @model_validator(mode="after")

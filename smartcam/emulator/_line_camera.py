@@ -66,7 +66,7 @@ class LineClient:
         self._camera = camera
         self._link = link
         self._server = server
-        self._row = 0  # number of the row of the current line
+        self._row_number = 0  # number of the current line's row of the dialect, 0 for none
         self._answers_later = False
 
     def answer_later(self) -> Self:
@@ -100,7 +100,7 @@ class LineClient:
     def say_bytes(self, data: bytes, *, row: int | None = None) -> None:
         """Send bytes unchanged: part of an answer, or a prompt."""
         if not self._link.closed:
-            message = SaidLine(row=self._row if row is None else row, data=data)
+            message = SaidLine(row=self._row_number if row is None else row, data=data)
             self._camera.say(self._link, message)
 
     def say_recorded(self, data: bytes) -> None:
@@ -130,7 +130,7 @@ class LineClient:
     def begin(self, message: HeardLine) -> None:
         """Note that a line has become the current one."""
         self.has_session = self.has_session or self._camera.begins_session(message)
-        self._row, self._server.busy = message.row, True
+        self._row_number, self._server.busy = message.row, True
 
 
 class LineCamera(WireCamera):
@@ -160,7 +160,7 @@ class LineCamera(WireCamera):
 
     Attributes:
         protocol: protocol of the camera, which speaks its first dialect.
-        device: operator's actions, if a subclass defines any: ``start()``, ``stop()``,
+        device: object with the operator's actions, if a subclass has any: ``start()``, ``stop()``,
             ``trigger()``, ``reboot(seconds)``, ``switch_application(id, running=False)``. Faults,
             scenarios and the page use those that exist.
         fault_kinds: the faults that the camera supports.
@@ -172,7 +172,7 @@ class LineCamera(WireCamera):
 
     protocol: Protocol
     device: Any = None
-    takes: ClassVar[frozenset[str]] = frozenset({"scenario", "seed", "web", "replay"})
+    accepted_options: ClassVar[frozenset[str]] = frozenset({"scenario", "seed", "web", "replay"})
     states: ClassVar[frozenset[DeviceState]] = frozenset(
         {DeviceState.CONNECTED, DeviceState.DISCONNECTED}
     )
@@ -195,7 +195,7 @@ class LineCamera(WireCamera):
         cues = [validated(Cue, cue, f"cue {at}") for at, cue in enumerate(timeline, start=1)]
         self.lines: LineCodec = self.make_codec()
         super().__init__(
-            spoken=self.lines,
+            codec=self.lines,
             device=self.device,
             host=host,
             port=port,
@@ -253,14 +253,14 @@ class LineCamera(WireCamera):
 
     @classmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
-        """Return the place of something unsupported in a scenario, and the reason; or None."""
+        """Return the path of an unsupported field in a scenario, and the reason; or None."""
         fields = _COMMON_FIELDS | (
             _PROGRAM_FIELDS if cls.state_options(None, running=True) else frozenset()
         )
         for name in sorted(plan.changed() - fields):
             if name != "dialect" or plan.dialect not in cls.protocol.dialects:
                 takes = ", ".join(sorted(fields))
-                return (name,), f"a camera of {cls.protocol.name} takes none; it takes {takes}"
+                return (name,), f"a camera of {cls.protocol.name} has no such field; it has {takes}"
         try:
             camera = cls.from_scenario(plan.model_copy(update={"timeline": ()}))
         except ConfigurationError as exc:
@@ -268,11 +268,11 @@ class LineCamera(WireCamera):
         return camera.mistake_in(plan.timeline)
 
     def mistake_in(self, cues: Sequence[Cue]) -> Mistake | None:
-        """Return the place of something unsupported in a timeline, and the reason; or None."""
+        """Return the path of an unsupported field in a timeline, and the reason; or None."""
         for number, cue in enumerate(cues):
             if cue.entering is not None and cue.entering not in self.states:
                 supported = ", ".join(sorted(state.value for state in self.states))
-                return ("timeline", number, "entering"), f"it tells only of {supported}"
+                return ("timeline", number, "entering"), f"its states are {supported}"
             for fault_index, fault in enumerate(cue.do):
                 mistake = find_unsupported(
                     fault, self.codec, self.application_ids, self.fault_kinds
@@ -307,7 +307,7 @@ class LineCamera(WireCamera):
             dialect.name,
             dialect.rows,
             line_end=dialect.line_end,
-            ends=re.compile(re.escape(dialect.line_end)),
+            client_line_end=re.compile(re.escape(dialect.line_end)),
             max_line=dialect.max_line,
             encoding=dialect.encoding,
             split=dialect.split,
@@ -323,7 +323,7 @@ class LineCamera(WireCamera):
         """Carry out a line, and call ``client.answer()`` once, now or later."""
         client.answer(self.answer(line))
 
-    def begun(self, client: LineClient, message: HeardLine) -> None:
+    def on_raw_line(self, client: LineClient, message: HeardLine) -> None:
         """Receive a client's raw line, before it is carried out; override to use it."""
 
     def greet(self, client: LineClient) -> None:
@@ -370,7 +370,7 @@ class LineCamera(WireCamera):
         """Return the machine of a new link."""
         return LineServer(self.lines, transport, trace)
 
-    def arrived(self, link: ClientLink) -> None:
+    def connection_begun(self, link: ClientLink) -> None:
         """Note that a connection was made."""
         assert isinstance(link.machine, LineServer)  # noqa: S101 - it is what make_machine made
         client = self._clients[link] = self.make_client(link, link.machine)
@@ -382,14 +382,14 @@ class LineCamera(WireCamera):
         """Return a new client."""
         return LineClient(self, link, server)
 
-    def received(self, link: ClientLink, message: m.Message) -> None:
+    def handle_message(self, link: ClientLink, message: m.Message) -> None:
         """Take a line of a link."""
         client = self._clients.get(link)
         if client is None or not isinstance(message, HeardLine):
             return
-        faults = self._fire_before(self.queue.device_on_client, message)
+        faults = self._fire_before(self.queue.client_device_faults, message)
         client.begin(message)
-        self.begun(client, message)
+        self.on_raw_line(client, message)
         self.hear(client, self.lines.text(message.data))
         self._run_device_faults(faults, "after")
 
@@ -405,7 +405,7 @@ class LineCamera(WireCamera):
         client = self._clients.get(link)
         return client is not None and client.has_session
 
-    def lost(self, link: ClientLink) -> None:
+    def forget_link(self, link: ClientLink) -> None:
         """Forget a lost link; a second call does nothing."""
         self._links_to_flush.pop(link, None)
         if self._clients.pop(link, None) is not None:
@@ -414,7 +414,7 @@ class LineCamera(WireCamera):
     def say(self, link: ClientLink, message: SaidLine) -> None:
         """Send a message to a link; it is written at the end of the step."""
         with self.step():
-            faults = self._fire_before(self.queue.device_on_camera, message)
+            faults = self._fire_before(self.queue.camera_device_faults, message)
             link.send(message)
             self._links_to_flush[link] = None
             self._run_device_faults(faults, "after")

@@ -52,10 +52,10 @@ class LineCodec:
         label: the dialect's name.
         rows: requests and answers.
         line_end: end of the camera's lines.
-        ends: pattern of the end of a client's line.
+        client_line_end: pattern of the end of a client's line.
         max_line: largest number of bytes of a client's line, without its end.
         encoding: encoding of characters.
-        split: function that splits an answer into its word or ticket and the text that rows read.
+        split: function that splits an answer into its word, or its request's ticket, and its text.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class LineCodec:
         rows: tuple[LineRow, ...],
         *,
         line_end: bytes,
-        ends: re.Pattern[bytes],
+        client_line_end: re.Pattern[bytes],
         max_line: int,
         encoding: str,
         split: Callable[[str], tuple[str, str]] | None = None,
@@ -72,7 +72,7 @@ class LineCodec:
         self._split = split
         self.label: str = label
         self.line_end: bytes = line_end
-        self.ends: re.Pattern[bytes] = ends
+        self.client_line_end: re.Pattern[bytes] = client_line_end
         self.max_line: int = max_line
         self.encoding: str = encoding
         self.table: tuple[MessageRow, ...] = tuple(
@@ -90,7 +90,7 @@ class LineCodec:
 
     def text(self, data: bytes) -> str:
         """Return a line's text without its end."""
-        match = self.ends.search(data)
+        match = self.client_line_end.search(data)
         return data[: match.start() if match else None].decode(self.encoding, "replace")
 
     def sent_text(self, data: bytes) -> str:
@@ -151,7 +151,7 @@ class LineCodec:
         """Return the bytes of a line; raise UnsupportedError for any other message."""
         if isinstance(message, (HeardLine, SaidLine)):
             return message.data
-        raise UnsupportedError(f"dialect {self.label} is lines: insert data")
+        raise UnsupportedError(f"dialect {self.label} has lines: insert data, no message")
 
     def encode_frame(self, frame: Frame) -> bytes:
         """Return a line's bytes."""
@@ -266,7 +266,7 @@ class LineFramer:
     def next_frame(self) -> Frame | None:
         """Return the next line, None if it is incomplete; raise FrameError if it is too long."""
         codec = self._codec
-        match = codec.ends.search(self._buffer, self._search_start)
+        match = codec.client_line_end.search(self._buffer, self._search_start)
         size = len(self._buffer) if match is None else match.start()
         if size > codec.max_line + (match is None):  # the last byte may be half of an end
             raise FrameError(

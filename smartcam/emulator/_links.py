@@ -75,7 +75,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         # the camera switches Nagle's algorithm off (newest SC manual p. 40: published)
         with contextlib.suppress(OSError):  # the client may be gone already
             transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._owner.arrived(self)
+        self._owner.connection_begun(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
         return self._read_buffer
@@ -112,7 +112,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         self._mark_closed()
         self._listener.leave(self)
         with self._owner.step():
-            self._owner.lost(self)
+            self._owner.forget_link(self)
         self._owner.connection_ended(self, by_client=by_client, reset=exc is not None)
 
     def write(self, data: bytes) -> bool:
@@ -132,10 +132,10 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         if not self.closed:
             self._mark_closed()
             _log.info("= %s: connection closed: %s", self.peer, reason)
-            self._owner.lost(self)
+            self._owner.forget_link(self)
         self._transport.abort()
 
-    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], reason: str = "a fault ends it") -> None:
         if how == "reset":
             with contextlib.suppress(OSError):  # the client may be gone already
                 sock = self._transport.get_extra_info("socket")
@@ -143,8 +143,8 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             self.close("a fault resets it")
             return
         self._mark_closed()
-        _log.info("= %s: connection closed: %s", self.peer, why)
-        self._owner.lost(self)
+        _log.info("= %s: connection closed: %s", self.peer, reason)
+        self._owner.forget_link(self)
         # closing a socket with unread bytes sends a reset, so it stays open until the client
         # has closed its side, too
         with contextlib.suppress(OSError):
@@ -162,7 +162,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         elif self._faulty is None or not self._faulty.is_dead:
             self._transport.resume_reading()
 
-    def heal(self) -> None:
+    def end_fault_effects(self) -> None:
         if self._faulty is not None and self._faulty.muted_by is not None:
             self.end_link("reset")
 
@@ -280,15 +280,15 @@ class _UdpLink(ClientLink):
     def write(self, data: bytes) -> bool:
         return not data or self._listener.send(data, self._address)
 
-    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
-        self.close(f"{why} ({how})")
+    def end_link(self, how: Literal["close", "reset"], reason: str = "a fault ends it") -> None:
+        self.close(f"{reason} ({how})")
 
     def stop_reading(self) -> None:
         pass  # the faulty link takes nothing any more
 
-    def heal(self) -> None:
+    def end_fault_effects(self) -> None:
         if self._faulty is not None and self._faulty.muted_by != REFUSED:
-            self._faulty.heal()
+            self._faulty.end_fault_effects()
 
     def block_messages(self) -> None:
         """Lose all messages while the port is closed."""
@@ -309,7 +309,7 @@ class _UdpLink(ClientLink):
             self._mark_closed()
             _log.debug("= %s: forgotten: %s", self.peer, reason)
             self._listener.forget(self._address)
-            self._owner.lost(self)
+            self._owner.forget_link(self)
 
 
 class UdpListener(Listener, asyncio.DatagramProtocol):

@@ -62,7 +62,7 @@ class Port:
         )
 
     def close(self) -> None:
-        """Close the port; links stay."""
+        """Close the port; connections stay."""
         self._stop_opening()
         self._listener.close_port()
         self._close_socket()

@@ -1,4 +1,4 @@
-"""The base class of several makes' emulated cameras, whose frames have a ticket."""
+"""The base class of emulated cameras of several makes, whose frames have a ticket."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class TicketedCodec(LineCodec):
             dialect.name,
             dialect.rows,
             line_end=dialect.line_end,
-            ends=re.compile(b"\r\n"),
+            client_line_end=re.compile(b"\r\n"),
             max_line=MAX_REQUEST_BYTES,
             encoding=dialect.encoding,
             split=dialect.split,
@@ -153,7 +153,7 @@ class TicketedCamera(LineCamera):
     are read meanwhile.
 
     Attributes:
-        also_hears: requests that other clients send, in addition to the dialect's.
+        also_hears: requests that smartcam does not send, but other clients do.
         client_class: class of its clients.
     """
 
@@ -198,7 +198,7 @@ class TicketedCamera(LineCamera):
             if isinstance(client, TicketedClient) and to(client):
                 client.say_bytes(client.frame(content(client), ticket), row=row)
 
-    def begun(self, client: LineClient, message: HeardLine) -> None:
+    def on_raw_line(self, client: LineClient, message: HeardLine) -> None:
         """Note the ticket of a request."""
         if isinstance(client, TicketedClient) and isinstance(self.lines, TicketedCodec):
             client.ticket = self.lines.content(self.lines.sent_text(message.data))[0]

@@ -25,7 +25,7 @@ production line."""
 
 MAX_BYTES = 1 << 25
 """Largest number of bytes of all entries, read or not; the oldest are dropped first. It keeps
-10,000 results of seven parts, or 120 of the largest containers, 64 kB."""
+10,000 results of seven localizations, or 120 of the largest containers, 64 kB."""
 
 MAX_IDS = 1000
 """Largest number of unknown message ids that are counted; ids of the dialect are always counted.
@@ -34,7 +34,7 @@ Only a client that sends arbitrary ids uses more."""
 _ENTRY_BYTES = 400  # bytes of an entry with its message, without the payload
 _BYTES_PER_BYTE = 4  # bytes per byte of payload: one in the message, three in hex
 
-MAX_VISITS = 1000
+MAX_ENDED_CONNECTIONS = 1000
 """Largest number of ended connections whose record is kept; the oldest are dropped first."""
 
 
@@ -42,7 +42,7 @@ Direction = Literal["in", "out"]
 
 
 class LogEntry(NamedTuple):
-    """One frame, or bytes that make no frame.
+    """One message as a frame, or bytes that make no frame.
 
     Attributes:
         time: time of the emulator's clock, seconds.
@@ -79,14 +79,14 @@ class LogEntry(NamedTuple):
         return text.rstrip("\r\n\0") if self.direction == "in" else text
 
 
-class Visit(NamedTuple):
+class EndedConnection(NamedTuple):
     """A TCP connection that has ended.
 
     Attributes:
         time: seconds of the emulator's clock when the connection ended.
         peer: address and port of the client.
         ended_by: the side that closed the connection first.
-        reset: True if the connection ended by a reset, and not in order.
+        reset: True if the connection ended by a reset instead of a normal close.
     """
 
     time: float
@@ -115,8 +115,8 @@ class Log(Sequence[LogEntry]):
     Attributes:
         maxlen: largest number of entries.
         max_bytes: largest number of bytes of all entries.
-        pushed_out: number of entries dropped because the log was full, since the beginning or the
-            last :meth:`clear`.
+        dropped_count: entries dropped because the log was full, since the beginning or the last
+            :meth:`clear`.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Log(Sequence[LogEntry]):
     ) -> None:
         self.maxlen: int = maxlen
         self.max_bytes: int = max_bytes
-        self.pushed_out: int = 0
+        self.dropped_count: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
         # the later entries, whose messages are not decoded yet
@@ -197,7 +197,7 @@ class Log(Sequence[LogEntry]):
         while len(sizes) > self.maxlen or (self._size > self.max_bytes and len(sizes) > 1):
             (self._entries or self._raw_entries).popleft()
             self._subtract_oldest()
-            self.pushed_out += 1
+            self.dropped_count += 1
 
     def since(self, serial: int, limit: int | None = None) -> tuple[list[LogEntry], int]:
         """Return the entries after the first ``serial`` ones, and the number of all so far.
@@ -234,7 +234,7 @@ class Log(Sequence[LogEntry]):
         self._entries.clear()
         self._raw_entries.clear()
         self._sizes.clear()
-        self._size = self.pushed_out = 0
+        self._size = self.dropped_count = 0
 
     def _subtract_oldest(self) -> None:
         """Subtract the size of the oldest entry."""
@@ -271,7 +271,7 @@ class TrafficLog:
     """Keeps the last entries and counts what clients sent."""
 
     def __init__(self, dialect: WireCodec) -> None:
-        self.visits: deque[Visit] = deque(maxlen=MAX_VISITS)  # the last connections that have ended
+        self.ended_connections: deque[EndedConnection] = deque(maxlen=MAX_ENDED_CONNECTIONS)
         self.entries: Log = Log(dialect)  # the last frames
         self._dialect = dialect
         self._received: Tally[int | type[Message] | None] = Tally(

@@ -26,7 +26,7 @@ from smartcam.emulator._clock import Clock, OneTimer, RealClock
 from smartcam.emulator._links import TcpListener, UdpListener
 from smartcam.emulator._port import Port
 from smartcam.emulator._scenario.timeline import Timeline
-from smartcam.emulator._traffic import TrafficLog, Visit
+from smartcam.emulator._traffic import EndedConnection, TrafficLog
 from smartcam.emulator.faults._base import DeviceFault
 from smartcam.emulator.faults._device_effects import FaultTargets, apply_fault, supported_faults
 from smartcam.emulator.faults._matching import FaultQueue
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._traffic import Log
     from smartcam.emulator.faults import Fault, FiredFault
     from smartcam.emulator.faults._base import BaseFault
-    from smartcam.emulator.faults._matching import Row
+    from smartcam.emulator.faults._matching import WaitingFault
     from smartcam.emulator.faults._wire_effects import WireCodec, WireMessage
     from smartcam.exceptions import RemoteProtocolError
 
@@ -108,8 +108,8 @@ class WireCamera(Server):
     """An emulated camera of any make on a real port; a subclass implements the messages.
 
     Args:
-        spoken: codec of the messages on the wire.
-        device: the camera itself, whose operator's methods faults call.
+        codec: codec of the messages on the wire.
+        device: the camera without the wire; faults call its operator's methods.
         host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
         transport: ``"tcp"`` or ``"udp"``.
@@ -128,7 +128,7 @@ class WireCamera(Server):
     write_limit: int = WRITE_LIMIT
     """Bytes kept for a client that does not read, or held back by faults; more end its
     connection."""
-    takes: ClassVar[frozenset[str]] = frozenset()
+    accepted_options: ClassVar[frozenset[str]] = frozenset()
     """The options among ``scenario``, ``dialect``, ``transport``, ``seed``, ``web`` and ``replay``
     that the camera accepts."""
     device: Any
@@ -139,7 +139,7 @@ class WireCamera(Server):
     def __init__(
         self,
         *,
-        spoken: WireCodec,
+        codec: WireCodec,
         device: object,
         host: str,
         port: int,
@@ -164,15 +164,15 @@ class WireCamera(Server):
         self.clock: Clock = clock if clock is not None else RealClock()
         self.seed: int = check_seed(seed, owner)
         self.fault_kinds: frozenset[str] = supported_faults(device)
-        self.codec: WireCodec = spoken
+        self.codec: WireCodec = codec
         self._cues = timeline
         self._step = _NestedContext(self._begin_step, self._end_step)
         self._listener: Listener = _LISTENERS[Transport(transport)](self)
         self._port = Port(self._listener, host, port, name)
-        self._traffic = TrafficLog(spoken)
+        self._traffic = TrafficLog(codec)
         self._step_at: float | None = None  # time of the present step
         self._logs_frames = False  # whether each frame is logged, checked once a step
-        self.queue: FaultQueue = FaultQueue(spoken, self.clock, applications, self.fault_kinds)
+        self.queue: FaultQueue = FaultQueue(codec, self.clock, applications, self.fault_kinds)
         self._fault_targets = FaultTargets(
             device=device,
             refuse=self._refuse,
@@ -209,7 +209,7 @@ class WireCamera(Server):
     @classmethod
     @abstractmethod
     def mistake(cls, plan: Scenario) -> Mistake | None:
-        """Return the place of something unsupported in a scenario, and the reason; or None."""
+        """Return the path of an unsupported field in a scenario, and the reason; or None."""
 
     @classmethod
     def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
@@ -320,14 +320,14 @@ class WireCamera(Server):
         return any(cue.is_random for cue in self._cues)
 
     @property
-    def cues_done(self) -> list[int]:
+    def cue_counts(self) -> list[int]:
         """Number of times that each cue of the timeline has happened since the start."""
         return self._timeline.injected_counts
 
     @property
-    def visits(self) -> deque[Visit]:
+    def ended_connections(self) -> deque[EndedConnection]:
         """The last connections that have ended, oldest first; over UDP there are none."""
-        return self._traffic.visits
+        return self._traffic.ended_connections
 
     @property
     def fired(self) -> deque[FiredFault]:
@@ -387,7 +387,7 @@ class WireCamera(Server):
             self._timeline.start()
         _log.info("= %s: listening on %s", self.name, self.url)
         if self.is_random:
-            _log.info("= %s: chance has the seed %d", self.name, self.seed)
+            _log.info("= %s: the random timeline has the seed %d", self.name, self.seed)
 
     async def stop(self) -> None:
         """Close the port and every connection; the device stands still. Do nothing if stopped.
@@ -449,7 +449,7 @@ class WireCamera(Server):
             self._end_device_faults()
             self._end_refusal()
             for link in self._listener.all_links:
-                link.heal()
+                link.end_fault_effects()
 
     def _refuse(self, seconds: float) -> None:
         """Close the port for a time; open connections stay."""
@@ -476,7 +476,7 @@ class WireCamera(Server):
     def _run_immediate_faults(self) -> None:
         self._run_device_faults(self.queue.at_once(), None)
 
-    def _fire_before(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
+    def _fire_before(self, waiting: list[WaitingFault], message: m.Message) -> Sequence[Fault]:
         """Run the device faults that come before a message; return all triggered faults."""
         if not waiting:
             return ()
@@ -500,7 +500,7 @@ class WireCamera(Server):
         """Return the machine of a new link."""
 
     @abstractmethod
-    def received(self, link: ClientLink, message: m.Message) -> None:
+    def handle_message(self, link: ClientLink, message: m.Message) -> None:
         """Handle a message of a link."""
 
     @abstractmethod
@@ -508,18 +508,19 @@ class WireCamera(Server):
         """Return True if the link has a session."""
 
     @abstractmethod
-    def lost(self, link: ClientLink) -> None:
+    def forget_link(self, link: ClientLink) -> None:
         """Forget a link that is gone; a second call does nothing."""
 
-    def arrived(self, link: ClientLink) -> None:
+    def connection_begun(self, link: ClientLink) -> None:
         """Note that a connection was made."""
 
     def connection_ended(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
         """Note that a connection has ended."""
         ended_by: Literal["client", "camera"] = "client" if by_client else "camera"
-        self._traffic.visits.append(Visit(self.clock.now, link.peer, ended_by, reset))
+        ended = EndedConnection(self.clock.now, link.peer, ended_by, reset)
+        self._traffic.ended_connections.append(ended)
 
-    def traced(
+    def note_frame(
         self, link: ClientLink, sender: m.Sender, content: Frame | RemoteProtocolError
     ) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
@@ -535,9 +536,9 @@ class WireCamera(Server):
         if self._logs_frames:
             self._log_last_entry()
 
-    def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
+    def note_message(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
         """Log a message that passed or is lost, as faults have changed it."""
-        faults = ", ".join(message.faults) or None
+        faults = ", ".join(message.effects) or None
         self._log_content(link.peer, sender, message.content, faults, message.wire)
 
     def _log_content(

@@ -31,7 +31,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from smartcam.emulator._inside import LogEntry, Visit
+    from smartcam.emulator._inside import EndedConnection, LogEntry
 
 Expected: TypeAlias = "type[m.Message] | m.Message | str | int"
 """A message type or its name, a message with all its fields, or a message id."""
@@ -57,21 +57,21 @@ class CameraLog(Sequence["LogEntry"]):
 
     Args:
         read: function that returns the entries.
-        visits: function that returns the connections that have ended.
+        ended_connections: function that returns the connections that have ended.
         links: function that returns the connected clients; empty without connections.
-        pushed_out: function that returns the number of entries dropped because the log was full.
+        dropped_count: function that returns the number of entries that a full log dropped.
     """
 
     def __init__(
         self,
         read: Callable[[], list[LogEntry]],
-        visits: Callable[[], list[Visit]],
+        ended_connections: Callable[[], list[EndedConnection]],
         links: Callable[[], list[str]],
-        pushed_out: Callable[[], int] = lambda: 0,
+        dropped_count: Callable[[], int] = lambda: 0,
     ) -> None:
         self._read = read
-        self._pushed_out = pushed_out
-        self._visits = visits
+        self._dropped_count = dropped_count
+        self._ended_connections = ended_connections
         self._links = links
 
     def __len__(self) -> int:
@@ -93,9 +93,9 @@ class CameraLog(Sequence["LogEntry"]):
         return self._read()[index]
 
     @property
-    def pushed_out(self) -> int:
+    def dropped_count(self) -> int:
         """Entries dropped because the log was full; expectations about all entries then fail."""
-        return self._pushed_out()
+        return self._dropped_count()
 
     @property
     def received(self) -> list[m.Message]:
@@ -137,13 +137,13 @@ class CameraLog(Sequence["LogEntry"]):
     ) -> None:
         """Check that clients sent nothing between the camera's BUSY and the status without it.
 
-        Queries, Get status, Connect and Disconnect are allowed. Messages in one piece with the
-        message that made the camera BUSY count as sent before.
+        Queries, Get status, Connect and Disconnect are allowed. Messages in one TCP
+        segment with the message that made the camera BUSY count as sent before.
 
         Args:
             also: other types of messages that are allowed.
             grace: seconds after BUSY in which a message may have been on its way already.
-            timeout: seconds to repeat a check that fails; a message in the log stays there.
+            timeout: seconds to repeat a failed check; a wrong message stays in the log.
 
         Raises:
             AssertionError: another message was sent.
@@ -162,7 +162,7 @@ class CameraLog(Sequence["LogEntry"]):
         )
 
     def expect_disconnect_before_close(self, *, timeout: float = 5.0) -> None:
-        """Check that every client with a session ended it by Disconnect, and then its connection.
+        """Check that every client with a session sent Disconnect and then closed its connection.
 
         Over UDP there is no connection: Disconnect has to be the last message of each client.
 
@@ -195,7 +195,7 @@ class CameraLog(Sequence["LogEntry"]):
                     sessions.add(entry.peer)
         for peer in sorted(sessions):
             if not isinstance(last[peer].message, m.Disconnect):
-                visit = next((v for v in self._visits() if v.peer == peer), None)
+                visit = next((v for v in self._ended_connections() if v.peer == peer), None)
                 how = "" if visit is None else f", and {_end_text(visit)}"
                 return (
                     f"the last message of {peer} was {_entry_text(last[peer])}, not Disconnect{how}"
@@ -219,7 +219,7 @@ class CameraLog(Sequence["LogEntry"]):
         while True:
             entries = self._read()
             failure = find_mistake(entries)
-            dropped_count = self._pushed_out()
+            dropped_count = self._dropped_count()
             missing = (
                 f"{dropped_count} older entries were pushed out of the full log"
                 if dropped_count
@@ -312,7 +312,7 @@ def _find_refused_frame(entries: list[LogEntry]) -> str | None:
     return None if refused is None else f"the client sent what the camera refuses: {refused.error}"
 
 
-def _end_text(visit: Visit) -> str:
+def _end_text(visit: EndedConnection) -> str:
     manner = "reset" if visit.reset else "closed"
     return f"the {visit.ended_by} {manner} the connection"
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.emulator import Scenario, TableScene, WireCamera
-    from smartcam.emulator._inside import BaseFault, Device, FiredFault, Visit
+    from smartcam.emulator._inside import BaseFault, Device, EndedConnection, FiredFault
     from smartcam.emulator.faults import Fault
     from smartcam.protocols.messages import Message
 
@@ -133,9 +133,9 @@ class ThreadedCamera(_HostedInThread):
         self._emulator: WireCamera = emulator
         self.log: CameraLog = CameraLog(
             read=lambda: self._call_in_thread(lambda: list(emulator.log)),
-            visits=lambda: self.visits,
+            ended_connections=lambda: self.ended_connections,
             links=lambda: self.links if self.transport == "tcp" else [],
-            pushed_out=lambda: self._call_in_thread(lambda: emulator.log.pushed_out),
+            dropped_count=lambda: self._call_in_thread(lambda: emulator.log.dropped_count),
         )
 
     def __repr__(self) -> str:
@@ -145,7 +145,7 @@ class ThreadedCamera(_HostedInThread):
 
     @property
     def url(self) -> str:
-        """The camera's address with the dialect pinned."""
+        """The camera's address with its dialect."""
         return self._emulator.url
 
     @property
@@ -204,9 +204,9 @@ class ThreadedCamera(_HostedInThread):
         return self._call_in_thread(lambda: self._emulator.links)
 
     @property
-    def visits(self) -> list[Visit]:
+    def ended_connections(self) -> list[EndedConnection]:
         """The last connections that have ended, oldest first; over UDP there are none."""
-        return self._call_in_thread(lambda: list(self._emulator.visits))
+        return self._call_in_thread(lambda: list(self._emulator.ended_connections))
 
     @property
     def faults(self) -> list[Fault]:
@@ -224,9 +224,9 @@ class ThreadedCamera(_HostedInThread):
         return self._emulator.commands
 
     @property
-    def cues_done(self) -> list[int]:
+    def cue_counts(self) -> list[int]:
         """Number of times that each cue of the timeline has happened."""
-        return self._call_in_thread(lambda: self._emulator.cues_done)
+        return self._call_in_thread(lambda: self._emulator.cue_counts)
 
     # ------------------------------------------------------------------ actions
 

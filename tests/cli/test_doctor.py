@@ -82,7 +82,7 @@ def test_doctor_healthy_camera_prints_each_check() -> None:
         ("warning", "clock"),
     ]  # fmt: skip
     first, last = outcome.out.splitlines()[0], outcome.out.splitlines()[-1]
-    assert first.startswith("ok       notice: connecting takes the camera from another client")
+    assert first.startswith("ok       notice: the camera serves one client: another one that is")
     assert last == "1 warning."
 
 
@@ -135,7 +135,7 @@ def test_doctor_json_has_an_object_for_each_finding_and_the_sum() -> None:
     assert all(list(one) == keys for one in [*findings, end])
     by_check = {one["check"]: one for one in findings}
     assert by_check["status"]["details"]["status"] == ["RUNNING", "WAITING_FOR_TRIGGER"]
-    assert by_check["trigger"]["details"]["trigger_time"]["times"] == 2
+    assert by_check["trigger"]["details"]["trigger_time"]["samples"] == 2
     assert by_check["clock"]["details"]["clock"] == "2000-01-02T12:00:00"
     assert (end["check"], end["severity"], end["exit_code"]) == ("summary", "warning", 0)
     assert end["details"] == {"ok": 8, "hint": 0, "warning": 1, "error": 0}
@@ -146,7 +146,7 @@ def test_doctor_json_of_a_failure_has_every_try_and_frame() -> None:
         outcome = run_as_far_as(CONNECT.hex(), "doctor", peer.url, "--json")
     session, end = outcome.lines[-2:]
     assert session["exit_code"] == end["exit_code"] == outcome.code == 3
-    assert len(session["details"]["tries"]) == len(session["details"]["frames"])
+    assert len(session["details"]["attempts"]) == len(session["details"]["frames"])
     sent = [entry["hex"] for entry in session["details"]["frames"][0]]
     assert CONNECT.hex() in sent
 

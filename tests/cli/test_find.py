@@ -93,7 +93,7 @@ def test_find_prints_a_table_and_how_it_went(port: int) -> None:
     assert outcome.err == (
         "42 of 42 ports tried: 2 open, 40 refused. Cameras that are set to UDP do not show. No "
         "document says that a camera of bvs keeps its client when another one connects and says "
-        "nothing: --leave and --fleet keep away from those at work.\n"
+        "nothing: --exclude and --fleet keep away from those at work.\n"
     )
 
 
@@ -123,7 +123,7 @@ def test_find_leaves_a_fleets_cameras_alone(port: int, tmp_path: Path) -> None:
         f'  line1/cam4: {{model: IN-SIGHT, url: "{NETWORK}3"}}\n  line2/**: {{emulated: {{}}}}\n'
         f'  found/{NETWORK.replace(".", "-")}4: {{url: "bvs://10.0.0.9"}}\n'
     )
-    alone = ("--fleet", str(fleet), "--leave", f"{NETWORK}1")
+    alone = ("--fleet", str(fleet), "--exclude", f"{NETWORK}1")
     args = (f"{NETWORK}1-4", "--port", str(port), "--may-disturb", *QUICK, *alone)
     with silent(port, 1, 2, 3, 4) as servers:
         out = search(*args).out
@@ -224,7 +224,7 @@ async def test_terminal_is_told_how_far_it_is(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     async with show_progress_line(search):
-        search.opened, search.total, search.counts["open"] = 7, 9, 1
+        search.tried, search.total, search.counts["open"] = 7, 9, 1
         await asyncio.sleep(1.5)
     clear = "\r\x1b[K"
     assert capsys.readouterr().err == f"{clear}7 of 9 ports, 1 open{clear}"

@@ -44,7 +44,7 @@ def test_calibrate_lists_its_parts_and_hides_what_it_does_itself() -> None:
 
 
 def test_timeout_of_probe_says_what_it_does() -> None:
-    assert "Longest time of all tries together" in run("probe", "--help").done().out
+    assert "Longest time of all attempts together" in run("probe", "--help").done().out
 
 
 @pytest.mark.parametrize(

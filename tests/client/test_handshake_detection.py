@@ -83,7 +83,7 @@ async def test_establish_unpinned_finds_the_dialect_and_pins_it(name: str, trans
         session = await establish(settings(emulator.port, transport))
         assert session.address.url == emulator.url
         assert session.dialect.name == dialect
-        assert session.dialect.quirks == emulator.spoken.quirks
+        assert session.dialect.quirks == emulator.wire_dialect.quirks
         assert set(statuses(session)) == {IDLE}
         await session.link.close(LIMIT)
         await until(lambda: not emulator.has_session)

@@ -31,7 +31,7 @@ from smartcam import (
     TriggerTimeoutError,
     UnsupportedError,
 )
-from smartcam.doctor._inside import trials
+from smartcam.doctor._inside import try_ways
 from smartcam.emulator import EmulatedInSight, ManualClock
 from smartcam.observers import Observer
 from smartcam.settings import parse_address
@@ -753,7 +753,7 @@ async def test_close_in_the_middle_of_a_trigger_says_nothing_more(
 async def test_probe_with_a_wrong_password_logs_in_once() -> None:
     async with EmulatedInSight(JOBS) as emulator:
         address = parse_address(emulator.url.replace("//", "//admin:hunter2@"))
-        (trial,) = [trial async for trial in trials(address, timeout=5)]
+        (trial,) = [trial async for trial in try_ways(address, timeout=5)]
         assert "the user or the password is wrong" in trial.outcome
         assert said(emulator) == ["admin", "***"]
         assert trial.received == sum(
@@ -773,7 +773,7 @@ async def test_probe_of_a_camera_that_falls_silent_repeats_no_password() -> None
     heard: dict[int, bytes] = {}
     async with scripted(talk) as listener:
         address = parse_address(f"insight://op:hunter2@127.0.0.1:{listener.port}")
-        (trial,) = [trial async for trial in trials(address, timeout=4 * SHORT)]
+        (trial,) = [trial async for trial in try_ways(address, timeout=4 * SHORT)]
     assert "then silence" in trial.outcome
     assert heard == {1: b"op\r\nhunter2\r\n"}
 

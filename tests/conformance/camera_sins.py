@@ -86,13 +86,13 @@ def hears(change: Callable[[Emulator, Any, m.Message], bool]) -> Callable[[Emula
     """Check each message of a client first; true if the camera must not receive it."""
 
     def do(emulator: Emulator) -> None:
-        received = emulator.received
+        handle = emulator.handle_message
 
         def hear(link: Any, message: m.Message) -> None:
             if not change(emulator, link, message):
-                received(link, message)
+                handle(link, message)
 
-        emulator.received = hear
+        emulator.handle_message = hear
 
     return do
 
@@ -104,7 +104,7 @@ def deaf(*kinds: type[m.Message]) -> Callable[[Emulator], None]:
 
 def write(emulator: Emulator, link: Any, *messages: m.Message) -> None:
     """Send something on a link, with or without a session."""
-    link._write_frames([emulator.spoken.encode(message) for message in messages])
+    link._write_frames([emulator.wire_dialect.encode(message) for message in messages])
 
 
 def answers(kind: type[m.Message], answer: m.Message) -> Callable[[Emulator], None]:
@@ -179,11 +179,11 @@ def _one_in_a_segment(emulator: Emulator, link: Any, message: m.Message) -> bool
 
 
 def _no_pieces(emulator: Emulator, _: Any, data: bytes) -> bytes:
-    return data if len(data) >= emulator.spoken.header.size else b""
+    return data if len(data) >= emulator.wire_dialect.header.size else b""
 
 
 def _query_without_session(emulator: Emulator, link: Any, data: bytes) -> bytes:
-    query, disconnect = map(emulator.spoken.encode, (m.Query(), m.Disconnect()))
+    query, disconnect = map(emulator.wire_dialect.encode, (m.Query(), m.Disconnect()))
     outside = not emulator.serves(link) or data.startswith(disconnect)
     if outside and data.endswith(query):
         write(emulator, link, QUERY_ANSWER)
@@ -191,12 +191,12 @@ def _query_without_session(emulator: Emulator, link: Any, data: bytes) -> bytes:
 
 
 def _any_magic(emulator: Emulator, _: Any, data: bytes) -> bytes:
-    magic: bytes = emulator.spoken.header.magic
+    magic: bytes = emulator.wire_dialect.header.magic
     return magic + data[len(magic) :]
 
 
 def _any_datagram(emulator: Emulator, link: Any, data: bytes) -> bytes:
-    if len(data) == emulator.spoken.header.size - 1:
+    if len(data) == emulator.wire_dialect.header.size - 1:
         write(emulator, link, QUERY_ANSWER)
     return data
 
@@ -262,7 +262,7 @@ def _runs_after_boot(emulator: Emulator) -> None:
 
 def _unknown_answer(emulator: Emulator, link: Any, message: m.Message) -> bool:
     if isinstance(message, m.Query) and emulator.serves(link):
-        link._write_frames([emulator.spoken.encode_frame(Frame(0x44, b""))])
+        link._write_frames([emulator.wire_dialect.encode_frame(Frame(0x44, b""))])
     return False
 
 
@@ -302,7 +302,7 @@ SINS = (
     Sin("trigger-gives-one-result", replaced(m.ResultContainer, application=9), "application=9"),
     Sin("trigger-is-acknowledged", replaced(m.TriggerAnswer, code=0x10), "code=16", "bid"),
     Sin("waiting-falls-and-rises", says(_never_busy_waiting), "ResultContainer"),
-    Sin("dropped-trigger-is-told", without(Status.OVERTRIGGERED), "ResultContainer"),
+    Sin("dropped-trigger-is-reported", without(Status.OVERTRIGGERED), "ResultContainer"),
     Sin(
         "overtriggered-falls-by-itself",
         lambda _: None,
@@ -323,7 +323,7 @@ SINS = (
     Sin("busy-during-a-switch", without(Status.BUSY), "SwitchAnswer"),
     Sin("second-switch-meanwhile", doubled(m.SwitchAnswer), "SwitchAnswer"),
     Sin("second-switch-meanwhile", replaced(m.QueryAnswer, code=2), "code=2", "bid"),
-    Sin("clock-is-told", replaced(m.ClockAnswer, month=13), "month=13"),
+    Sin("clock-is-reported", replaced(m.ClockAnswer, month=13), "month=13"),
     Sin("clock-is-set", deaf(m.SetClock), " 20"),
     Sin("impossible-date-is-harmless", hears(_keep_bad_date), "month=13"),
     Sin("impossible-date-is-harmless", replaced(m.SetClockAnswer, code=0), "code=0", "bid"),

@@ -59,7 +59,7 @@ def short_options(url: str, **fields: Any) -> ConformanceOptions:
     given: dict[str, Any] = {
         "other_application": OTHER,
         "allow": ~Allow.NOTHING,
-        "quiet": 0.1,
+        "silence": 0.1,
         "timeout": 2.0,
         "switch_timeout": 1.0,
         "reboot_timeout": 5.0,
@@ -70,7 +70,7 @@ def short_options(url: str, **fields: Any) -> ConformanceOptions:
 
 
 SECONDS = {
-    *("quiet", "timeout", "switch_timeout", "reboot_timeout"),
+    *("silence", "timeout", "switch_timeout", "reboot_timeout"),
     *("load_time", "processing_time", "overtriggered_time", "reboot_time"),
 }
 """Settings in seconds, of options, an application and a camera's quirks."""

@@ -244,7 +244,7 @@ def _serve_everybody(emulator: Any) -> None:
     """Leave a client whose session is taken, and go on to answer its Query."""
 
     def answer(emulator: Any, link: Any, data: bytes) -> bytes:
-        if data == emulator.spoken.encode(m.Query()) and not emulator.serves(link):
+        if data == emulator.wire_dialect.encode(m.Query()) and not emulator.serves(link):
             camera_sins.write(emulator, link, camera_sins.QUERY_ANSWER)
         return data
 
@@ -382,7 +382,7 @@ def test_allow_read_names_what_may_be_done(text: str, names: list[str]) -> None:
     ("fields", "text"),
     [
         ({"timeout": 0}, "timeout: expected seconds, above 0 to 3600, got 0"),
-        ({"quiet": float("nan")}, "quiet: expected seconds, above 0 to 3600, got nan"),
+        ({"silence": float("nan")}, "silence: expected seconds, above 0 to 3600, got nan"),
         ({"application": 0}, "application: expected an integer, 1 to 4294967295, got 0"),
         ({"application": 3, "other_application": 3}, "both applications are 3: name another one"),
         ({"sequence_offset": -1}, "sequence_offset: expected an integer, 0 to 65535, got -1"),

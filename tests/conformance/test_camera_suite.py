@@ -44,7 +44,7 @@ sys.exit(pytest.main())
 
 def short() -> tuple[str, ...]:
     """Return short times, as options."""
-    return ("--camera-quiet", f"{slowed(0.05)}", "--camera-timeout", f"{slowed(2)}")
+    return ("--camera-silence", f"{slowed(0.05)}", "--camera-timeout", f"{slowed(2)}")
 
 
 @pytest.fixture(scope="module")
@@ -162,10 +162,10 @@ from smartcam.conformance.camera import CameraConformance
 
 class TestByClass(CameraConformance):
     camera_url = {one.url!r}
-    camera_options = {{"quiet": {slowed(0.05)}}}
+    camera_options = {{"silence": {slowed(0.05)}}}
 
 class TestByFixture(CameraConformance):
-    camera_options = {{"quiet": {slowed(0.05)}}}
+    camera_options = {{"silence": {slowed(0.05)}}}
 
     @pytest.fixture
     def camera_address(self):
@@ -213,7 +213,7 @@ def test_suite_that_is_broken_off_leaves_the_camera_as_it_was(
         process = start(
             folder,
             *("--pyargs", "smartcam.conformance.camera", "--camera-url", emulator.url),
-            *("--camera-quiet", "60", "-k", "second-stop"),
+            *("--camera-silence", "60", "-k", "second-stop"),
         )
         thread.call(
             lambda: emulator.wait_received(m.Stop, count=2, timeout=PATIENCE), timeout=2 * PATIENCE
@@ -222,7 +222,7 @@ def test_suite_that_is_broken_off_leaves_the_camera_as_it_was(
         process.send_signal(signal.SIGINT)
         printed, _ = process.communicate(timeout=PATIENCE)
         assert process.returncode == pytest.ExitCode.INTERRUPTED
-        assert "found with application 5, in run mode; left so" in printed
+        assert "at first: application 5, in run mode; restored" in printed
         assert thread.run(lambda: emulator.device.running)
         thread.call(
             lambda: emulator.wait_received(m.Disconnect, count=3, timeout=PATIENCE),

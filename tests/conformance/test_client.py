@@ -122,7 +122,7 @@ SINS: dict[str, tuple[str, str]] = {
     "switches_with_a_late_answer": ("next is the answer", "it failed: TaskError: 0x12 came"),
     "waits_until_busy_falls": ("ignores busy", "s after BUSY was sent"),
     "switches_with_busy_after_it": ("ignores busy", "it failed: TimeoutError"),
-    "fails_where_a_switch_is_refused": ("believes", "all is well, and gave 1 result"),
+    "reports_refused_switch": ("believes", "all is well, and gave 1 result"),
     "reads_byte_by_byte": ("a message is what comes", "it failed: IndexError"),
     "reads_several_at_once": ("a message is what comes", "it failed: "),
     "passes_over_unknown_messages": ("knows all", "it failed: TaskError: message 0x77"),
@@ -142,9 +142,9 @@ SINS: dict[str, tuple[str, str]] = {
     "fails_where_the_camera_closes": ("all is well", "all is well, and gave 0 results"),
     "fails_where_the_camera_resets": ("all is well", "all is well, and gave 0 results"),
     "fails_where_the_camera_is_gone": ("waits for ever", HANGS),
-    "fails_where_a_result_is_cut": ("all is well", "all is well, and gave 0 results"),
+    "reports_cut_result": ("all is well", "all is well, and gave 0 results"),
     "fails_where_garbage_comes": ("waits for ever", HANGS),
-    "fails_where_a_length_is_impossible": ("waits for ever", HANGS),
+    "reports_impossible_length": ("waits for ever", HANGS),
 }
 """For each check a client that fails it: its sin, and the text of the finding."""
 

@@ -103,7 +103,7 @@ def it_passes_what_only_should_be_and_reports_it(own: Ended) -> None:
     section = own.out.partition("smartcam: the client")[2]
     assert "\nmust: 1\nsends_whole_messages (handbook, tcp): the camera ignores" in section
     assert "\nshould: 1\npasses_over_unknown_messages (should; handbook, tcp): it" in section
-    assert "  expected: a later firmware may have more messages" in section
+    assert "  because: a later firmware may have more messages" in section
 
 
 def it_skips_what_the_client_cannot_do(own: Ended) -> None:

@@ -66,7 +66,7 @@ def test_command_without_task_or_address_is_refused(template: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         CommandClient(template)
     assert str(caught.value) == (
-        f"client command {template!r}: it needs {{task}}, and {{url}} or {{host}} and {{port}}"
+        f"client command {template!r}: it needs {{task}}, and {{url}} or {{port}}"
     )
 
 

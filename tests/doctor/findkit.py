@@ -91,8 +91,8 @@ def filtered(host: str, port: int) -> Iterator[None]:
 class TakenAtOnce(EmulatedCamera):
     """A camera whose session a bare connection takes; no document says whether cameras do that."""
 
-    def arrived(self, link: ClientLink) -> None:
-        super().arrived(link)
+    def connection_begun(self, link: ClientLink) -> None:
+        super().connection_begun(link)
         old = self._session_link
         if isinstance(old, type(link)) and old is not link:
             old.close("a newcomer")
@@ -101,7 +101,7 @@ class TakenAtOnce(EmulatedCamera):
 class RefusesAtOnce(EmulatedCamera):
     """A camera that closes every new connection at once while it has a session."""
 
-    def arrived(self, link: ClientLink) -> None:
-        super().arrived(link)
+    def connection_begun(self, link: ClientLink) -> None:
+        super().connection_begun(link)
         if self.has_session and not self.serves(link):
             link.close("another client has the session")

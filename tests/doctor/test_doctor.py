@@ -14,7 +14,7 @@ from smartcam import doctor
 from smartcam.doctor import examine
 from smartcam.doctor._context import Examination
 from smartcam.doctor._inside import Finding, summary
-from smartcam.doctor._timing import Figures, figures
+from smartcam.doctor._timing import time_statistics
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight, faults
 from smartcam.emulator._inside import BaseFault
 from smartcam.exceptions import ConfigurationError
@@ -72,7 +72,7 @@ async def test_round_trip_has_figures_of_thirty_requests() -> None:
     async with camera() as emulator:
         found = finding_of(await examined(emulator.url), "round trip")
     times = found.details["round_trip"]
-    assert times["times"] == 30
+    assert times["samples"] == 30
     assert 0 < times["min"] <= times["median"] <= times["p99"] < 1.0
 
 
@@ -111,7 +111,7 @@ async def test_with_trigger_and_application_everything_goes_back(running: bool) 
         findings = await examined(emulator.url, trigger=True, application=2, count=2)
         state = (emulator.device.active_application, emulator.device.running)
     assert errors(findings) == []
-    assert finding_of(findings, "trigger").details["trigger_time"]["times"] == 2
+    assert finding_of(findings, "trigger").details["trigger_time"]["samples"] == 2
     assert state == (5, running)
 
 
@@ -325,7 +325,7 @@ async def test_free_running_camera_is_reported_with_its_rate() -> None:
     assert found.severity == "ok"
     assert "application 5 runs free: " in found.text
     assert 50 < found.details["results_per_second"] < 200
-    assert found.details["interval"]["times"] == found.details["results"] - 1
+    assert found.details["interval"]["samples"] == found.details["results"] - 1
     assert finding_of(findings, "layout").details["sizes"] == [4]
 
 
@@ -354,7 +354,7 @@ async def test_triggers_have_figures_and_a_rate() -> None:
         findings = await examined(emulator.url, trigger=True, count=5)
     found = finding_of(findings, "trigger")
     times = found.details["trigger_time"]
-    assert times["times"] == 5
+    assert times["samples"] == 5
     assert 0.001 <= times["min"] <= times["median"] <= times["p99"]
     assert 1 < found.details["results_per_second"] < 1000
 
@@ -429,7 +429,7 @@ async def test_second_trigger_that_fails_keeps_the_figures_of_the_first() -> Non
     failed, measured = [one for one in findings if one.check == "trigger"]
     assert failed.text.startswith("trigger 2 was inspected")
     assert measured.details["results_per_second"] > 5  # the wait for the second left out
-    assert measured.details["trigger_time"]["times"] == 1
+    assert measured.details["trigger_time"]["samples"] == 1
 
 
 async def test_several_results_for_a_trigger_get_a_hint() -> None:
@@ -538,11 +538,10 @@ async def test_cells_of_a_spreadsheet_are_compared_with_the_layout() -> None:
 
 
 def test_figures_of_a_row_of_times() -> None:
-    assert figures([1.0, 3.0, 2.0, 10.0]) == Figures(4, 1.0, 2.5, 10.0, (2 + 1 + 8) / 3)
-    assert figures([2.0]) == Figures(1, 2.0, 2.0, 2.0, 0.0)
-    assert figures([float(n) for n in range(1, 201)]).p99 == 198.0
-    text = str(figures([0.001, 0.003]))
-    assert text == "min 1.0, median 2.0, p99 3.0 ms, jitter 2.0 ms"
+    assert time_statistics([1.0, 3.0, 2.0, 10.0]) == (4, 1.0, 2.5, 10.0, (2 + 1 + 8) / 3)
+    assert time_statistics([2.0]) == (1, 2.0, 2.0, 2.0, 0.0)
+    assert time_statistics([float(n) for n in range(1, 201)]).p99 == 198.0
+    assert str(time_statistics([0.001, 0.003])) == "min 1.0, median 2.0, p99 3.0 ms, jitter 2.0 ms"
 
 
 def finding(severity: Any, code: Exit = Exit.DONE) -> Finding:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from smartcam.doctor._inside import Trial, locate, no_session, trials
+from smartcam.doctor._inside import TracedAttempt, locate, no_session, try_ways
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.exceptions import ConnectFailedError
 from smartcam.protocols import Protocol
@@ -35,8 +35,8 @@ def known(monkeypatch: pytest.MonkeyPatch) -> Callable[[Protocol], None]:
     return register
 
 
-async def tried(url: str, timeout: float = 2.0, **options: Any) -> list[Trial]:
-    every = trials(parse_address(url), timeout=timeout, every_protocol=True, **options)
+async def tried(url: str, timeout: float = 2.0, **options: Any) -> list[TracedAttempt]:
+    every = try_ways(parse_address(url), timeout=timeout, every_protocol=True, **options)
     async with aclosing(every) as found:
         return [trial async for trial in found]
 

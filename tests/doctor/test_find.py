@@ -109,8 +109,8 @@ async def test_clients_at_work_notice_nothing() -> None:
         others = (silent, rubbish, endless)
         assert [(other.opened, other.received) for other in others] == [(1, b"")] * 3
         await until(lambda: all(other.ended == 1 for other in others))
-        visitors = {visit.peer for one in bvs for visit in one.visits}
-        assert len(visitors) == 2, "each was opened once, and closed by us"
+        peers = {ended.peer for one in bvs for ended in one.ended_connections}
+        assert len(peers) == 2, "each was opened once, and closed by us"
 
 
 @pytest.mark.parametrize("quirks", [{"second_client": "takeover"}, {"second_client": "refuse"}])
@@ -134,12 +134,12 @@ async def test_camera_of_one_client_is_not_asked_without_consent() -> None:
         session = list(emulator.sessions)
         with pytest.raises(ConfigurationError, match=r"cameras of bvs serve one client.*consent"):
             await found_on(port, may_disturb=False, ask=True)
-        await found_on(port, leave=[f"{NETWORK}1"])
-        await found_on(port, leave=[f"{NETWORK}0/28"])
+        await found_on(port, exclude=[f"{NETWORK}1"])
+        await found_on(port, exclude=[f"{NETWORK}0/28"])
         await found_on(port, may_disturb=False, ask=True, protocols=["insight"], ports=[])
         assert emulator.sessions == session
-        assert not emulator.visits
-        # what "leave" is for: this reading of the documents, and what it costs
+        assert not emulator.ended_connections
+        # what "exclude" is for: this reading of the documents, and what it costs
         assert by_last_number(await found_on(port, may_disturb=False)) == {
             "1": (("bvs",), "silent")
         }
@@ -266,7 +266,7 @@ async def test_openings_have_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     times, _ = fake_openings(monkeypatch, lasts=0.3)
     search = CameraSearch(["10.0.0.0/24"], protocols=["insight"], ports=[24], rate=20, at_once=500)
     await search.run()
-    assert len(times) == search.opened == search.total == 2 * 254
+    assert len(times) == search.tried == search.total == 2 * 254
     # neither more than 20 in any second, nor a burst in a tenth of one
     assert all(later - first > 1 - 1e-3 for first, later in zip(times, times[20:], strict=False))
     assert all(later - first > 0.1 - 1e-3 for first, later in zip(times, times[2:], strict=False))
@@ -320,7 +320,7 @@ async def test_talker_that_never_says_a_line_ends_by_its_deadline() -> None:
         ({"ports": range(1, 40)}, "39 ports"),
         ({"protocols": []}, "no protocol"),
         ({"protocols": ["insigth"]}, "did you mean 'insight'"),
-        ({"leave": ["10.0.0."]}, "is no address"),
+        ({"exclude": ["10.0.0."]}, "is no address"),
     ],
 )
 def test_search_that_cannot_work_is_refused(options: dict[str, Any], said: str) -> None:
@@ -341,11 +341,11 @@ async def test_more_addresses_may_be_allowed(monkeypatch: pytest.MonkeyPatch) ->
 async def test_network_that_is_left_is_left_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     times, _ = fake_openings(monkeypatch, lasts=0.0)
     search = CameraSearch(
-        ["10.0.0.0-20"], protocols=["insight"], leave=["10.0.0.0/28", "10.0.0.17"]
+        ["10.0.0.0-20"], protocols=["insight"], exclude=["10.0.0.0/28", "10.0.0.17"]
     )
     await search.run()
     assert len(times) == search.total == 4
-    assert search.left_out == {"10.0.0.17": "10.0.0.17"}
+    assert search.excluded == {"10.0.0.17": "10.0.0.17"}
 
 
 async def test_address_of_ipv6() -> None:
@@ -371,7 +371,7 @@ async def test_name_means_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(loop, "getaddrinfo", look_up)
     async with listening(f"{NETWORK}1", port), listening(f"{NETWORK}2", port) as other:
         assert [*by_last_number(await found_on(port, "cam.example"))] == ["1", "2"]
-        assert await found_on(port, leave=["cam.example"]) == []
+        assert await found_on(port, exclude=["cam.example"]) == []
         assert other.opened == 1
     for name, said in (("nobody.example", "no such name"), ("slow.example", "within 5 s")):
         with pytest.raises(ConfigurationError, match=f"{name}.*{said}"):
@@ -434,7 +434,7 @@ async def test_cancelled_search_closes_and_keeps_what_it_found() -> None:
                 await task
         await until(lambda: silent.ended == silent.opened and later.ended == later.opened)
         assert by_last_number(search.results()) == {"1": (("insight",), "greeted")}
-        assert search.opened < search.total
+        assert search.tried < search.total
 
 
 async def test_port_that_meets_itself_is_not_open() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from smartcam.doctor._inside import Trial, trials
+from smartcam.doctor._inside import TracedAttempt, try_ways
 from smartcam.doctor._probing import MAX_FRAMES, ways
 from smartcam.emulator import EmulatedCamera
 from smartcam.models import Status
@@ -36,8 +36,8 @@ SHORT = 0.3
 """Seconds for all tries in tests where most tries get no answer."""
 
 
-async def tried(url: str, timeout: float = SHORT, **options: Any) -> list[Trial]:
-    async with aclosing(trials(parse_address(url), timeout=timeout, **options)) as found:
+async def tried(url: str, timeout: float = SHORT, **options: Any) -> list[TracedAttempt]:
+    async with aclosing(try_ways(parse_address(url), timeout=timeout, **options)) as found:
         return [trial async for trial in found]
 
 
@@ -49,7 +49,7 @@ def names(url: str) -> list[tuple[str, str]]:
     ]
 
 
-def broken(trial: Trial) -> list[tuple[str, str]]:
+def broken(trial: TracedAttempt) -> list[tuple[str, str]]:
     return [(one.message, one.hex) for one in trial.frames if one.direction == "!"]
 
 
@@ -98,7 +98,7 @@ async def test_camera_is_found_whatever_it_speaks(dialect: str, transport: Any) 
 async def test_session_is_over_before_its_try_is_reported() -> None:
     seen: list[TraceEntry] = []
     async with EmulatedCamera() as emulator:
-        async for trial in trials(parse_address(emulator.url), timeout=1.0, trace=seen.append):
+        async for trial in try_ways(parse_address(emulator.url), timeout=1.0, trace=seen.append):
             assert trial.answer is not None
             assert emulator.sessions == []
     assert [one.message for one in trial.frames] == [
@@ -288,7 +288,7 @@ async def test_try_that_runs_out_says_disconnect() -> None:
 
     async with scripted(cut_short) as listener:
         address = parse_address(f"bvs://{HOST}:{listener.port}?dialect=handbook")
-        async with aclosing(trials(address, timeout=SHORT)) as found:
+        async with aclosing(try_ways(address, timeout=SHORT)) as found:
             assert (await anext(found)).answer is None
         async with asyncio.timeout(5.0):
             while not goodbyes:  # noqa: ASYNC110 - what is waited for has no event

@@ -247,7 +247,7 @@ async def test_value_of_shifted_bytes_gets_a_hint() -> None:
     findings = await read("n: int32", {"n": 7}, "x: real32")
     found = finding_of(findings, "values")
     assert found.details["value"] == tiny
-    assert "which nothing measures" in found.text
+    assert "which no camera measures" in found.text
     assert "all after it are shifted" in found.cure
 
 

@@ -65,7 +65,7 @@ async def test_connecting_is_announced_before_anything_is_sent() -> None:
         findings = examine(emulator.url)
         first = await anext(findings)
         assert (first.check, first.severity) == ("notice", "ok")
-        assert "takes the camera from another client" in first.text
+        assert "another one that is connected now loses its session" in first.text
         assert list(emulator.log) == []
         await findings.aclose()
 
@@ -77,9 +77,9 @@ async def test_nothing_listens_is_reported_with_every_way_that_was_tried() -> No
     found = finding_of(findings, "session")
     assert found.text == f"nothing listens at {HOST}:{port} (TCP): Connection refused"
     assert "36701" in found.cure
-    own = [one for one in found.details["tries"] if " at port " not in one.partition(":")[0]]
+    own = [one for one in found.details["attempts"] if " at port " not in one.partition(":")[0]]
     assert {one.partition(":")[0].rpartition(" ")[2] for one in own} == {"TCP", "UDP"}
-    assert len(own) < len(found.details["tries"])
+    assert len(own) < len(found.details["attempts"])
     assert findings[-1] is found
 
 
@@ -161,7 +161,7 @@ async def test_silent_tcp_camera_set_to_udp_is_found_and_examined() -> None:
     assert errors(findings) == NO_SESSION
     failed, made = [one for one in findings if one.check == "session"]
     assert failed.cure == (
-        f"A camera answers at {emulator.url}: use this URL. What follows was seen there."
+        f"A camera answers at {emulator.url}: use this URL. The next checks were made there."
     )
     assert made.details["url"] == emulator.url
     assert finding_of(findings, "run state").severity == "ok"
@@ -182,7 +182,7 @@ async def test_camera_that_answers_one_try_only_is_gone_again() -> None:
         wrong = emulator.url.replace("thesis", "handbook")
         findings = await examined(wrong, timeout=2 * SHORT)
     assert errors(findings) == 2 * NO_SESSION
-    assert findings[-1].text.startswith("and it is gone again: ")
+    assert findings[-1].text.startswith("the camera that answered a moment ago is gone: ")
 
 
 async def test_camera_that_refuses_newcomers_hangs_up() -> None:
@@ -241,7 +241,7 @@ async def test_session_that_fails_at_first_only_is_a_warning() -> None:
         findings = await examined(url, timeout=SHORT)
     warned, made = [one for one in findings if one.check == "session"]
     assert (warned.severity, made.severity) == ("warning", "ok")
-    assert "and one a moment later" in warned.text
+    assert "the second one had a session" in warned.text
     assert len(warned.details["attempts"]) == 3
 
 
@@ -259,8 +259,8 @@ async def test_session_has_the_connect_time_with_its_spread() -> None:
         findings = await examined(emulator.url)
     found = finding_of(findings, "session")
     times = found.details["connect_time"]
-    assert list(times) == ["times", "min", "median", "p99", "jitter"]
-    assert times["times"] == 5
+    assert list(times) == ["samples", "min", "median", "p99", "jitter"]
+    assert times["samples"] == 5
     assert 0 < times["min"] <= times["median"] <= times["p99"]
     assert (found.cure, found.details["url"]) == ("", emulator.url)
 
@@ -269,9 +269,9 @@ async def test_session_without_a_pinned_dialect_tells_the_url_to_use() -> None:
     async with EmulatedCamera(running=True) as emulator:
         findings = await examined(emulator.url.partition("?")[0], timeout=3.0)
     found = finding_of(findings, "session")
-    assert found.cure == f"Use {emulator.url} from now on: it says what was found out."
+    assert found.cure == f"Use {emulator.url} from now on: it names the dialect."
     assert "the first, which found the dialect, " in found.text
-    assert found.details["connect_time"]["times"] >= 1
+    assert found.details["connect_time"]["samples"] >= 1
 
 
 # ---------------------------------------------------------------------- a session lost
@@ -337,7 +337,7 @@ async def test_camera_taken_over_udp_falls_silent_and_the_cure_says_why() -> Non
     ) as emulator:
         findings = await examined(emulator.url, timeout=0.1)
     assert findings[-1].check == "lost"
-    assert "another took the camera is told nothing" in findings[-1].cure
+    assert "a client is not told that another one has taken the camera" in findings[-1].cure
 
 
 # ---------------------------------------------------------------------- a slow link

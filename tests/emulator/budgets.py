@@ -12,8 +12,9 @@ from tests.budgets.parser import Parser, streamed
 def _line_codec() -> LineCodec:
     import re
 
+    end = re.compile(rb"\n")
     return LineCodec(
-        "lines", LINE_ROWS, line_end=b"\n", ends=re.compile(rb"\n"), max_line=4096, encoding="utf-8"
+        "lines", LINE_ROWS, line_end=b"\n", client_line_end=end, max_line=4096, encoding="utf-8"
     )
 
 

@@ -14,4 +14,4 @@ from smartcam.emulator._scenario.timeline import MAX_CUES_AT_ONCE, MAX_PENDING, 
 from smartcam.emulator.faults import _matching
 from smartcam.emulator.faults._base import WireFault
 from smartcam.emulator.faults._matching import FaultQueue
-from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
+from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, parse, parse_one

@@ -26,8 +26,8 @@ from tests.emulator.inside import generator_names
 
 
 def container(application: Application, **options: Any) -> bytes:
-    given: dict[str, Any] = {"number": 5, "turn": 0, "time": 0.0, "scene": TableScene(), **options}
-    data = application.container(**given)
+    given: dict[str, Any] = {"number": 5, "run_index": 0, "time": 0.0, "scene": TableScene()}
+    data = application.container(**{**given, **options})
     assert data is not None
     return data
 
@@ -91,12 +91,11 @@ def test_builtin_9_number_beyond_int32_starts_over() -> None:
 
 
 def test_container_without_send_results_is_none() -> None:
-    given: dict[str, Any] = {"number": 0, "turn": 0, "time": 0.0, "scene": TableScene()}
-    assert Application(id=2).container(**given) is None
+    assert Application(id=2).container(number=0, run_index=0, time=0.0, scene=TableScene()) is None
 
 
 @pytest.mark.parametrize(
-    ("fields", "period"),
+    ("fields", "runs"),
     [
         ({"layout": "n: uint8", "constant": [1]}, 1),
         ({"layout": "n: uint8", "cycle": [[1], [2], [1]]}, 3),
@@ -106,14 +105,14 @@ def test_container_without_send_results_is_none() -> None:
     ],
 )
 def test_period_is_known_where_a_run_changes_nothing(
-    fields: dict[str, Any], period: int | None
+    fields: dict[str, Any], runs: int | None
 ) -> None:
-    assert Application(id=2, **fields).period == period
+    assert Application(id=2, **fields).repeat_after == runs
 
 
 def test_container_cycle_goes_round() -> None:
     app = Application(id=2, layout="n: uint8", cycle=[{"n": 1}, [2], {"n": 3}])
-    assert b"".join(container(app, turn=turn) for turn in range(7)) == b"\1\2\3\1\2\3\1"
+    assert b"".join(container(app, run_index=index) for index in range(7)) == b"\1\2\3\1\2\3\1"
 
 
 def test_container_slots_are_filled_with_zeros() -> None:
@@ -141,7 +140,7 @@ def test_container_generator_function_sees_the_run() -> None:
 
     app = Application(id=2, layout="n: int32", generator=generate, parameters={"a": 1})
     assert len(seen) == 1
-    container(app, number=3, turn=2, time=1.5)
+    container(app, number=3, run_index=2, time=1.5)
     assert seen[-1][:3] == (3, 2, 1.5)
     assert seen[-1].parameters == {"a": 1}
     assert seen[-1].layout == Layout("n: int32")

@@ -10,7 +10,7 @@ from smartcam.emulator import ManualClock, faults
 from smartcam.emulator._inside import DelayLine, Ending, Transmission
 from smartcam.protocols import Frame
 from smartcam.protocols._inside import HANDBOOK, Framer
-from tests.emulator.inside import WireMessage, apply_faults, cut, cut_datagram
+from tests.emulator.inside import WireMessage, apply_faults, parse, parse_one
 from tests.machines import THESIS
 
 
@@ -23,11 +23,11 @@ class Line:
         self.close_at: str | None = None
         self.delayed = DelayLine[Transmission](
             self.clock,
-            ordered=ordered,
+            keeps_order=ordered,
             wake=lambda: self.delayed.run(),
             carry=self.carry,
             end=lambda ending: self.seen.append(f"[{ending.how}]"),
-            on_dropped=lambda sent: self.seen.append(f"[lost {sent.faults[0]}]"),
+            on_dropped=lambda sent: self.seen.append(f"[lost {sent.effects[0]}]"),
         )
 
     def carry(self, batch: list[tuple[Transmission, bytes]]) -> None:
@@ -38,7 +38,7 @@ class Line:
 
     def put(self, text: str, **changes: Any) -> None:
         parts = changes.pop("parts", [text.encode()])
-        self.delayed.put([Transmission(parts, faults=[text], **changes)])
+        self.delayed.put([Transmission(parts, effects=[text], **changes)])
 
     def at(self, seconds: float) -> list[str]:
         """Return the events until ``seconds``, and forget them."""
@@ -205,7 +205,7 @@ def test_cutting_gives_back_every_byte(dialect: Any) -> None:
     data = b"??" + frame + frame + b"PSV!" + frame + frame[:5]
     for at in range(len(data)):
         framer = Framer(dialect.header, 100)
-        messages = cut(data[:at], framer, dialect) + cut(data[at:], framer, dialect)
+        messages = parse(data[:at], framer, dialect) + parse(data[at:], framer, dialect)
         assert b"".join(one.original for one in messages) + framer.pending == data
         assert [one.content for one in messages if isinstance(one.content, Frame)] == [
             Frame(0x31, b"\x15\0\0\0")
@@ -214,11 +214,11 @@ def test_cutting_gives_back_every_byte(dialect: Any) -> None:
 
 def test_cutting_refuses_a_length_as_the_machine_does() -> None:
     data = bytes.fromhex("50535642 0b000000 30000000")
-    messages = cut(data, Framer(HANDBOOK.header, 10), HANDBOOK)
+    messages = parse(data, Framer(HANDBOOK.header, 10), HANDBOOK)
     assert [type(one.content) for one in messages] == [bytes]
 
 
 @pytest.mark.parametrize("data", [b"", b"?", bytes.fromhex("50535642 00000000 30000000") * 2])
 def test_datagram_that_is_not_one_frame_stays_whole(data: bytes) -> None:
-    message = cut_datagram(data, HANDBOOK)
+    message = parse_one(data, HANDBOOK)
     assert (message.content, message.original, message.parts) == (data, data, [data])

@@ -612,7 +612,7 @@ def test_endian_is_reported_and_turns_containers_and_input() -> None:
     assert say(device, m.SetInput(data=b"\1\2"), m.Trigger())[1] == "result 2 0102"
 
 
-def test_operators_actions_happen_inside_around() -> None:
+def test_operators_actions_happen_inside_their_context() -> None:
     device = make()
     seen: list[str] = []
 
@@ -622,7 +622,7 @@ def test_operators_actions_happen_inside_around() -> None:
         yield
         seen.append(f"after {device.status}")
 
-    device.around = around
+    device.action_context = around
     device.start()
     assert seen == ["before no bit set", "after RUNNING + WAITING_FOR_TRIGGER"]
 
@@ -630,9 +630,7 @@ def test_operators_actions_happen_inside_around() -> None:
 # ---------------------------------------------------------------------- the rest
 
 
-def test_generator_that_fails_gives_no_result_and_is_logged(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_failing_generator_gives_no_result_and_a_log_line(caplog: pytest.LogCaptureFixture) -> None:
     calls: list[int] = []
 
     def fails_later(run: Any) -> list[int]:

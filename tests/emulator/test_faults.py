@@ -200,7 +200,7 @@ def queue_of(*given: faults.Fault | dict[str, Any]) -> FaultQueue:
 
 
 def said(queue: FaultQueue, *messages: m.Message) -> list[list[str]]:
-    return [[f.kind for f in queue.by_message(queue.wire_on_camera, one)] for one in messages]
+    return [[f.kind for f in queue.by_message(queue.camera_wire_faults, one)] for one in messages]
 
 
 ANSWER = m.QueryAnswer(application=1)
@@ -212,7 +212,7 @@ def test_nth_and_times_count_the_messages_that_fit() -> None:
     hits = said(queue, ANSWER, VERSION, ANSWER, VERSION, ANSWER, ANSWER)
     assert hits == [[], [], ["drop"], [], ["drop"], []]
     assert queue.waiting == []
-    assert queue.wire_on_camera == []
+    assert queue.camera_wire_faults == []
 
 
 def test_times_none_never_ends() -> None:
@@ -228,23 +228,23 @@ def test_several_apply_in_the_order_given() -> None:
 
 def test_id_without_a_sender_is_the_cameras_for_the_wire_and_the_clients_for_the_device() -> None:
     queue = queue_of(faults.Drop(on=0x30), faults.OperatorStop(on=0x30))
-    assert [row.fault.kind for row in queue.wire_on_camera] == ["drop"]
-    assert [row.fault.kind for row in queue.device_on_client] == ["stop"]
-    assert queue.by_message(queue.device_on_client, m.Query()) == [faults.OperatorStop(on=0x30)]
+    assert [row.fault.kind for row in queue.camera_wire_faults] == ["drop"]
+    assert [row.fault.kind for row in queue.client_device_faults] == ["stop"]
+    assert queue.by_message(queue.client_device_faults, m.Query()) == [faults.OperatorStop(on=0x30)]
 
 
 def test_unknown_id_of_a_client_fits_by_number_only() -> None:
     queue = queue_of(faults.Drop(on=0x77, sender="client"), faults.Drop(sender="client", nth=2))
     frame = Frame(0x77, b"x")
-    assert len(queue.by_frame(queue.wire_on_client, frame)) == 1
-    assert len(queue.by_frame(queue.wire_on_client, frame)) == 1
+    assert len(queue.by_frame(queue.client_wire_faults, frame)) == 1
+    assert len(queue.by_frame(queue.client_wire_faults, frame)) == 1
     unknown = m.UnknownMessage(message_id=0x77, payload=b"x")
     assert [fired.message for fired in queue.fired] == [unknown, unknown]
 
 
 def test_short_body_of_a_client_fits_by_name_and_is_recorded_as_bytes() -> None:
     queue = queue_of(faults.Drop(on="SwitchApplication"))
-    queue.by_frame(queue.wire_on_client, Frame(0x31, b"\1"))
+    queue.by_frame(queue.client_wire_faults, Frame(0x31, b"\1"))
     (fired,) = queue.fired
     assert fired.message == m.UnknownMessage(message_id=0x31, payload=b"\1")
     assert (fired.time, fired.fault) == (0.0, faults.Drop(on="SwitchApplication"))
@@ -269,9 +269,9 @@ def test_clear_forgets_all_and_keeps_the_record() -> None:
     queue.clear()
     assert queue.waiting == []
     assert [
-        *queue.wire_on_camera,
-        *queue.wire_on_client,
-        *queue.device_on_client,
+        *queue.camera_wire_faults,
+        *queue.client_wire_faults,
+        *queue.client_device_faults,
         *queue.at_once(),
     ] == []
 

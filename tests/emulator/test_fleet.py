@@ -110,7 +110,7 @@ def test_dialect_that_is_given_goes_before_the_files(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="line 1: quirks: dialect handbook has no quirk"):
         load_scenario(path)
     assert load_scenario(path, dialect="b16").dialect == "b16"
-    assert EmulatedCamera(scenario=path, dialect="b16").spoken.quirks == ("code",)
+    assert EmulatedCamera(scenario=path, dialect="b16").wire_dialect.quirks == ("code",)
 
 
 def test_scenario_says_dialect_transport_and_port() -> None:
@@ -133,7 +133,7 @@ async def test_fleet_starts_and_stops_all(tmp_path: Path) -> None:
             async with smartcam.connect(emulator.url) as camera:
                 assert camera.active_application in {5, 6}
         clock.advance(1)
-        assert [emulator.cues_done for emulator in fleet] == [[1], [1, 0, 0]]
+        assert [emulator.cue_counts for emulator in fleet] == [[1], [1, 0, 0]]
     with pytest.raises(smartcam.ConnectFailedError):
         await smartcam.connect(fleet["left"].url, reconnect=None, connect_timeout=1)
 

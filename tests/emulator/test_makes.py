@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 WEIGHTS = """
 def weights(run):
     "Weights that grow."
-    return {"grams": 100 + run.turn}
+    return {"grams": 100 + run.run_index}
 
 NUMBER = 7
 """
@@ -85,7 +85,7 @@ def test_scenario_of_another_make_says_what_it_cannot_do() -> None:
     mistake = EmulatedInSight.mistake(Scenario(protocol="insight", transport="udp"))
     assert mistake is not None
     assert mistake[0] == ("transport",)
-    assert mistake[1].startswith("a camera of insight takes none; it takes active, ")
+    assert mistake[1].startswith("a camera of insight has no such field; it has active, ")
 
 
 def test_threads_take_any_make() -> None:

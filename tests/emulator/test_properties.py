@@ -225,10 +225,10 @@ class Owner:
     def make_machine(self, transport: CarriedBy, trace: Trace) -> Machine:
         return Machine(HANDBOOK, Role.CAMERA, transport, max_length=MAX_INPUT_BYTES, trace=trace)
 
-    def arrived(self, link: ClientLink) -> None:
+    def connection_begun(self, link: ClientLink) -> None:
         pass
 
-    def received(self, link: ClientLink, message: m.Message) -> None:
+    def handle_message(self, link: ClientLink, message: m.Message) -> None:
         self.messages.append(message)
         if isinstance(message, m.Connect):
             link.send(m.ConnectAnswer(version=1))
@@ -239,13 +239,13 @@ class Owner:
     def connection_ended(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
         pass
 
-    def lost(self, link: ClientLink) -> None:
+    def forget_link(self, link: ClientLink) -> None:
         pass
 
-    def traced(self, link: ClientLink, sender: m.Sender, what: object) -> None:
+    def note_frame(self, link: ClientLink, sender: m.Sender, what: object) -> None:
         pass
 
-    def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
+    def note_message(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
         pass
 
 

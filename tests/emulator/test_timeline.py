@@ -270,7 +270,7 @@ async def test_every_state_can_be_entered() -> None:
         device.handle(m.Disconnect())
         device.reboot(1)
         device.report_entered()
-    done = dict(zip(DeviceState, emulator.cues_done, strict=True))
+    done = dict(zip(DeviceState, emulator.cue_counts, strict=True))
     assert [state for state, count in done.items() if not count] == [DeviceState.INPUT_CONTAINER]
 
 
@@ -283,7 +283,7 @@ async def test_input_container_bit_is_a_state() -> None:
     async with emulator:
         emulator.device.trigger()  # without a container
         clock.advance(1)
-        assert emulator.cues_done == [1]
+        assert emulator.cue_counts == [1]
         assert not emulator.device.running
 
 
@@ -328,7 +328,7 @@ async def test_cues_that_bring_each_other_about_end(caplog: pytest.LogCaptureFix
     )
     async with emulator:
         emulator.device.stop()
-        assert sum(emulator.cues_done) == MAX_CUES_AT_ONCE
+        assert sum(emulator.cue_counts) == MAX_CUES_AT_ONCE
     assert "one is dropped" in caplog.text
 
 
@@ -380,7 +380,7 @@ async def test_timeline_in_real_time() -> None:
     async with emulator, asyncio.timeout(5):
         while emulator.device.running:  # noqa: ASYNC110 - the device has no event for it
             await asyncio.sleep(0.005)
-    assert emulator.cues_done == [1]
+    assert emulator.cue_counts == [1]
 
 
 @pytest.mark.parametrize(

@@ -103,16 +103,16 @@ def test_log_is_bounded_in_bytes_and_tells_what_went(look_after: int) -> None:
         assert log.size <= 20_000
     kept, count = log.since(0)
     assert [int(entry.hex[:2], 16) for entry in kept] == [6, 7, 8, 9]
-    assert (len(log), log.pushed_out, count) == (4, 6, 10)
+    assert (len(log), log.dropped_count, count) == (4, 6, 10)
     assert count - len(kept) == 6  # missed
 
 
 def test_log_keeps_the_last_entry_however_large() -> None:
     log = Log(HANDBOOK, max_bytes=1000)
     log.append((0.5, PEER, m.Sender.CLIENT, Frame(0x21, bytes(5000)), None, None))
-    assert (len(log), log.pushed_out) == (1, 0)
+    assert (len(log), log.dropped_count) == (1, 0)
     put(log, 1)
-    assert (numbers(log), log.pushed_out) == ([1], 1)
+    assert (numbers(log), log.dropped_count) == ([1], 1)
 
 
 def test_log_counts_all_that_an_entry_says() -> None:
@@ -120,7 +120,7 @@ def test_log_counts_all_that_an_entry_says() -> None:
     log.append(LogEntry(0.5, "in", PEER, None, None, "00 00", 1000 * "e", 100 * "f", 3000 * "w"))
     assert 4100 < log.size < 6000
     log.popleft()
-    assert (log.size, log.pushed_out) == (0, 0)
+    assert (log.size, log.dropped_count) == (0, 0)
 
 
 @pytest.mark.parametrize("reads", [False, True])
@@ -140,7 +140,7 @@ def test_log_holds_no_more_memory_than_it_says(reads: bool) -> None:
         tracemalloc.stop()
     assert held < 1.1 * MAX_BYTES
     assert read < 1.1 * MAX_BYTES
-    assert len(entries) + traffic.entries.pushed_out == 500
+    assert len(entries) + traffic.entries.dropped_count == 500
 
 
 async def test_log_of_large_frames_is_bounded_on_the_wire() -> None:
@@ -152,7 +152,7 @@ async def test_log_of_large_frames_is_bounded_on_the_wire() -> None:
         log = emulator.log
         entries, count = log.since(0)
         assert log.size <= MAX_BYTES
-        assert log.pushed_out == count - len(entries) > 0
+        assert log.dropped_count == count - len(entries) > 0
         frame, reason = entries[-2:]
         assert frame.hex == bytes(MAX_INPUT_BYTES).hex(" ")
         assert reason.error is not None
@@ -164,7 +164,7 @@ def test_log_counts_what_nobody_read() -> None:
     for number in range(2, 9):
         put(log, number)
     new, count = log.since(before)
-    assert (before, count, len(new), log.pushed_out) == (2, 9, 3, 6)
+    assert (before, count, len(new), log.dropped_count) == (2, 9, 3, 6)
 
 
 def test_log_gives_no_more_than_asked_for() -> None:
@@ -177,9 +177,9 @@ def test_log_gives_no_more_than_asked_for() -> None:
 
 def test_log_that_is_emptied_begins_anew() -> None:
     log = make(1, 2, 3, 4)
-    assert log.pushed_out == 1
+    assert log.dropped_count == 1
     log.clear()
-    assert (len(log), log.size, log.pushed_out) == (0, 0, 0)
+    assert (len(log), log.size, log.dropped_count) == (0, 0, 0)
     put(log, 5)
     assert log.since(4) == (list(log), 5)
 

@@ -33,7 +33,7 @@ class LiveMake(LiveCamera):
         return f"{self.emulator.url}?{self.query}"
 
     @property
-    def unpinned(self) -> str:
+    def url_without_dialect(self) -> str:
         query = "&".join(one for one in self.query.split("&") if "dialect" not in one)
         return f"{self.emulator.url}?{query}"
 

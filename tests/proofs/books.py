@@ -192,7 +192,7 @@ class BookKeeper(EmulatedCamera):
                 run = self.runs.get(index, KeptRun(index, 0.0))
                 self._sent.append(Sent(entry.peer, run, data, entry.wire is None))
 
-    def received(self, link: ClientLink, message: m.Message) -> None:
+    def handle_message(self, link: ClientLink, message: m.Message) -> None:
         """Note whose the run is that a trigger begins."""
         if len(self.log) > FULL_LOG:
             self._read_log()  # it is bounded
@@ -204,7 +204,7 @@ class BookKeeper(EmulatedCamera):
         elif isinstance(message, m.Trigger):
             self.triggers += 1
             self._in_session += 1
-        super().received(link, message)
+        super().handle_message(link, message)
         if isinstance(message, m.Trigger):
             told, self._told = self._told, NOBODY
             if idle and self.device.processing:

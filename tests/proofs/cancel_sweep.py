@@ -533,7 +533,7 @@ async def _check_state(bench: Bench, call: Call) -> None:
     assert inside(camera)._state.wanted.application in {None, active}
     if not camera.capabilities.status_by_itself:
         await camera.query_status()
-    bits = bench.box.spoken.status_bits
+    bits = bench.box.wire_dialect.status_bits
     assert camera.status == bits.read(bits.write(device.status))
     while not inside(camera)._waits.pending_answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
         await asyncio.sleep(0)

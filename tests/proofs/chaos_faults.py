@@ -91,12 +91,13 @@ def _good_link(victim: Victim) -> None:
 def _bad_datagrams(victim: Victim, chance: Random) -> None:
     way: Literal["up", "down"] = chance.choice(("up", "down"))
     seed, share = chance.randrange(1000), chance.uniform(0.02, 0.3)
+    picked: dict[str, Any] = {"direction": way, "probability": share, "seed": seed}
     chosen: rules.Rule = chance.choice(
         [
-            rules.Lose(direction=way, probability=share, seed=seed),
-            rules.Repeat(direction=way, probability=share, seed=seed),
-            rules.Late(direction=way, probability=share, seed=seed, seconds=0.005, jitter=0.02),
-            rules.Reorder(direction=way, probability=share, seed=seed, seconds=0.02),
+            rules.DropDatagrams(**picked),
+            rules.DuplicateDatagrams(**picked),
+            rules.DelayDatagrams(**picked, seconds=0.005, jitter=0.02),
+            rules.Reorder(**picked, seconds=0.02),
         ]
     )
     victim.proxy.rules[:] = [chosen]

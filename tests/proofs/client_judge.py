@@ -448,7 +448,7 @@ class ClientJudge:
             return False  # the next session tells
         self.go(None)
         assert active == camera.active_application == device.active_application
-        bits = self.box.spoken.status_bits
+        bits = self.box.wire_dialect.status_bits
         assert camera.status == bits.read(bits.write(device.status))
         assert not inside(camera)._waits.pending_answers
         return True

@@ -418,18 +418,18 @@ def datagram_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[
     for one in found:
         picked: dict[str, Any] = {"direction": one.way, "number": one.nth}
         changes: dict[str, rules.Rule] = {
-            "lost": rules.Lose(**picked),
-            "twice": rules.Repeat(**picked),
-            "3 times": rules.Repeat(**picked, copies=2),
-            "soon": rules.Late(**picked, seconds=0.02),
-            "late": rules.Late(**picked, seconds=0.25),
+            "lost": rules.DropDatagrams(**picked),
+            "twice": rules.DuplicateDatagrams(**picked),
+            "3 times": rules.DuplicateDatagrams(**picked, copies=2),
+            "soon": rules.DelayDatagrams(**picked, seconds=0.02),
+            "late": rules.DelayDatagrams(**picked, seconds=0.25),
             "behind the next": rules.Reorder(**picked, seconds=0.05),
             "behind two": rules.Reorder(**picked, overtaken_by=2, seconds=0.05),
         }
         for label, rule in changes.items():
             more: dict[str, Any] = {"allowed": SILENT}
-            lasts = rule.seconds if isinstance(rule, (rules.Late, rules.Reorder)) else 0.0
-            if isinstance(rule, rules.Repeat):
+            lasts = rule.seconds if isinstance(rule, (rules.DelayDatagrams, rules.Reorder)) else 0.0
+            if isinstance(rule, rules.DuplicateDatagrams):
                 more = {"allowed": TWICE.get(one.frame.message, NONE), "bounds": PATIENT}
                 more["copies"] = 1 + rule.copies
             elif one.frame.message == "StatusReport":  # an old one may be heard last

@@ -82,14 +82,14 @@ class ReportedCamera(NumberedCamera):
         super().__init__(**options)
         self._place, self._had = number, [""]
 
-    def received(self, link: Any, message: Any) -> None:
+    def handle_message(self, link: Any, message: Any) -> None:
         """Hear a message, and say whose the session is, if that has changed."""
-        super().received(link, message)
+        super().handle_message(link, message)
         self._tell()
 
-    def lost(self, link: Any) -> None:
+    def forget_link(self, link: Any) -> None:
         """Lose a link; the same."""
-        super().lost(link)
+        super().forget_link(link)
         self._tell()
 
     def _tell(self) -> None:

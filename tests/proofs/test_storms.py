@@ -135,7 +135,7 @@ def a_ledger(*runs: int) -> tuple[Ledger, list[str]]:
     for run in runs:
         data = RECORD.pack(0, run, 0, 1)
         message = m.ResultContainer(application=1, data=data)
-        frame = emulator.spoken.to_frame(message)
+        frame = emulator.wire_dialect.to_frame(message)
         emulator._traffic.add(0.0, "somebody:1", m.Sender.CAMERA, frame)
     complaints: list[str] = []
     return Ledger("camera", emulator, complaints.append, ordered=True), complaints
@@ -173,7 +173,8 @@ async def test_result_of_another_trigger_is_a_violation(monkeypatch: pytest.Monk
     watch = Watch()
     station = Station(2, watch, Random(SEED))  # noqa: S311
     emulator = station.emulator
-    monkeypatch.setattr(emulator, "received", partial(EmulatedCamera.received, emulator))
+    handle = partial(EmulatedCamera.handle_message, emulator)
+    monkeypatch.setattr(emulator, "handle_message", handle)
     await station.open()
     work = asyncio.create_task(station.work())
     try:

@@ -87,7 +87,7 @@ async def test_replay_recorded_again_is_the_same(
     ) as emulator:
         first = await record(tmp_path / "a.mcap", emulator, triggers=3)
     async with ReplayedCamera(first, quirks={"overtriggered_time": 0.2}) as emulator:
-        assert emulator.spoken.quirks == tuple(quirks)
+        assert emulator.wire_dialect.quirks == tuple(quirks)
         assert emulator.quirks.overtriggered_time == 0.2
         assert (emulator.dialect, emulator.transport) == (dialect, transport)
         second = await record(tmp_path / "b.mcap", emulator, triggers=3)

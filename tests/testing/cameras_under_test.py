@@ -131,7 +131,7 @@ class _InSightSite(LiveCamera):
         return f"{self.emulator.url}?dialect=native&cells=A2"
 
     @property
-    def unpinned(self) -> str:
+    def url_without_dialect(self) -> str:
         return f"{self.emulator.url}?cells=A2"
 
     @property

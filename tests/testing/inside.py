@@ -6,7 +6,7 @@ from smartcam.testing.proxy import _log
 from smartcam.testing.proxy._log import Entry
 from smartcam.testing.proxy._rules import (
     MAX_COPY_BYTES,
-    MAX_HOLD_BYTES,
+    MAX_RULE_BYTES,
     Direction,
     PointRule,
     RangeRule,

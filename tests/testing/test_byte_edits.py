@@ -32,7 +32,7 @@ def fed(rules: Iterable[PointRule | RangeRule], *chunks: bytes) -> list[Edit]:
     """Return every edit but the notes."""
     editor = Editor(rules)
     edits = [edit for chunk in (b"", *chunks) for edit in editor.feed(chunk)]
-    return [edit for edit in edits if not edit.faults]
+    return [edit for edit in edits if not edit.effects]
 
 
 def written(edits: Iterable[Edit]) -> bytes:
@@ -124,7 +124,7 @@ def test_point_acts_as_soon_as_it_is_reached() -> None:
 
 def test_point_at_the_beginning_acts_before_any_byte() -> None:
     note, end = Editor([Cut()]).feed(b"")
-    assert (note.faults, note.at, end.end) == (["cut"], 0, CUT)
+    assert (note.effects, note.at, end.end) == (["cut"], 0, CUT)
 
 
 def test_drip_marks_its_range_only() -> None:
@@ -136,7 +136,7 @@ def test_notes_name_only_what_is_reached_and_once() -> None:
     rules = [Flip(at=2, count=4), DropBytes(at=20), InsertBytes(at=3, data=b"x"), Flip(at=10)]
     editor = Editor(rules)
     edits = itertools.chain.from_iterable(editor.feed(bytes([byte])) for byte in DATA)
-    notes = [(edit.faults, edit.at) for edit in edits if edit.faults]
+    notes = [(edit.effects, edit.at) for edit in edits if edit.effects]
     assert notes == [(["flip"], 2), (["insert"], 3)]
     assert editor.position == 10
 

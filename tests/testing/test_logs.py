@@ -80,13 +80,13 @@ def test_log_that_was_full_is_reported_and_is_no_proof(emulator: ThreadedCamera)
     log = emulator.log
     with talk(emulator, CONNECT, QUERY):
         log.expect(m.Query, "QueryAnswer", timeout=PATIENCE)
-        assert log.pushed_out == 0
+        assert log.dropped_count == 0
         emulator.run(lambda camera: setattr(camera.log, "maxlen", 3))
     with talk(emulator, CONNECT) as client:
         emulator.wait_received(m.Connect, count=2)
         client.sendall(DISCONNECT)
         emulator.wait_received(m.Disconnect)
-    gone = f"{log.pushed_out} older entries were pushed out of the full log\n"
+    gone = f"{log.dropped_count} older entries were pushed out of the full log\n"
     log.expect("ConnectAnswer", "Disconnect")  # what is there is there
     assert gone in failure(log.expect, "Query", timeout=0)
     # of what went, nobody knows whether it was right
@@ -149,7 +149,7 @@ def test_close_without_disconnect_is_found(emulator: ThreadedCamera) -> None:
         emulator.wait_received(m.Connect)
         text = failure(emulator.log.expect_disconnect_before_close, timeout=0)
         assert "was Connect(), not Disconnect\n" in text
-    wait_until(lambda: emulator.visits)  # it has noticed
+    wait_until(lambda: emulator.ended_connections)  # it has noticed
     text = failure(emulator.log.expect_disconnect_before_close, timeout=0.1)
     assert re.search(r"not Disconnect, and the client (reset|closed) the connection\n", text)
 

@@ -115,8 +115,8 @@ MISTAKES: dict[str, Callable[[pytest.MonkeyPatch], CameraKind]] = {
     "test_close_ends_the_session_and_leaves_the_camera_as_it_is": other(
         with_site(HANDBOOK, has_session=NOBODY)
     ),
-    "test_connect_pinned_knows_the_camera": other(with_site(HANDBOOK, url=UNPINNED)),
-    "test_connect_unpinned_finds_out_and_pins_it": other(with_site(HANDBOOK, url=UNPINNED)),
+    "test_connect_with_the_dialect_knows_the_camera": other(with_site(HANDBOOK, url=UNPINNED)),
+    "test_connect_without_the_dialect_finds_it_out": other(with_site(HANDBOOK, url=UNPINNED)),
     "test_connect_with_an_application_has_it_running": patched(
         active_application=property(lambda _: 1)
     ),
@@ -124,8 +124,8 @@ MISTAKES: dict[str, Callable[[pytest.MonkeyPatch], CameraKind]] = {
     "test_input_that_does_not_fit_is_refused_where_there_are_codes": patched_bid(trigger=patient),
     "test_killed_camera_ends_what_waits_for_it": patched(statistics=unbalanced),
     "test_load_by_file": patched(switch_application=gives(None)),
-    "test_lost_camera_is_told_and_comes_back": patched(statistics=unbalanced),
-    "test_newcomer_takes_the_camera_or_stands_beside": other(
+    "test_lost_camera_is_reported_and_comes_back": patched(statistics=unbalanced),
+    "test_second_client_takes_the_camera_or_is_served_too": other(
         dataclasses.replace(HANDBOOK, exclusive=False)
     ),
     "test_next_result_is_the_next_one_whoever_triggers": patched_bid(
@@ -151,9 +151,9 @@ MISTAKES: dict[str, Callable[[pytest.MonkeyPatch], CameraKind]] = {
         with_site(HANDBOOK, trigger=lambda _: None)
     ),
     "test_trigger_gives_a_typed_result": patched(trigger=counting),
-    "test_trigger_in_another_application_goes_back": patched(trigger=patient),
+    "test_trigger_in_another_application_is_undone": patched(trigger=patient),
     "test_trigger_of_a_stopped_application_is_refused_at_once": patched(stop=gives(None)),
-    "test_trigger_of_another_application_than_the_one_named_is_told": other(
+    "test_trigger_of_another_application_than_the_named_one_fails": other(
         with_site(BID, switch=lambda *_: None)
     ),
     "test_trigger_that_timed_out_leaves_the_next_one_its_own_result": patched(trigger=patient),
@@ -161,9 +161,7 @@ MISTAKES: dict[str, Callable[[pytest.MonkeyPatch], CameraKind]] = {
     "test_trigger_while_somebody_elses_inspection_runs_waits_for_its_end": patched(
         statistics=unbalanced
     ),
-    "test_trigger_whose_result_does_not_fit_is_told_and_the_next_one_taken": patched(
-        trigger=patient
-    ),
+    "test_trigger_whose_result_does_not_fit_fails_and_the_next_one_works": patched(trigger=patient),
     "test_triggers_at_one_time_take_turns": patched(trigger=counting),
     "test_two_that_want_the_camera_do_not_fight_for_it": patched(statistics=unbalanced),
 }

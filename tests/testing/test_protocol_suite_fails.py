@@ -157,7 +157,7 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"message_label": lambda self, message: "it"}, "is 'it'"),
         ({"fields": lambda self, kind: ("speed",)}, "has {'speed'}"),
     ],
-    "test_message_that_it_has_not_is_unsupported": [
+    "test_message_unknown_to_the_dialect_is_unsupported": [
         ({"message_id": lambda self, message: 0}, "but it has an id")
     ],
     "test_codes_mean_something": [
@@ -166,7 +166,7 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"code": lambda *_: CodeMeaning("no", Verdict.REFUSED)}, "no code says"),
         ({"capabilities": can(result_codes=True)}, "every code says done"),
     ],
-    "test_any_frame_can_be_spelled": [({"spell": lambda *_: None}, "expected a Spelled")],
+    "test_any_frame_can_be_shown": [({"spell": lambda *_: None}, "expected a Spelled")],
     "test_any_raw_request_is_taken_or_refused": [
         ({"raw_request": lambda *_: None}, "raw_request(0): None"),
         ({"body": lambda *_: "text"}, "expected bytes, got 'text'"),
@@ -410,23 +410,23 @@ ANYTHING = "test_any_bytes_tell_messages_or_one_failure"
 MISTAKES = [
     ("test_conversation_goes_as_written", Wordless, "expected b'HELLO\\n' on the wire"),
     ("test_conversation_can_be_cut_anywhere", ByDeliveries, "expected events"),
-    ("test_any_cutting_of_any_bytes_tells_the_same", Fussy, "in pieces"),
+    ("test_any_cutting_of_any_bytes_gives_the_same_events", Fussy, "in pieces"),
     (ANYTHING, Talkative, "which is the last"),
     (ANYTHING, Verbose, "a text of 1200"),
     (ANYTHING, Nonsense, "none of a camera's messages"),
-    ("test_end_of_the_link_is_told_once", EndsTwice, "which is the last"),
+    ("test_end_of_the_link_is_reported_once", EndsTwice, "which is the last"),
     ("test_what_waits_for_more_has_a_bound", Unbounded, "bytes are kept"),
     ("test_what_waits_for_more_has_a_bound", Hoarding, "the machine has grown by"),
     ("test_what_waits_for_more_has_a_bound", KeepsFailed, "of a link that failed"),
     ("test_request_before_the_session_is_refused", Willing, "Query() was taken"),
     ("test_disconnect_before_the_session_is_harmless", Touchy, "not yet"),
-    ("test_message_that_it_has_not_is_refused", Obliging, "Reboot() was taken"),
+    ("test_message_unknown_to_the_dialect_is_refused", Obliging, "Reboot() was taken"),
     ("test_second_request_while_the_answer_is_owed_is_refused", Impatient, "Query() was taken"),
-    ("test_answer_that_nobody_asked_for_is_not_told", Credulous, "no request was open"),
+    ("test_answer_that_nobody_asked_for_is_not_reported", Credulous, "no request was open"),
     ("test_disconnect_is_the_last_word", Restless, "GetStatus() was taken"),
     ("test_disconnect_is_the_last_word", Answering, "it said b'BYE"),
     ("test_machine_says_what_it_is", WrongCandidates, "was not asked for"),
-    ("test_machine_says_what_it_is", Sharing, "an earlier list"),
+    ("test_machine_says_what_it_is", Sharing, "has returned an earlier list again"),
     ("test_bytes_are_counted", Uncounted, "bytes_received is 0"),
     ("test_trace_shows_what_is_said", Untraced, "was traced"),
     ("test_trace_shows_what_is_said", Indiscreet, "the trace has the password"),

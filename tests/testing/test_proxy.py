@@ -16,20 +16,20 @@ from smartcam.testing.proxy import (
     CoalesceBytes,
     Cut,
     DelayBytes,
+    DelayDatagrams,
     Drip,
+    DropDatagrams,
     DuplicateBytes,
+    DuplicateDatagrams,
     Flip,
     InsertBytes,
-    Late,
     LinkProxy,
-    Lose,
     Rate,
     Reorder,
-    Repeat,
     SplitBytes,
     Stall,
 )
-from tests.testing.inside import MAX_COPY_BYTES, MAX_HOLD_BYTES, Entry
+from tests.testing.inside import MAX_COPY_BYTES, MAX_RULE_BYTES, Entry
 from tests.testing.inside import _log as log
 from tests.testing.proxykit import HOST, MESSAGE, SHORT, client, linked, target
 
@@ -90,7 +90,7 @@ async def test_direction_that_is_none_is_refused() -> None:
 async def test_rule_of_the_other_transport_is_refused_from_now() -> None:
     async with linked() as (proxy, _, _):
         with pytest.raises(ConfigurationError, match="it means nothing on TCP"):
-            proxy.from_now(Lose())
+            proxy.from_now(DropDatagrams())
 
 
 async def test_port_is_free_again_after_it() -> None:
@@ -159,15 +159,14 @@ async def test_client_gets_no_result_from_a_stalled_camera() -> None:
 
 
 async def test_client_on_udp_asks_again_where_the_answer_is_lost() -> None:
+    drop = DropDatagrams(number=1, connection=1)
     async with (
         EmulatedCamera(active=7, transport="udp") as emulator,
-        LinkProxy(
-            emulator.host, emulator.port, transport="udp", rules=[Lose(number=1, connection=1)]
-        ) as proxy,
+        LinkProxy(emulator.host, emulator.port, transport="udp", rules=[drop]) as proxy,
         smartcam.connect(proxy.url(emulator.url), connect_timeout=2) as camera,
     ):
         assert camera.active_application == 7
-        assert proxy.counts["lose"] == 1
+        assert proxy.counts["drop"] == 1
         assert proxy.counts["connect"] == 2
 
 
@@ -196,7 +195,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: Flip(mask=0), "mask must be 1 to 255"),
     (lambda: SplitBytes(pause=-1), "pause must be 0 or more seconds"),
     (lambda: Drip(pause=-1), "pause must be 0 or more seconds"),
-    (lambda: CoalesceBytes(size=MAX_HOLD_BYTES + 1), "size must be 1 to 65536 bytes"),
+    (lambda: CoalesceBytes(size=MAX_RULE_BYTES + 1), "size must be 1 to 65536 bytes"),
     (lambda: CoalesceBytes(size=1, seconds=0), "seconds must be more than 0"),
     (lambda: InsertBytes(data=b""), "data must be 1 to 1048576 bytes"),
     (lambda: DuplicateBytes(count=MAX_COPY_BYTES + 1), "count must be at most 1048576 bytes"),
@@ -204,13 +203,13 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: DelayBytes(seconds=-1), "times must be 0 or more seconds"),
     (lambda: DelayBytes(seconds=1, jitter=-1), "times must be 0 or more seconds"),
     (lambda: Rate(bytes_per_second=0), "the rate must be more than 0"),
-    (lambda: Lose(number=0), "datagrams count from 1"),
-    (lambda: Lose(probability=1.5), "probability must be 0 to 1"),
-    (lambda: Repeat(copies=0), "copies must be 1 to 100"),
-    (lambda: Late(seconds=-1), "times must be 0 or more seconds"),
+    (lambda: DropDatagrams(number=0), "datagrams count from 1"),
+    (lambda: DropDatagrams(probability=1.5), "probability must be 0 to 1"),
+    (lambda: DuplicateDatagrams(copies=0), "copies must be 1 to 100"),
+    (lambda: DelayDatagrams(seconds=-1), "times must be 0 or more seconds"),
     (lambda: Reorder(overtaken_by=0), "overtaken_by must be 1 or more datagrams"),
     (lambda: Reorder(seconds=0), "seconds must be more than 0"),
-    (lambda: LinkProxy("h", 1, rules=[Lose()]), "it means nothing on TCP"),
+    (lambda: LinkProxy("h", 1, rules=[DropDatagrams()]), "it means nothing on TCP"),
     (lambda: LinkProxy("h", 1, transport="udp", rules=[Cut()]), "it means nothing on UDP"),
 ]
 
@@ -238,11 +237,11 @@ def chance(seed: int) -> Random:
 
 
 def test_number_picks_one_datagram() -> None:
-    assert [n for n in range(1, 6) if Lose(number=3).picks(n, chance(0))] == [3]
+    assert [n for n in range(1, 6) if DropDatagrams(number=3).picks(n, chance(0))] == [3]
 
 
 def test_probability_picks_the_same_again_with_the_same_seed() -> None:
-    rule = Lose(probability=0.3)
+    rule = DropDatagrams(probability=0.3)
     first, second = ([rule.picks(n, one) for n in range(1000)] for one in (chance(5), chance(5)))
     assert first == second
     assert 200 < sum(first) < 400

@@ -238,9 +238,9 @@ async def test_receiver_that_does_not_read_stops_the_sender() -> None:
         pipe = proxy._relay.clients[1]._pipes["down"]  # type: ignore[union-attr]
         await until(lambda: pipe._writing and not pipe._reading)
         assert (
-            directions.MAX_HELD_BYTES
+            directions.MAX_QUEUED_BYTES
             <= pipe.held_bytes
-            < directions.MAX_HELD_BYTES + directions.CHUNK
+            < directions.MAX_QUEUED_BYTES + directions.CHUNK
         )
         assert camera.transport.get_write_buffer_size() > 0
         end.transport.resume_reading()
@@ -647,7 +647,7 @@ async def test_slow_rate_stops_the_sender_and_not_only_the_receiver() -> None:
         camera.write(bytes(32_000_000))
         await proxy.wait_passed("down", 60)
         pipe = proxy._relay.clients[1]._pipes["down"]  # type: ignore[union-attr]
-        assert pipe.held_bytes < directions.MAX_HELD_BYTES + directions.CHUNK
+        assert pipe.held_bytes < directions.MAX_QUEUED_BYTES + directions.CHUNK
         assert not pipe._reading
 
 

@@ -85,7 +85,7 @@ def test_faults_commands_and_states_by_any_thread(emulator: ThreadedCamera) -> N
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(emulator.command, ["jam"] * 20))
     assert emulator.commands == ("jam",)
-    assert emulator.cues_done == [20]
+    assert emulator.cue_counts == [20]
     assert emulator.device.status & smartcam.Status.BUSY
     emulator.clear_faults()
     assert emulator.faults == []
@@ -111,7 +111,7 @@ def test_log_can_be_read_when_all_is_over(emulator: ThreadedCamera) -> None:
     emulator.stop()
     emulator.stop()
     assert emulator.log.received == [Connect()]
-    assert len(emulator.visits) == 1
+    assert len(emulator.ended_connections) == 1
     assert not emulator.has_session
     with pytest.raises(ConfigurationError, match="does not run"):
         emulator.inject({"kind": "stop"})

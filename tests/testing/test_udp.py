@@ -11,7 +11,14 @@ from typing import NamedTuple
 import pytest
 
 from smartcam import ConfigurationError
-from smartcam.testing.proxy import Late, LinkProxy, Lose, Reorder, Repeat, Rule
+from smartcam.testing.proxy import (
+    DelayDatagrams,
+    DropDatagrams,
+    DuplicateDatagrams,
+    LinkProxy,
+    Reorder,
+    Rule,
+)
 from smartcam.testing.proxy import _udp as udp
 from tests.handmade import until
 from tests.testing.inside import Direction, Entry
@@ -75,16 +82,16 @@ async def test_clients_are_kept_apart() -> None:
 @pytest.mark.parametrize("direction", ["up", "down"])
 async def test_lost_datagram_is_the_one_that_is_meant(direction: Direction, number: int) -> None:
     left = [one for one in FIVE if one != b"%d" % number]
-    async with linked(Lose(number=number, direction=direction)) as (proxy, client, camera):
+    async with linked(DropDatagrams(number=number, direction=direction)) as (proxy, client, camera):
         client.send(*FIVE)
         await receives(client, left)
         assert camera.received == (FIVE if direction == "down" else left)
-        assert proxy.log[-1] == Entry("lose", 1, direction, number)
+        assert proxy.log[-1] == Entry("drop", 1, direction, number)
 
 
 @pytest.mark.parametrize("number", [1, 3, 5])
 async def test_repeated_datagram_comes_again_at_once(number: int) -> None:
-    async with linked(Repeat(number=number, copies=2)) as (proxy, client, _):
+    async with linked(DuplicateDatagrams(number=number, copies=2)) as (proxy, client, _):
         client.send(*FIVE)
         again = FIVE[number - 1 : number] * 2
         await receives(client, FIVE[:number] + again + FIVE[number:])
@@ -104,7 +111,7 @@ async def test_reordered_datagram_comes_after_two_others_or_at_its_time(
 
 async def test_late_datagram_is_overtaken() -> None:
     loop = asyncio.get_running_loop()
-    async with linked(Late(number=2, seconds=SHORT, jitter=0.01)) as (_, client, _):
+    async with linked(DelayDatagrams(number=2, seconds=SHORT, jitter=0.01)) as (_, client, _):
         begin = loop.time()
         client.send(*FIVE)
         await receives(client, [b"1", b"3", b"4", b"5", b"2"])
@@ -112,8 +119,8 @@ async def test_late_datagram_is_overtaken() -> None:
 
 
 async def test_late_and_reordered_datagram_is_both() -> None:
-    rules = [Reorder(number=1, overtaken_by=4), Late(number=1, seconds=SHORT), Repeat(number=1)]
-    async with linked(*rules) as (proxy, client, _):
+    late, twice = DelayDatagrams(number=1, seconds=SHORT), DuplicateDatagrams(number=1)
+    async with linked(Reorder(number=1, overtaken_by=4), late, twice) as (proxy, client, _):
         client.send(*FIVE)
         await receives(client, [b"2", b"3", b"4", b"5"])
         await proxy.wait_passed("down", 6)
@@ -124,9 +131,9 @@ async def test_chance_is_the_same_again_with_the_same_seed() -> None:
     sent = [b"%d" % number for number in range(60)]
     kept: list[list[bytes]] = []
     for seed in (1, 1, 2):
-        async with linked(Lose(probability=0.5, seed=seed)) as (proxy, client, _):
+        async with linked(DropDatagrams(probability=0.5, seed=seed)) as (proxy, client, _):
             client.send(*sent)
-            await until(lambda: proxy.passed["down"] + proxy.counts["lose"] == len(sent))
+            await until(lambda: proxy.passed["down"] + proxy.counts["drop"] == len(sent))
             await until(lambda: len(client.received) == proxy.passed["down"])
             kept.append(client.received)
     assert kept[0] == kept[1] != kept[2]
@@ -134,7 +141,7 @@ async def test_chance_is_the_same_again_with_the_same_seed() -> None:
 
 
 async def test_rule_for_the_second_client_leaves_the_first() -> None:
-    rules = [Lose(connection=2, number=1, direction="up")]
+    rules = [DropDatagrams(connection=2, number=1, direction="up")]
     async with linked(*rules) as (proxy, client, camera), mailbox(proxy.port) as other:
         client.send(b"a")
         await receives(client, [b"a"])
@@ -147,7 +154,7 @@ async def test_rule_from_now_counts_from_here() -> None:
     async with linked() as (proxy, client, _):
         client.send(b"a", b"b")
         await receives(client, [b"a", b"b"])
-        proxy.from_now(Lose(number=2, direction="up"), Repeat())
+        proxy.from_now(DropDatagrams(number=2, direction="up"), DuplicateDatagrams())
         client.send(b"c", b"d", b"e")
         await receives(client, [b"a", b"b", b"c", b"c", b"e", b"e"])
 
@@ -249,7 +256,7 @@ async def test_client_that_was_never_answered_makes_room(monkeypatch: pytest.Mon
 
 async def test_datagrams_held_back_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "MAX_WAITING_DATAGRAMS", 2)
-    async with linked(Late(seconds=SHORT)) as (proxy, client, _):
+    async with linked(DelayDatagrams(seconds=SHORT)) as (proxy, client, _):
         client.send(*FIVE)
         await proxy.wait_for("full", 3)
         await receives(client, [b"1", b"2"])
@@ -257,7 +264,7 @@ async def test_datagrams_held_back_are_bounded(monkeypatch: pytest.MonkeyPatch) 
 
 async def test_forgotten_client_gets_nothing_that_was_held_back() -> None:
     rules = [
-        Late(number=1, seconds=SHORT / 2),
+        DelayDatagrams(number=1, seconds=SHORT / 2),
         Reorder(number=2, overtaken_by=9, seconds=SHORT / 2),
     ]
     async with linked(*rules) as (proxy, client, _):
@@ -268,7 +275,7 @@ async def test_forgotten_client_gets_nothing_that_was_held_back() -> None:
 
 
 async def test_closing_forgets_what_is_on_its_way() -> None:
-    rules = [Late(number=1, seconds=60), Reorder(number=2, overtaken_by=9, seconds=60)]
+    rules = [DelayDatagrams(number=1, seconds=60), Reorder(number=2, overtaken_by=9, seconds=60)]
     async with mailbox(echo=True) as camera:
         async with (
             LinkProxy(HOST, camera.port, transport="udp", rules=rules) as proxy,

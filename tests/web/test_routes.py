@@ -381,7 +381,7 @@ async def test_log_tells_what_was_pushed_out() -> None:
         for _ in range(20):
             world.emulator.device.trigger()
             world.clock.advance(1)
-        gone = world.emulator.log.pushed_out
+        gone = world.emulator.log.dropped_count
         part = await world.caller.get("log")
     assert gone > 20
     assert (part["missed"], part["entries"][0]["serial"]) == (gone, gone)

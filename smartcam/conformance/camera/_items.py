@@ -1,7 +1,7 @@
 """List all checks and questions (items), in the order in which a camera is tested.
 
-Items that change the camera least come first. Items that may leave it in a wrong state, by bytes
-that are no frame or a restart, come last. Each module defines its items in this order.
+Items that change the camera least come first. Items that send invalid bytes or restart the camera
+may leave it in a wrong state, so they come late. Each module defines its items in this order.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _DECLARED = [
 
 
 def _sort_key(item: Item) -> tuple[bool, bool]:
-    """Return a key that sorts two kinds of items after the others."""
+    """Return a key that sorts items with a restart, then the check of all messages, to the end."""
     return item is message_checks.only_documented_messages_came, Allow.REBOOT in item.needs
 
 

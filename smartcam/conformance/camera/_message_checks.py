@@ -1,10 +1,10 @@
-"""Checks: messages that a camera has to ignore, and messages that it may send."""
+"""Checks: messages that a camera has to ignore, or may send. Sources: docs/sources.md."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from smartcam.conformance._dialects import SMART
+from smartcam.conformance._dialects import SMART_DIALECTS
 from smartcam.conformance.camera._results import check
 from smartcam.conformance.camera._verdicts import Differs
 from smartcam.conformance.camera._wire import frames_with_id
@@ -24,15 +24,15 @@ _IGNORED_SOURCES = {
 }
 _BODY_SOURCES = {
     "": "SC-A29 to SC-B34, MV27, MV29, published",
-    "b16": "the bodies of the dialects with 32 bits narrowed, inferred",
+    "b16": "bodies as in the dialects of 32 bits, with numbers of 16 bits, inferred",
     "bid": "ID-a 226 to 232, ID-b 210 to 221, published",
 }
 
 
 def wrong_magic(camera: CameraUnderTest) -> bytes:
     """Return a Query with every bit of its magic number inverted."""
-    frame = camera.wire.encode_request(m.Query())
-    size = len(camera.wire.magic)
+    frame = camera.codec.encode_request(m.Query())
+    size = len(camera.codec.magic)
     return bytes(byte ^ 0xFF for byte in frame[:size]) + frame[size:]
 
 
@@ -43,7 +43,7 @@ def _check_ignored(camera: CameraUnderTest, label: str, *data: bytes) -> None:
         start_index = len(client.received)
         client.write(*data)
         client.round_trip()
-        client.listen(camera.options.quiet)
+        client.listen(camera.options.silence)
         frames = [
             each for each in client.received[start_index:] if each.message_id != MessageId.STATUS
         ]
@@ -55,34 +55,34 @@ def _check_ignored(camera: CameraUnderTest, label: str, *data: bytes) -> None:
             )
 
 
-@check(_IGNORED_SOURCES, dialects=SMART)
+@check(_IGNORED_SOURCES, dialects=SMART_DIALECTS)
 def unknown_id_is_ignored(camera: CameraUnderTest) -> None:
-    """A message with an unknown id is not answered, and what follows it is."""
+    """A message with an unknown id is not answered; the next message is."""
     _check_ignored(
-        camera, "an unknown id", camera.wire.make_frame(UNKNOWN_ID, bytes(camera.wire.word_size))
+        camera, "an unknown id", camera.codec.make_frame(UNKNOWN_ID, bytes(camera.codec.word_size))
     )
 
 
-@check(_IGNORED_SOURCES, dialects=SMART)
+@check(_IGNORED_SOURCES, dialects=SMART_DIALECTS)
 def long_body_is_ignored(camera: CameraUnderTest) -> None:
-    """A Query with a body is not answered, and what follows it is."""
-    body = bytes(camera.wire.word_size)
+    """A Query with a body is not answered; the next message is."""
+    body = bytes(camera.codec.word_size)
     _check_ignored(
-        camera, "a Query with a body", camera.wire.make_frame(MessageId.QUERY_APPLICATION, body)
+        camera, "a Query with a body", camera.codec.make_frame(MessageId.QUERY_APPLICATION, body)
     )
 
 
-@check(_IGNORED_SOURCES, dialects=SMART)
+@check(_IGNORED_SOURCES, dialects=SMART_DIALECTS)
 def short_body_is_ignored(camera: CameraUnderTest) -> None:
-    """A switch without an id is not answered, and what follows it is."""
+    """A switch without an id is not answered; the next message is."""
     _check_ignored(
-        camera, "a switch without an id", camera.wire.make_frame(MessageId.SWITCH_APPLICATION)
+        camera, "a switch without an id", camera.codec.make_frame(MessageId.SWITCH_APPLICATION)
     )
 
 
 @check(_IGNORED_SOURCES, dialects=("handbook", "thesis"), transports=("udp",))
 def wrong_magic_is_ignored(camera: CameraUnderTest) -> None:
-    """A datagram with a wrong magic number is not answered, and what follows it is."""
+    """A datagram with a wrong magic number is not answered; the next message is."""
     _check_ignored(camera, "a wrong magic number", wrong_magic(camera))
 
 
@@ -92,8 +92,8 @@ def broken_datagram_is_ignored(camera: CameraUnderTest) -> None:
     _check_ignored(
         camera,
         "datagrams that are not one whole frame",
-        camera.wire.make_frame(MessageId.QUERY_APPLICATION, length=camera.wire.word_size),
-        camera.wire.encode_request(m.Query())[:-1],
+        camera.codec.make_frame(MessageId.QUERY_APPLICATION, length=camera.codec.word_size),
+        camera.codec.encode_request(m.Query())[:-1],
     )
 
 

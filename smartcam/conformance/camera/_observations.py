@@ -1,6 +1,6 @@
 """Observations that several checks use: inspections, switches, a restart.
 
-Inspections take time, so each observation is made only once for a camera.
+Inspections take time, so most observations are made only once for a camera.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ def observe_inspections(camera: CameraUnderTest) -> list[ObservedRun]:
 
 def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
     start_index, status_under_way = len(client.received), None
-    waiting_mask, word_size = camera.wire.bits.waiting, camera.wire.word_size
+    waiting_mask, word_size = camera.codec.bits.waiting, camera.codec.word_size
     sent_at = client.send(m.Trigger())
-    if camera.wire.is_bid:
+    if camera.codec.is_bid:
         client.send(m.GetStatus())
         answer = client.wait_for_frame(
             MessageId.STATUS,
@@ -104,7 +104,7 @@ def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
             "an answer to Get status",
             start_index=start_index,
         )
-        status_under_way = camera.wire.read_numbers(answer.body)[0]
+        status_under_way = camera.codec.read_numbers(answer.body)[0]
         _wait_result(camera, client, start_index)
         client.wait_status(
             lambda status: status & waiting_mask,
@@ -123,7 +123,7 @@ def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
             break
         waits_again = run.transition_indices()[2] is not None  # a result may still come
         if (
-            client.next_frame(min(remaining, camera.options.quiet) if waits_again else remaining)
+            client.next_frame(min(remaining, camera.options.silence) if waits_again else remaining)
             is None
         ):
             break
@@ -159,8 +159,8 @@ def observe_unasked_statuses(camera: CameraUnderTest) -> ObservedRun:
             sent_at,
             client.received[start_index:],
             None,
-            camera.wire.word_size,
-            camera.wire.bits.waiting,
+            camera.codec.word_size,
+            camera.codec.bits.waiting,
         )
         if not run.results:
             raise NotObserved(
@@ -194,7 +194,7 @@ def has_no_id(camera: CameraUnderTest) -> bool:
     if camera.dialect != "b16":
         return False
     first_words = [
-        int.from_bytes(inspection.results[0].body[: camera.wire.word_size], "little")
+        int.from_bytes(inspection.results[0].body[: camera.codec.word_size], "little")
         for inspection in observe_inspections(camera)
         if inspection.results
     ]
@@ -223,16 +223,14 @@ def observe_double_trigger(camera: CameraUnderTest) -> DoubleTrigger:
     The camera has to send its status unasked.
     """
     inspection_seconds = inspection_time(camera)
-    bits, rose_at, fell_at = camera.wire.bits, None, None
+    bits, rose_at, fell_at = camera.codec.bits, None, None
     with camera.session() as client:
         camera.ensure_ready(client)
         start_index = len(client.received)
         client.send(m.Trigger(), m.Trigger())
         client.round_trip()
-        deadline, index = (
-            time.monotonic() + 2 * inspection_seconds + camera.options.quiet,
-            start_index,
-        )
+        deadline = time.monotonic() + 2 * inspection_seconds + camera.options.silence
+        index = start_index
         while fell_at is None:
             if index == len(client.received):
                 remaining = deadline - time.monotonic()
@@ -241,7 +239,7 @@ def observe_double_trigger(camera: CameraUnderTest) -> DoubleTrigger:
             frame, index = client.received[index], index + 1
             if frame.message_id != MessageId.STATUS:
                 continue
-            if not camera.wire.read_numbers(frame.body)[0] & bits.overtriggered:
+            if not camera.codec.read_numbers(frame.body)[0] & bits.overtriggered:
                 fell_at = None if rose_at is None else frame.at
             elif rose_at is None:
                 rose_at = frame.at
@@ -267,7 +265,7 @@ def observe_stopped_trigger(camera: CameraUnderTest) -> StoppedTrigger:
         camera.ensure_stopped(client)
         start_index = len(client.received)
         client.send(m.Trigger())
-        frames = client.listen(inspection_seconds + camera.options.quiet)
+        frames = client.listen(inspection_seconds + camera.options.silence)
         return StoppedTrigger(frames, client.describe_received(start_index))
 
 
@@ -315,13 +313,13 @@ def observe_switch(camera: CameraUnderTest) -> ObservedSwitch:
 
 def _wait_until_not_busy(camera: CameraUnderTest, client: RawClient, start_index: int) -> None:
     """Wait for a status without BUSY if the last one had it."""
-    busy = camera.wire.bits.busy
-    words = camera.wire.status_words(client.received[start_index:])
+    busy = camera.codec.bits.busy
+    words = camera.codec.status_words(client.received[start_index:])
     if busy and any(word & busy for word in words) and words[-1] & busy:
         client.wait_for_frame(
             lambda frame: (
                 frame.message_id == MessageId.STATUS
-                and not camera.wire.read_numbers(frame.body)[0] & busy
+                and not camera.codec.read_numbers(frame.body)[0] & busy
             ),
             camera.options.timeout,
             "a status without BUSY after the switch",
@@ -357,9 +355,8 @@ def observe_restart(camera: CameraUnderTest) -> ObservedRestart:
                 return ObservedRestart(
                     seconds, camera.active_application(client), camera.is_running(client)
                 )
-        time.sleep(
-            max(0.0, tried_at + min(REBOOT_POLL_INTERVAL, camera.options.quiet) - time.monotonic())
-        )
+        pause = min(REBOOT_POLL_INTERVAL, camera.options.silence)
+        time.sleep(max(0.0, tried_at + pause - time.monotonic()))
     camera.gone_reason = (
         f"it did not come back within {camera.options.reboot_timeout:g} s of a reboot"
     )
@@ -385,7 +382,7 @@ def _is_connect_answered(camera: CameraUnderTest) -> bool:
     """Return True if the camera answers a Connect now."""
     try:
         with camera.link() as client:
-            client.ask(m.Connect(), timeout=max(camera.options.quiet, REBOOT_POLL_INTERVAL))
+            client.ask(m.Connect(), timeout=max(camera.options.silence, REBOOT_POLL_INTERVAL))
     except (NotObserved, Differs, LinkClosedError):
         return False
     return True

@@ -1,4 +1,4 @@
-"""The options of a judgement: the camera, the allowed actions, the times to wait."""
+"""The options of a camera's examination: the camera, the allowed actions, the times to wait."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ MAX_SECONDS = 3600.0
 """Largest number of seconds of one wait."""
 
 MAX_INPUT_DATA_BYTES = 1 << 16
-"""Largest number of bytes of input data: about 64 kB, as a container (HAL 15, published for the
-other direction)."""
+"""Largest number of bytes of input data: about 64 kB, the limit of result containers (HAL 15,
+published); no document gives one for input data."""
 
 
 class Allow(enum.Flag):
@@ -89,7 +89,7 @@ class ConformanceOptions:
         other_application: id of another application that may be loaded, None for none.
         allow: actions that are allowed at the camera.
         timeout: longest time for an answer, a status or a result.
-        quiet: time without a message after which the camera counts as silent.
+        silence: time without a message after which the camera counts as silent.
         switch_timeout: longest time for loading an application.
         reboot_timeout: longest time for a restart.
         sequence_offset: offset of the sequence number, an int32, in the application's results,
@@ -97,7 +97,7 @@ class ConformanceOptions:
         input_data: input data that the application accepts, None for none.
 
     Raises:
-        ConfigurationError: a number cannot work.
+        ConfigurationError: a value is not valid, or both applications are the same.
     """
 
     url: str
@@ -105,7 +105,7 @@ class ConformanceOptions:
     other_application: int | None = None
     allow: Allow = Allow.RUN | Allow.TRIGGER | Allow.SWITCH
     timeout: float = 5.0
-    quiet: float = 0.5
+    silence: float = 0.5
     switch_timeout: float = 30.0
     reboot_timeout: float = 180.0
     sequence_offset: int | None = None
@@ -114,18 +114,18 @@ class ConformanceOptions:
     def __post_init__(self) -> None:
         check_text(self.url, "url", least=1)
         check_kind(self.allow, Allow, "allow", "flags of Allow")
-        for name in ("timeout", "quiet", "switch_timeout", "reboot_timeout"):
+        for name in ("timeout", "silence", "switch_timeout", "reboot_timeout"):
             seconds = check_number(
                 getattr(self, name), name, 0, MAX_SECONDS, exclusive=True, unit="seconds"
             )
             object.__setattr__(self, name, seconds)
-        for name, least, most in (
+        for name, minimum, maximum in (
             ("application", 1, MAX_APPLICATION_ID),
             ("other_application", 1, MAX_APPLICATION_ID),
             ("sequence_offset", 0, 0xFFFF),
         ):
             if getattr(self, name) is not None:
-                number = check_integer(getattr(self, name), name, least, most)
+                number = check_integer(getattr(self, name), name, minimum, maximum)
                 object.__setattr__(self, name, number)
         if self.other_application is not None and self.other_application == self.application:
             raise ConfigurationError(f"both applications are {self.application}: name another one")
@@ -149,7 +149,7 @@ OPTION_PARSERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "--camera-other-application": ("other_application", int),
     "--camera-allow": ("allow", Allow.read),
     "--camera-timeout": ("timeout", float),
-    "--camera-quiet": ("quiet", float),
+    "--camera-silence": ("silence", float),
     "--camera-switch-timeout": ("switch_timeout", float),
     "--camera-reboot-timeout": ("reboot_timeout", float),
     "--camera-sequence-offset": ("sequence_offset", int),

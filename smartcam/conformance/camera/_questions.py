@@ -1,11 +1,11 @@
-"""Questions: an experiment for each field of Quirks, and for facts that documents contradict."""
+"""Questions: an experiment for each field of Quirks, and where docs/sources.md disagree."""
 
 from __future__ import annotations
 
 import contextlib
 from typing import TYPE_CHECKING
 
-from smartcam.conformance._dialects import SMART
+from smartcam.conformance._dialects import SMART_DIALECTS
 from smartcam.conformance.camera import _observations as observations
 from smartcam.conformance.camera._message_checks import UNKNOWN_ID, wrong_magic
 from smartcam.conformance.camera._observations import (
@@ -36,7 +36,7 @@ MAX_CONTAINERS = 1024
 MAX_LEFT_CONTAINERS = 64
 """Largest number of triggers sent to empty the input queue that another client has filled."""
 
-_OPEN_SOURCE = {"": "no document, open"}
+_NO_DOCUMENT = {"": "no document, open"}
 
 
 @question("SC-A28, SC-C40, T 3.1.1, published", contradictions=("C1", "C7"))
@@ -51,10 +51,10 @@ def code(camera: CameraUnderTest) -> bool:
     """Answers begin with a result code."""
     with camera.link() as client:
         answer = client.ask(m.Connect())
-    has_code = {(1,): False, (0, 1): True}.get(camera.wire.read_numbers(answer.body))
+    has_code = {(1,): False, (0, 1): True}.get(camera.codec.read_numbers(answer.body))
     if has_code is None:
         raise Undescribed(
-            "the version 1, or the code 0 and the version", camera.wire.describe(answer)
+            "the version 1, or the code 0 and the version", camera.codec.describe(answer)
         )
     return has_code
 
@@ -73,13 +73,13 @@ def no_id(camera: CameraUnderTest) -> bool:
 # ---------------------------------------------------------------------- inspections
 
 
-@question(_OPEN_SOURCE, needs=Allow.TRIGGER)
+@question(_NO_DOCUMENT, needs=Allow.TRIGGER)
 def waiting_before_result(camera: CameraUnderTest) -> bool:
     """Waiting for Trigger rises before the result comes."""
     inspection_time(camera)  # raises if there are no results
     orders: set[bool] = set()
     for run in (
-        [observe_unasked_statuses(camera)] if camera.wire.is_bid else observe_inspections(camera)
+        [observe_unasked_statuses(camera)] if camera.codec.is_bid else observe_inspections(camera)
     ):
         _, result, rose = run.transition_indices()
         if result is None or rose is None:
@@ -90,18 +90,18 @@ def waiting_before_result(camera: CameraUnderTest) -> bool:
     return orders.pop()
 
 
-@question(_OPEN_SOURCE, needs=Allow.TRIGGER)
+@question(_NO_DOCUMENT, needs=Allow.TRIGGER)
 def busy_while_processing(camera: CameraUnderTest) -> bool:
     """BUSY is set during an inspection (BVS ID: Ready is not)."""
-    bits, seen = camera.wire.bits, set[bool]()
+    bits, seen = camera.codec.bits, set[bool]()
     for inspection in observe_inspections(camera):
         if inspection.status_under_way is not None:
             words = [inspection.status_under_way]
         else:
             end = inspection.transition_indices()[2]
-            words = camera.wire.status_words(inspection.frames[:end])
+            words = camera.codec.status_words(inspection.frames[:end])
         words = [word for word in words if not word & bits.waiting]
-        if words and camera.wire.is_bid:
+        if words and camera.codec.is_bid:
             seen.add(not words[0] & bits.ready)
         elif words:
             seen.add(any(word & bits.busy for word in words))
@@ -112,9 +112,9 @@ def busy_while_processing(camera: CameraUnderTest) -> bool:
     return seen.pop()
 
 
-@question(_OPEN_SOURCE, needs=Allow.TRIGGER, dialects=SMART)
+@question(_NO_DOCUMENT, needs=Allow.TRIGGER, dialects=SMART_DIALECTS)
 def hidden_triggers(camera: CameraUnderTest) -> bool:
-    """Waiting for Trigger stays set during an inspection."""
+    """Waiting for Trigger stays set during an inspection, which hides that a trigger was taken."""
     seen = set[bool]()
     for inspection in observe_inspections(camera):
         fell, result, _ = inspection.transition_indices()
@@ -126,7 +126,7 @@ def hidden_triggers(camera: CameraUnderTest) -> bool:
     return seen.pop()
 
 
-@question(_OPEN_SOURCE, needs=Allow.TRIGGER, dialects=SMART)
+@question(_NO_DOCUMENT, needs=Allow.TRIGGER, dialects=SMART_DIALECTS)
 def overtriggered_time(camera: CameraUnderTest) -> float:
     """Time for which Overtriggered stays set, seconds."""
     seen = observe_double_trigger(camera)
@@ -140,16 +140,16 @@ def overtriggered_time(camera: CameraUnderTest) -> float:
 @question(
     "SC-A30 against SC-B33, published",
     needs=Allow.RUN | Allow.TRIGGER,
-    dialects=SMART,
+    dialects=SMART_DIALECTS,
     contradictions=("C8",),
 )
 def overtriggered_when_stopped(camera: CameraUnderTest) -> bool:
     """Overtriggered rises for a trigger to a stopped camera, too."""
-    seen, bit = observe_stopped_trigger(camera), camera.wire.bits.overtriggered
-    return any(word & bit for word in camera.wire.status_words(seen.frames))
+    seen, bit = observe_stopped_trigger(camera), camera.codec.bits.overtriggered
+    return any(word & bit for word in camera.codec.status_words(seen.frames))
 
 
-@question(_OPEN_SOURCE, needs=Allow.RUN | Allow.TRIGGER, dialects=SMART)
+@question(_NO_DOCUMENT, needs=Allow.RUN | Allow.TRIGGER, dialects=SMART_DIALECTS)
 def stop_during_inspection(camera: CameraUnderTest) -> str:
     """Outcome of an inspection that Stop falls into."""
     inspection_seconds = inspection_time(camera)
@@ -160,7 +160,7 @@ def stop_during_inspection(camera: CameraUnderTest) -> str:
         client.round_trip()
         client.listen(inspection_seconds + camera.silence_timeout)
         frames = client.received[start_index:]
-        if all(word & camera.wire.bits.running for word in camera.wire.status_words(frames)):
+        if all(word & camera.codec.bits.running for word in camera.codec.status_words(frames)):
             raise Differs(
                 "a status without Running after Stop", client.describe_received(start_index)
             )
@@ -189,23 +189,23 @@ def ready_bit(camera: CameraUnderTest) -> str:
 # ---------------------------------------------------------------------- switching, settings
 
 
-@question(_OPEN_SOURCE, needs=Allow.SWITCH, dialects=SMART)
+@question(_NO_DOCUMENT, needs=Allow.SWITCH, dialects=SMART_DIALECTS)
 def switch_answer(camera: CameraUnderTest) -> str:
     """The answer to a switch comes before or after the status without BUSY."""
-    seen, busy = observe_switch(camera), camera.wire.bits.busy
-    answer_codes = seen.frames.index(seen.answer)
+    seen, busy = observe_switch(camera), camera.codec.bits.busy
+    answer_index = seen.frames.index(seen.answer)
     was_busy = False
     for index, frame in enumerate(seen.frames):
         if frame.message_id != MessageId.STATUS:
             continue
-        if camera.wire.read_numbers(frame.body)[0] & busy:
+        if camera.codec.read_numbers(frame.body)[0] & busy:
             was_busy = True
         elif was_busy:
-            return "after_status" if answer_codes > index else "before_status"
+            return "after_status" if answer_index > index else "before_status"
     raise NotObserved("no status with BUSY came during the switch, and one without it after")
 
 
-@question(_OPEN_SOURCE, needs=Allow.RUN | Allow.SWITCH, dialects=SMART)
+@question(_NO_DOCUMENT, needs=Allow.RUN | Allow.SWITCH, dialects=SMART_DIALECTS)
 def switch_while_running(camera: CameraUnderTest) -> str:
     """Outcome of a switch while the application runs."""
     with camera.session() as client:
@@ -235,12 +235,12 @@ def switch_while_running(camera: CameraUnderTest) -> str:
 def _switch_answers(client: RawClient, start_index: int) -> list[int]:
     """Return the codes of the answers to a switch, -1 for an answer without one."""
     answers = frames_with_id(client.received[start_index:], MessageId.SWITCH_APPLICATION)
-    return [(*client.wire.read_numbers(answer.body), -1)[0] for answer in answers]
+    return [(*client.codec.read_numbers(answer.body), -1)[0] for answer in answers]
 
 
 def _was_busy(camera: CameraUnderTest, client: RawClient, start_index: int) -> bool:
-    statuses = camera.wire.status_words(client.received[start_index:])
-    return any(word & camera.wire.bits.busy for word in statuses)
+    statuses = camera.codec.status_words(client.received[start_index:])
+    return any(word & camera.codec.bits.busy for word in statuses)
 
 
 @question(
@@ -252,10 +252,10 @@ def _was_busy(camera: CameraUnderTest, client: RawClient, start_index: int) -> b
 def big_endian_number(camera: CameraUnderTest) -> bool:
     """The number of Set sequence number is big endian."""
     little = (0x01020304).to_bytes(4, "little")
-    observations.has_no_id(camera)  # raises if the number's place is unknown
+    observations.has_no_id(camera)  # raises if the number's offset is unknown
     with camera.session() as client:
         camera.ensure_ready(client)
-        client.write(camera.wire.make_frame(MessageId.SET_SEQUENCE_NUMBER, little))
+        client.write(camera.codec.make_frame(MessageId.SET_SEQUENCE_NUMBER, little))
         field = read_next_number(camera, client)
     is_big = {little: False, little[::-1]: True}.get(field)
     if is_big is None:
@@ -266,13 +266,13 @@ def big_endian_number(camera: CameraUnderTest) -> bool:
     return is_big
 
 
-@question(_OPEN_SOURCE, needs=Allow.INPUT | Allow.TRIGGER, dialects=SMART)
+@question(_NO_DOCUMENT, needs=Allow.INPUT | Allow.TRIGGER, dialects=SMART_DIALECTS)
 def input_queue_depth(camera: CameraUnderTest) -> int:
     """Number of input containers that are kept."""
     data = camera.options.input_data
     if data is None:
         raise NotObserved("it is not known what input data the application takes: --camera-input")
-    bit = camera.wire.bits.input_container
+    bit = camera.codec.bits.input_container
     inspection_time(camera)  # raises if there are no results
     with camera.session() as client:
         camera.ensure_ready(client)
@@ -295,10 +295,10 @@ def input_queue_depth(camera: CameraUnderTest) -> int:
 
 
 def _empty_input_queue(camera: CameraUnderTest, client: RawClient, max_triggers: int) -> None:
-    """Trigger until the queue of input containers is empty."""
+    """Trigger until Input Container is set: the queue is empty, so a run had no container."""
     for _ in range(max_triggers):
         _trigger_once(camera, client)
-        if client.read_status() & camera.wire.bits.input_container:
+        if client.read_status() & camera.codec.bits.input_container:
             return
     raise NotObserved(
         f"Input Container did not rise in {max_triggers} triggers without input data: "
@@ -326,7 +326,7 @@ def disconnect_answer(camera: CameraUnderTest) -> str:
         answers = frames_with_id(client.received[start_index:], MessageId.DISCONNECT)
         if not answers:
             return "silent"
-        if [camera.wire.read_numbers(answer.body) for answer in answers] != [(0,)]:
+        if [camera.codec.read_numbers(answer.body) for answer in answers] != [(0,)]:
             raise Undescribed("the code 0, once", client.describe_received(start_index))
         return "code"
 
@@ -338,12 +338,12 @@ def bad_message(camera: CameraUnderTest) -> str:
         client.round_trip()
         start_index = len(client.received)
         client.write(
-            camera.wire.make_frame(UNKNOWN_ID, bytes(2)),
-            camera.wire.make_frame(MessageId.SWITCH_APPLICATION),
+            camera.codec.make_frame(UNKNOWN_ID, bytes(2)),
+            camera.codec.make_frame(MessageId.SWITCH_APPLICATION),
         )
         client.round_trip()
         answers = [
-            (message.message_id, camera.wire.read_numbers(message.body))
+            (message.message_id, camera.codec.read_numbers(message.body))
             for message in client.received[start_index:-1]
             if message.message_id in {UNKNOWN_ID, MessageId.SWITCH_APPLICATION}
         ]
@@ -356,7 +356,7 @@ def bad_message(camera: CameraUnderTest) -> str:
         )
 
 
-@question(_OPEN_SOURCE, transports=("tcp",))
+@question(_NO_DOCUMENT, transports=("tcp",))
 def second_client(camera: CameraUnderTest) -> str:
     """Answer to a second TCP client's Connect."""
     with camera.session() as first, contextlib.ExitStack() as stack:
@@ -385,14 +385,14 @@ def second_client(camera: CameraUnderTest) -> str:
     return policy
 
 
-@question(_OPEN_SOURCE, dialects=("handbook", "thesis"), transports=("tcp",))
+@question(_NO_DOCUMENT, dialects=("handbook", "thesis"), transports=("tcp",))
 def bad_frame(camera: CameraUnderTest) -> str:
     """Course of a TCP stream after bytes that are no frame."""
-    longest = camera.wire.dialect.header.max_payload
+    longest = camera.codec.dialect.header.max_payload
     outcomes = {
         "a wrong magic number": _react_to_bad_bytes(camera, wrong_magic(camera)),
         "an impossible length": _react_to_bad_bytes(
-            camera, camera.wire.make_frame(MessageId.QUERY_APPLICATION, length=longest)
+            camera, camera.codec.make_frame(MessageId.QUERY_APPLICATION, length=longest)
         ),
     }
     reactions = set(outcomes.values())
@@ -410,14 +410,14 @@ def _react_to_bad_bytes(camera: CameraUnderTest, data: bytes) -> str:
         client.round_trip()
         start_index = len(client.received)
         try:
-            client.write(data, camera.wire.encode_request(m.Query()))
+            client.write(data, camera.codec.encode_request(m.Query()))
             client.wait_for_frame(
                 MessageId.QUERY_APPLICATION,
                 camera.options.timeout,
                 "an answer to a Query",
                 start_index=start_index,
             )
-            client.listen(camera.options.quiet)
+            client.listen(camera.options.silence)
         except Differs:
             return "the stream is stuck"
         except LinkClosedError:
@@ -430,7 +430,7 @@ def _react_to_bad_bytes(camera: CameraUnderTest, data: bytes) -> str:
         return "skip" if len(answers) == 1 else "it is taken for a frame"
 
 
-@question("MV31, published", needs=Allow.REBOOT, dialects=SMART)
+@question("MV31, published", needs=Allow.REBOOT, dialects=SMART_DIALECTS)
 def reboot_time(camera: CameraUnderTest) -> float:
     """Time for which a restart keeps the camera off the network, seconds."""
     return round(observe_restart(camera).seconds, 2)

@@ -47,7 +47,7 @@ class RawClient:
         OSError: there is no connection.
     """
 
-    wire: RawDialect
+    codec: RawDialect
     _address: tuple[str, int]
     _tcp: bool
     _timeout: float  # seconds for the connection, and for an answer
@@ -92,7 +92,7 @@ class RawClient:
             if self.ended:
                 return
             if self._may_have_session:
-                self._write(self.wire.encode_request(m.Disconnect()))
+                self._write(self.codec.encode_request(m.Disconnect()))
             if self._tcp:
                 # closing a socket with unread bytes sends RST, which may overtake the Disconnect
                 self._socket.shutdown(socket.SHUT_WR)
@@ -108,7 +108,7 @@ class RawClient:
         """Send requests and return the time; TCP gets one write, UDP a datagram for each request.
 
         Raises:
-            EndedError: the link is down.
+            LinkClosedError: the link is down.
         """
         for message in messages:
             if isinstance(message, m.Connect):
@@ -117,12 +117,12 @@ class RawClient:
                 self._may_have_session = False
             elif isinstance(message, _STATE_CHANGES):
                 self._on_change()
-        return self.write(*[self.wire.encode_request(message) for message in messages])
+        return self.write(*[self.codec.encode_request(message) for message in messages])
 
     def write(self, *data: bytes) -> float:
         """Send any bytes, and return the time as :meth:`send` does."""
         for frame in data:
-            self._note(">", self.wire.describe_request(frame))
+            self._note(">", self.codec.describe_request(frame))
         sent_at = time.monotonic()
         for frame in [b"".join(data)] if self._tcp else data:
             self._write(frame)
@@ -143,7 +143,7 @@ class RawClient:
         """Return the next frame, None if none comes within ``timeout`` seconds.
 
         Raises:
-            EndedError: the camera ends the link.
+            LinkClosedError: the camera ends the link.
             Differs: the camera sends bytes that make no frame.
         """
         deadline = time.monotonic() + timeout
@@ -159,7 +159,7 @@ class RawClient:
         if not self._buffer:
             return None
         try:
-            parts = self.wire.parse_frame(self._buffer)
+            parts = self.codec.parse_frame(self._buffer)
             if not self._tcp and (parts is None or parts[2] != len(self._buffer)):
                 raise BadBytesError(
                     f"a datagram is not one whole frame: {hex_excerpt(self._buffer)}"
@@ -167,19 +167,19 @@ class RawClient:
         except BadBytesError as exc:
             self._note("<", hex_excerpt(self._buffer))
             self._buffer = b""
-            raise Differs(f"frames of dialect {self.wire.dialect.name}", str(exc)) from exc
+            raise Differs(f"frames of dialect {self.codec.dialect.name}", str(exc)) from exc
         if parts is None:
             return None
         message_id, body, size = parts
         self._buffer = self._buffer[size:]
         frame = ReceivedFrame(time.monotonic(), message_id, body)
-        self._note("<", self.wire.describe(frame))
+        self._note("<", self.codec.describe(frame))
         self._received_bytes += len(body)
         if self._received_bytes > MAX_RECEIVED_BYTES:
             raise NotObserved(f"the camera sent more than {MAX_RECEIVED_BYTES} bytes meanwhile")
         self.received.append(frame)
-        if message_id == MessageId.STATUS and len(body) >= self.wire.word_size:
-            self.status = self.wire.read_numbers(body)[0]
+        if message_id == MessageId.STATUS and len(body) >= self.codec.word_size:
+            self.status = self.codec.read_numbers(body)[0]
         return frame
 
     def _receive(self, timeout: float) -> bool:
@@ -221,13 +221,13 @@ class RawClient:
         Args:
             wanted: id of the wanted message, or a function that is true for the wanted frame.
             timeout: seconds from now.
-            expected: text of the difference if no such frame comes.
+            expected: text on the wanted frame, for the report if none comes.
             start_index: index of the first frame of :attr:`received` to look at; without it, only
                 frames that come now are looked at.
 
         Raises:
             Differs: the answer does not come in time.
-            EndedError: the camera ends the link.
+            LinkClosedError: the camera ends the link.
         """
         matches = wanted if callable(wanted) else lambda frame: frame.message_id == wanted
         first_index = len(self.received) if start_index < 0 else start_index
@@ -243,7 +243,7 @@ class RawClient:
 
     def ask(self, request: m.Message, *, timeout: float | None = None) -> ReceivedFrame:
         """Send a request, return the next frame with its id; raise as :meth:`wait_for_frame`."""
-        message_id = self.wire.dialect.message_id(request)
+        message_id = self.codec.dialect.message_id(request)
         start_index = len(self.received)
         self.send(request)
         timeout = self._timeout if timeout is None else timeout
@@ -265,7 +265,7 @@ class RawClient:
 
         Raises:
             Differs: the Query is not answered.
-            EndedError: the camera ends the link.
+            LinkClosedError: the camera ends the link.
         """
         start_index = len(self.received)
         self.ask(m.Query())
@@ -281,7 +281,7 @@ class RawClient:
 
     def describe_received(self, start_index: int = 0) -> str:
         """Return the frames of :attr:`received` from an index on as text, at most five of them."""
-        texts = [self.wire.describe(frame) for frame in self.received[start_index:]]
+        texts = [self.codec.describe(frame) for frame in self.received[start_index:]]
         if len(texts) > 5:
             texts = [*texts[:4], f"{len(texts) - 4} more"]
         end = ["the end of the link"] if self.ended else []
@@ -290,13 +290,13 @@ class RawClient:
     # ------------------------------------------------------------------ the status
 
     def read_status(self) -> int:
-        """Return the present status word: of ``bid`` on request, of others the last received one.
+        """Return the status word: the last received one; in the dialect ``bid``, ask for it.
 
         Raises:
             NotObserved: no status came since Connect.
             Differs: a request is not answered.
         """
-        if self.wire.is_bid:
+        if self.codec.is_bid:
             self.send(m.GetStatus())
         self.round_trip()
         if self.status is None:
@@ -311,7 +311,7 @@ class RawClient:
             remaining = deadline - time.monotonic()
             if remaining <= 0:
                 raise Differs(f"{expected} within {timeout:g} s", f"the status stays {word:#x}")
-            if self.wire.is_bid:
+            if self.codec.is_bid:
                 self.listen(STATUS_POLL_INTERVAL)
                 word = self.read_status()
             else:

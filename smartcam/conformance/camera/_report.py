@@ -94,9 +94,9 @@ class CameraReport:
         lines = [f"camera: {self.url}"]
         if state_before is not None:
             run = "in run mode" if state_before.running else "stopped"
-            lines.append(f"found with application {state_before.application}, {run}; left so")
+            lines.append(f"at first: application {state_before.application}, {run}; restored")
         if camera.not_restored:
-            lines[-1] = f"NOT LEFT AS IT WAS: {camera.not_restored}"
+            lines[-1] = f"NOT RESTORED: {camera.not_restored}"
         if camera.gone_reason:
             lines.append(f"THE CAMERA IS GONE: {camera.gone_reason}")
         count = Counter(
@@ -120,7 +120,7 @@ class CameraReport:
                 f"  {difference.item.name}: {difference.item.about}",
                 f"    source:   {difference.source}, {difference.grade}",
                 f"    expected: {difference.expected}",
-                f"    came:     {difference.observed}",
+                f"    observed: {difference.observed}",
                 *(f"      {row}" for row in difference.wire),
             ]
         return ["", "differs from the documented device:", *lines] if lines else []
@@ -179,7 +179,7 @@ class CameraReport:
             "transport": camera.transport,
             "dialect": camera.known_dialect or None,
             "before": None if state_before is None else state_before._asdict(),
-            "left": camera.not_restored or None,
+            "not_restored": camera.not_restored or None,
             "gone": camera.gone_reason or None,
             "allowed": camera.options.allow.names,
             "measured_seconds": {name: round(s, 6) for name, s in camera.measured_times.items()},

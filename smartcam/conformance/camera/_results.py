@@ -40,7 +40,7 @@ class Item:
 
     name: str  # in reports and for ``-k``
     about: str  # documented fact or question, one sentence
-    # source and grade, ``"SC-A28, published"``, by dialect; key ``""`` is for all other dialects
+    # key in docs/sources.md and grade, "SC-A28, published", by dialect; "": all other dialects
     sources: Mapping[str, str]
     # function to call: for a check it returns None or a remark, for a question the value
     run: Callable[[CameraUnderTest], Any]
@@ -148,5 +148,5 @@ class CameraFinding:
         if self.text:
             row["text"] = self.text
         if self.failed:
-            row |= {"expected": self.expected, "came": self.observed, "wire": list(self.wire)}
+            row |= {"expected": self.expected, "observed": self.observed, "wire": list(self.wire)}
         return row

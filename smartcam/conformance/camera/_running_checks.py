@@ -1,11 +1,11 @@
-"""Checks: run mode and triggers."""
+"""Checks: run mode and triggers. Sources: the keys in docs/sources.md."""
 
 from __future__ import annotations
 
 import time
 from typing import TYPE_CHECKING
 
-from smartcam.conformance._dialects import SMART
+from smartcam.conformance._dialects import SMART_DIALECTS
 from smartcam.conformance.camera._observations import (
     inspection_time,
     observe_double_trigger,
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from smartcam.protocols.messages import Message
 
 
-@check("MV31, SC-A30, published", needs=Allow.RUN, dialects=SMART)
+@check("MV31, SC-A30, published", needs=Allow.RUN, dialects=SMART_DIALECTS)
 def start_begins_run_mode(camera: CameraUnderTest) -> str:
     """Start sets Running, and a triggered application begins to wait."""
-    bits = camera.wire.bits
+    bits = camera.codec.bits
     with camera.session() as client:
         camera.load_application(client, camera.application)
         camera.ensure_stopped(client)
@@ -43,7 +43,7 @@ def start_begins_run_mode(camera: CameraUnderTest) -> str:
     return ""
 
 
-@check("SC-A28, published", needs=Allow.RUN, dialects=SMART)
+@check("SC-A28, published", needs=Allow.RUN, dialects=SMART_DIALECTS)
 def second_start_is_harmless(camera: CameraUnderTest) -> None:
     """Start is not answered, and changes nothing in run mode."""
     with camera.session() as client:
@@ -55,16 +55,16 @@ def second_start_is_harmless(camera: CameraUnderTest) -> None:
 def trigger_gives_one_result(camera: CameraUnderTest) -> str:
     """A trigger gives one result container, of the active application."""
     inspection_time(camera)  # raises if there are no results
-    word = camera.wire.word_size
+    word_size = camera.codec.word_size
     for inspection in observe_inspections(camera):
         if len(inspection.results) != 1:
             raise Differs("one result for each trigger", f"{len(inspection.results)} results")
         body = inspection.results[0].body
-        application = int.from_bytes(body[:word], "little")
+        application = int.from_bytes(body[:word_size], "little")
         if camera.dialect != "b16" and application != camera.application:
             raise Differs(
                 f"the id {camera.application} at the beginning of the result",
-                camera.wire.describe(inspection.results[0]),
+                camera.codec.describe(inspection.results[0]),
             )
     return f"{len(observe_inspections(camera))} triggers"
 
@@ -74,8 +74,8 @@ def trigger_is_acknowledged(camera: CameraUnderTest) -> None:
     """A trigger is answered with the code 0."""
     for inspection in observe_inspections(camera):
         answers = frames_with_id(inspection.frames, MessageId.TRIGGER)
-        if [camera.wire.read_numbers(answer.body) for answer in answers] != [(0,)]:
-            frames_text = "; ".join(map(camera.wire.describe, inspection.frames)) or "nothing"
+        if [camera.codec.read_numbers(answer.body) for answer in answers] != [(0,)]:
+            frames_text = "; ".join(map(camera.codec.describe, inspection.frames)) or "nothing"
             raise Differs("one answer to the trigger, the code 0", frames_text)
 
 
@@ -86,19 +86,19 @@ def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
         if inspection.status_under_way is not None:
             fell = not inspection.status_under_way & inspection.waiting_mask
             result = inspection.results[0] if inspection.results and not fell else None
-            if result is not None and result.at - inspection.sent_at < camera.options.quiet:
+            if result is not None and result.at - inspection.sent_at < camera.options.silence:
                 continue  # the inspection was over before the status came
-            rose = True  # the observation has waited for it
+            rose = True  # observe_inspections() waits until it has risen
         else:
             indices = inspection.transition_indices()
             fell, rose = indices[0] is not None, indices[2] is not None
         if not (fell and rose):
-            frames_text = "; ".join(map(camera.wire.describe, inspection.frames)) or "nothing"
+            frames_text = "; ".join(map(camera.codec.describe, inspection.frames)) or "nothing"
             raise Differs("Waiting for Trigger falls with a trigger and rises again", frames_text)
 
 
-@check("SC-A30, SC-B33, published", needs=Allow.TRIGGER, dialects=SMART)
-def dropped_trigger_is_told(camera: CameraUnderTest) -> None:
+@check("SC-A30, SC-B33, published", needs=Allow.TRIGGER, dialects=SMART_DIALECTS)
+def dropped_trigger_is_reported(camera: CameraUnderTest) -> None:
     """One of two triggers at once is dropped, and a status with Overtriggered says so."""
     observed = observe_double_trigger(camera)
     if observed.rose_at is None:
@@ -109,7 +109,7 @@ def dropped_trigger_is_told(camera: CameraUnderTest) -> None:
         raise Differs("one result for two triggers of which one was dropped", observed.text)
 
 
-@check("SC-A30, published", needs=Allow.TRIGGER, dialects=SMART)
+@check("SC-A30, published", needs=Allow.TRIGGER, dialects=SMART_DIALECTS)
 def overtriggered_falls_by_itself(camera: CameraUnderTest) -> None:
     """A status without Overtriggered comes later."""
     observed = observe_double_trigger(camera)
@@ -126,8 +126,8 @@ def reset_errors_brings_a_status(camera: CameraUnderTest) -> None:
         client.round_trip()
         start_index = len(client.received)
         answer = client.ask(m.ResetErrors())
-        if camera.wire.read_numbers(answer.body) != (0,):
-            raise Differs("the code 0", camera.wire.describe(answer))
+        if camera.codec.read_numbers(answer.body) != (0,):
+            raise Differs("the code 0", camera.codec.describe(answer))
         after_answer = client.received.index(answer) + 1
         client.wait_for_frame(
             MessageId.STATUS,
@@ -141,12 +141,12 @@ def reset_errors_brings_a_status(camera: CameraUnderTest) -> None:
 def trigger_error_stays_until_reset(camera: CameraUnderTest) -> None:
     """A dropped trigger shows as Trigger Error, which stays until the errors are reset."""
     inspection_seconds = inspection_time(camera)
-    error = camera.wire.bits.overtriggered
+    error = camera.codec.bits.overtriggered
     with camera.session() as client:
         camera.ensure_ready(client)
         start_index = len(client.received)
         client.send(m.Trigger(), m.Trigger())
-        client.listen(2 * inspection_seconds + camera.options.quiet)
+        client.listen(2 * inspection_seconds + camera.options.silence)
         word = client.read_status()
         results = len(frames_with_id(client.received[start_index:], MessageId.RESULT_CONTAINER))
         if not word & error and results >= 2:
@@ -160,7 +160,7 @@ def trigger_error_stays_until_reset(camera: CameraUnderTest) -> None:
             )
 
 
-@check("MV31, published", needs=Allow.RUN, dialects=SMART)
+@check("MV31, published", needs=Allow.RUN, dialects=SMART_DIALECTS)
 def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
     """An application without triggers sends results in run mode, and none after Stop."""
     with camera.session() as client:
@@ -179,15 +179,15 @@ def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
         camera.ensure_stopped(client)
         client.round_trip()
         start_index = len(client.received)
-        frames = client.listen(2 * camera.options.quiet)
+        frames = client.listen(2 * camera.options.silence)
         if frames_with_id(frames, MessageId.RESULT_CONTAINER):
             raise Differs("no result after Stop", client.describe_received(start_index))
 
 
-@check("MV31, SC-A30, published", needs=Allow.RUN, dialects=SMART)
+@check("MV31, SC-A30, published", needs=Allow.RUN, dialects=SMART_DIALECTS)
 def stop_ends_run_mode(camera: CameraUnderTest) -> None:
     """Stop takes Running and Waiting for Trigger away."""
-    bits = camera.wire.bits
+    bits = camera.codec.bits
     with camera.session() as client:
         camera.load_application(client, camera.application)
         camera.ensure_running(client)
@@ -199,7 +199,7 @@ def stop_ends_run_mode(camera: CameraUnderTest) -> None:
             raise Differs("a stopped camera that does not wait for triggers", f"{word:#x}")
 
 
-@check("SC-A28, published", needs=Allow.RUN, dialects=SMART)
+@check("SC-A28, published", needs=Allow.RUN, dialects=SMART_DIALECTS)
 def second_stop_is_harmless(camera: CameraUnderTest) -> None:
     """Stop is not answered, and changes nothing out of run mode."""
     with camera.session() as client:
@@ -213,16 +213,16 @@ def _check_no_change(camera: CameraUnderTest, message: Message) -> None:
         start_index = len(client.received)
         client.send(message)
         client.round_trip()
-        client.listen(camera.options.quiet)
+        client.listen(camera.options.silence)
         running_after = camera.is_running(client)
         name = type(message).__name__
-        if frames_with_id(client.received, camera.wire.dialect.message_id(message)):
+        if frames_with_id(client.received, camera.codec.dialect.message_id(message)):
             raise Differs(f"no answer to {name}", client.describe_received(start_index))
         if running_before != running_after:
             raise Differs(f"a second {name} changes nothing", client.describe_received(start_index))
 
 
-@check("MV31, published", needs=Allow.RUN | Allow.TRIGGER, dialects=SMART)
+@check("MV31, published", needs=Allow.RUN | Allow.TRIGGER, dialects=SMART_DIALECTS)
 def stopped_camera_ignores_triggers(camera: CameraUnderTest) -> None:
     """A trigger to a stopped camera gives no result."""
     observed = observe_stopped_trigger(camera)

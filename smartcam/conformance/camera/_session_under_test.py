@@ -12,7 +12,7 @@ from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import MAX_LOG_LINES, LinkClosedError, RawClient
 from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import RawDialect
-from smartcam.doctor._inside import trials as probe_trials
+from smartcam.doctor._inside import try_ways
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId, load_protocol
@@ -60,7 +60,7 @@ class CameraUnderTest:
         )
         self.gone_reason: str = ""  # reason why the camera is gone, "" while it answers
         self.not_restored: str = ""  # state that could not be restored; "" if everything was
-        # messages on the wire since the last forget_trail()
+        # messages on the wire since the last clear_message_log()
         self.message_log: deque[str] = deque(maxlen=MAX_LOG_LINES)
         # undocumented frames of the camera, as texts, each kind once
         self.flaws: dict[str, str] = {}
@@ -70,7 +70,7 @@ class CameraUnderTest:
             raise ConfigurationError(
                 f"{options.url!r} is not the address of a BVS camera: bvs://HOST"
             )
-        self._wire: RawDialect | None = None
+        self._codec: RawDialect | None = None
         self._observations: dict[str, Any] = {}
         self._allow = options.allow
         self._state_changed = False
@@ -84,32 +84,32 @@ class CameraUnderTest:
 
     @property
     def address(self) -> Address:
-        """Address of the camera; the dialect is pinned once it is known."""
-        if self._wire is None:
+        """Address of the camera, with the dialect once it is known."""
+        if self._codec is None:
             return self._address
-        dialect = self._wire.dialect
+        dialect = self._codec.dialect
         return self._address._replace(dialect=dialect.name, quirks=dialect.quirks)
 
     @property
-    def wire(self) -> RawDialect:
+    def codec(self) -> RawDialect:
         """The dialect; it is found out if the address does not name it.
 
         Raises:
             Differs: no dialect is answered.
         """
-        if self._wire is None:
-            self._wire = RawDialect(self._detect())
-        return self._wire
+        if self._codec is None:
+            self._codec = RawDialect(self._detect())
+        return self._codec
 
     @property
     def dialect(self) -> str:
-        """The dialect's name; raises as :attr:`wire`."""
-        return self.wire.dialect.name
+        """The dialect's name; raises as :attr:`codec`."""
+        return self.codec.dialect.name
 
     @property
     def known_dialect(self) -> str:
         """The dialect's name, "" while it is not known."""
-        return self._address.dialect or "" if self._wire is None else self._wire.dialect.name
+        return self._address.dialect or "" if self._codec is None else self._codec.dialect.name
 
     def _detect(self) -> FramedDialect:
         address = self._address
@@ -123,15 +123,15 @@ class CameraUnderTest:
 
     def learn_quirk(self, name: str, *, is_present: bool) -> None:
         """Add a quirk to the camera's dialect, or remove it."""
-        dialect = self.wire.dialect
+        dialect = self.codec.dialect
         names = {*dialect.quirks, name} if is_present else {*dialect.quirks} - {name}
         plain = cast("FramedDialect", load_protocol("bvs").dialects[dialect.name])
-        self._wire = RawDialect(plain.with_quirks(names))
+        self._codec = RawDialect(plain.with_quirks(names))
 
     @property
     def silence_timeout(self) -> float:
-        """Seconds to wait for an answer that may not come, if no fence can show its absence."""
-        return 4 * self.options.quiet
+        """Seconds to wait for an answer that may not come, where no round trip can show that."""
+        return 4 * self.options.silence
 
     def observe_once(self, name: str, observe: Callable[[], T]) -> T:
         """Make an observation in the first call; later, return its result or raise its error."""
@@ -169,9 +169,9 @@ class CameraUnderTest:
         finally:
             for frame in client.received:
                 self._learn_code(frame)
-                flaw = self.wire.find_flaw(frame)
+                flaw = self.codec.find_flaw(frame)
                 if flaw is not None:
-                    self.flaws.setdefault(flaw, self.wire.describe(frame))
+                    self.flaws.setdefault(flaw, self.codec.describe(frame))
 
     def open_link(self) -> RawClient:
         """Open a link to the camera; the caller closes it.
@@ -180,11 +180,11 @@ class CameraUnderTest:
             OSError: there is no connection.
         """
         return RawClient(
-            self.wire,
+            self.codec,
             (self._address.host, self._address.port),
             self.transport == "tcp",
             self.options.timeout,
-            self.options.quiet,
+            self.options.silence,
             self.message_log,
             self._note_state_change,
         )
@@ -230,12 +230,12 @@ class CameraUnderTest:
 
         Raises:
             Differs: the camera does not answer.
-            EndedError: the camera ends the link.
+            LinkClosedError: the camera ends the link.
         """
         answer = client.ask(m.Connect())
         self._learn_code(answer)
-        client.wire = self.wire
-        if not self.wire.is_bid:
+        client.codec = self.codec
+        if not self.codec.is_bid:
             client.wait_for_frame(
                 MessageId.STATUS, self.options.timeout, "a status after Connect", start_index=0
             )
@@ -261,15 +261,15 @@ class CameraUnderTest:
             Differs: the camera does not answer with it.
         """
         answer = client.ask(m.Query())
-        numbers = self.wire.read_numbers(answer.body)
-        code_count = 1 if self.wire.dialect.coded else 0
+        numbers = self.codec.read_numbers(answer.body)
+        code_count = 1 if self.codec.dialect.coded else 0
         if len(numbers) <= code_count:
-            raise Differs("the active application's id", self.wire.describe(answer))
+            raise Differs("the active application's id", self.codec.describe(answer))
         return numbers[code_count]
 
     def is_running(self, client: RawClient) -> bool:
         """Return True if the camera is in run mode; a BVS ID always is."""
-        return self.wire.is_bid or bool(client.read_status() & self.wire.bits.running)
+        return self.codec.is_bid or bool(client.read_status() & self.codec.bits.running)
 
     @property
     def application(self) -> int:
@@ -297,8 +297,8 @@ class CameraUnderTest:
             NotObserved: Stop is not allowed.
             Differs: the camera does not stop.
         """
-        bits = self.wire.bits
-        if self.wire.is_bid or not client.read_status() & bits.running:
+        bits = self.codec.bits
+        if self.codec.is_bid or not client.read_status() & bits.running:
             return
         self.require_allowed(Allow.RUN)
         client.send(m.Stop())
@@ -308,8 +308,8 @@ class CameraUnderTest:
 
     def ensure_running(self, client: RawClient) -> None:
         """Start the camera unless it is in run mode; raises as :meth:`ensure_stopped`."""
-        bits = self.wire.bits
-        if self.wire.is_bid or client.read_status() & bits.running:
+        bits = self.codec.bits
+        if self.codec.is_bid or client.read_status() & bits.running:
             return
         self.require_allowed(Allow.RUN)
         client.send(m.Start())
@@ -332,16 +332,16 @@ class CameraUnderTest:
         answer = client.ask(
             m.SwitchApplication(application=application), timeout=self.options.switch_timeout
         )
-        code, active = (*self.wire.read_numbers(answer.body), -1, -1)[:2]
+        code, active = (*self.codec.read_numbers(answer.body), -1, -1)[:2]
         if code:
             raise NotObserved(
-                f"the camera does not load application {application}: {self.wire.describe(answer)}"
+                f"the camera does not load application {application}: {self.codec.describe(answer)}"
             )
         if active != application:
-            raise Differs(f"application {application} in the answer", self.wire.describe(answer))
-        bits = self.wire.bits
+            raise Differs(f"application {application} in the answer", self.codec.describe(answer))
+        bits = self.codec.bits
         client.wait_status(
-            lambda word: word & bits.ready if self.wire.is_bid else not word & bits.busy,
+            lambda word: word & bits.ready if self.codec.is_bid else not word & bits.busy,
             self.options.switch_timeout,
             "a status that is not busy",
         )
@@ -362,7 +362,7 @@ class CameraUnderTest:
         """Wait until the camera waits for a trigger; raises as :meth:`ensure_ready`."""
         if self._observations.get("runs free") == self.application:
             raise NotObserved(f"application {self.application} runs without triggers")
-        waiting = self.wire.bits.waiting
+        waiting = self.codec.bits.waiting
         try:
             client.wait_status(
                 lambda word: word & waiting,
@@ -420,12 +420,12 @@ async def _probe(address: Address) -> Address | str:
     """Return the address with its dialect, or the outcome of each try as text."""
     tried: list[str] = []
     outcome: Address | str | None = None
-    async with contextlib.aclosing(probe_trials(address, timeout=DETECTION_TIMEOUT)) as trials:
-        async for trial in trials:
-            if trial.address.scheme != address.scheme:
+    async with contextlib.aclosing(try_ways(address, timeout=DETECTION_TIMEOUT)) as attempts:
+        async for attempt in attempts:
+            if attempt.address.scheme != address.scheme:
                 break
-            if trial.answer is not None:
-                outcome = parse_address(trial.answer.url)
+            if attempt.answer is not None:
+                outcome = parse_address(attempt.answer.url)
                 break
-            tried.append(str(trial))
+            tried.append(str(attempt))
     return outcome or "; ".join(tried)

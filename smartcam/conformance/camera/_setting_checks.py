@@ -6,7 +6,7 @@ import time
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
-from smartcam.conformance._dialects import SMART
+from smartcam.conformance._dialects import SMART_DIALECTS
 from smartcam.conformance.camera._observations import (
     has_no_id,
     inspection_time,
@@ -37,8 +37,8 @@ EXAMPLE_DATE = datetime(2016, 6, 25, 10, 11, 12, tzinfo=UTC)
 
 # ---------------------------------------------------------------------- switching
 
-_NARROWED = "the bodies of the dialects with 32 bits narrowed, inferred"
-_SWITCH = {"": "SC-B34, published", "b16": _NARROWED, "bid": "ID-a 229, published"}
+_B16 = "bodies as in the dialects of 32 bits, with numbers of 16 bits, inferred"
+_SWITCH = {"": "SC-B34, published", "b16": _B16, "bid": "ID-a 229, published"}
 
 
 @check(_SWITCH, needs=Allow.SWITCH)
@@ -55,14 +55,14 @@ def unknown_application_is_refused(camera: CameraUnderTest) -> None:
 
 def _check_refusal(camera: CameraUnderTest, application: int) -> None:
     with camera.session() as client:
-        code = 0x1A if camera.wire.dialect.coded else 1
+        code = 0x1A if camera.codec.dialect.coded else 1
         active = camera.active_application(client)
         camera.ensure_stopped(client)
         answer = client.ask(m.SwitchApplication(application=application))
-        if camera.wire.read_numbers(answer.body) != (code, active):
+        if camera.codec.read_numbers(answer.body) != (code, active):
             raise Differs(
                 f"the code {code:#x} and the application that stays active, {active}",
-                camera.wire.describe(answer),
+                camera.codec.describe(answer),
             )
         if camera.active_application(client) != active:
             raise Differs(f"application {active} stays active", client.describe_received())
@@ -72,9 +72,9 @@ def _check_refusal(camera: CameraUnderTest, application: int) -> None:
 def switch_loads_the_application(camera: CameraUnderTest) -> str:
     """A switch is answered when it is done, with the id that is active then."""
     observed = observe_switch(camera)
-    if camera.wire.read_numbers(observed.answer.body) != (0, observed.application):
+    if camera.codec.read_numbers(observed.answer.body) != (0, observed.application):
         raise Differs(
-            f"the code 0 and the id {observed.application}", camera.wire.describe(observed.answer)
+            f"the code 0 and the id {observed.application}", camera.codec.describe(observed.answer)
         )
     if observed.active != observed.application:
         raise Differs(
@@ -84,14 +84,14 @@ def switch_loads_the_application(camera: CameraUnderTest) -> str:
     return f"{observed.seconds:.3f} s"
 
 
-@check("SC-B33, published", needs=Allow.SWITCH, dialects=SMART)
+@check("SC-B33, published", needs=Allow.SWITCH, dialects=SMART_DIALECTS)
 def busy_during_a_switch(camera: CameraUnderTest) -> None:
     """BUSY is set during a switch."""
     observed = observe_switch(camera)
-    busy = camera.wire.bits.busy
-    words = camera.wire.status_words(observed.frames)
+    busy = camera.codec.bits.busy
+    words = camera.codec.status_words(observed.frames)
     if not any(word & busy for word in words) or words[-1] & busy:
-        frames_text = "; ".join(map(camera.wire.describe, observed.frames))
+        frames_text = "; ".join(map(camera.codec.describe, observed.frames))
         raise Differs("a status with BUSY during the switch, and one without it after", frames_text)
 
 
@@ -122,14 +122,14 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
         switch_done = (0, other)
         client.wait_for_frame(
             lambda message: (
-                camera.wire.read_numbers(message.body) == switch_done
+                camera.codec.read_numbers(message.body) == switch_done
                 and message.message_id == MessageId.SWITCH_APPLICATION
             ),
             camera.options.switch_timeout,
             "the answer to the first switch",
             start_index=start_index,
         )
-        client.listen(camera.options.quiet)
+        client.listen(camera.options.silence)
         _judge_second_switch(camera, client, start_index, first, active)
 
 
@@ -137,9 +137,9 @@ def _judge_second_switch(
     camera: CameraUnderTest, client: RawClient, start_index: int, query: ReceivedFrame, active: int
 ) -> None:
     switched = frames_with_id(client.received[start_index:], MessageId.SWITCH_APPLICATION)
-    answers = [camera.wire.read_numbers(message.body) for message in switched]
-    numbers = camera.wire.read_numbers(query.body)
-    if camera.wire.is_bid:
+    answers = [camera.codec.read_numbers(message.body) for message in switched]
+    numbers = camera.codec.read_numbers(query.body)
+    if camera.codec.is_bid:
         if numbers != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:
             raise Differs(
                 f"the code 0x16 and 0 to the Query, 0x16 and {active} to the second switch",
@@ -157,17 +157,17 @@ def _judge_second_switch(
 
 def _read_clock(camera: CameraUnderTest, client: RawClient) -> datetime:
     answer = client.ask(m.GetClock())
-    numbers = camera.wire.read_numbers(answer.body)
-    if camera.wire.dialect.coded:
+    numbers = camera.codec.read_numbers(answer.body)
+    if camera.codec.dialect.coded:
         code, numbers = numbers[0], numbers[1:]
         if code != 6:
-            raise Differs("the code 6", camera.wire.describe(answer))
+            raise Differs("the code 6", camera.codec.describe(answer))
     try:
         year, month, day, hour, minute, second = numbers
         return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError as exc:
         raise Differs(
-            "year, month, day, hour, minute, second", camera.wire.describe(answer)
+            "year, month, day, hour, minute, second", camera.codec.describe(answer)
         ) from exc
 
 
@@ -187,27 +187,25 @@ def _send_setting(
     camera: CameraUnderTest, client: RawClient, request: m.Request, code: tuple[int, ...]
 ) -> None:
     """Send a request that a BVS ID acknowledges and a smart camera does not answer."""
-    if not camera.wire.is_bid:
-        message_id = camera.wire.dialect.message_id(request)
+    if not camera.codec.is_bid:
+        message_id = camera.codec.dialect.message_id(request)
         client.send(request)
         if frames_with_id(client.round_trip(), message_id):
             raise Differs(f"no answer to {type(request).__name__}", client.describe_received())
         return
     answer = client.ask(request)
-    if camera.wire.read_numbers(answer.body) != code:
-        raise Differs(f"the code {code[0]:#x}", camera.wire.describe(answer))
+    if camera.codec.read_numbers(answer.body) != code:
+        raise Differs(f"the code {code[0]:#x}", camera.codec.describe(answer))
 
 
-@check({"": "MV29, published", "b16": _NARROWED, "bid": "ID-b 218, published"})
-def clock_is_told(camera: CameraUnderTest) -> str:
-    """Get the time stamp is answered with a date and a time."""
+@check({"": "MV29, published", "b16": _B16, "bid": "ID-b 218, published"})
+def clock_is_reported(camera: CameraUnderTest) -> str:
+    """The command "Get the time stamp" is answered with a date and a time."""
     with camera.session() as client:
         return f"{_read_clock(camera, client):%Y-%m-%d %H:%M:%S}"
 
 
-@check(
-    {"": "MV29, MV30, published", "b16": _NARROWED, "bid": "ID-a 231, published"}, needs=Allow.CLOCK
-)
+@check({"": "MV29, MV30, published", "b16": _B16, "bid": "ID-a 231, published"}, needs=Allow.CLOCK)
 def clock_is_set(camera: CameraUnderTest) -> None:
     """The clock goes on from the time that is set."""
     with camera.session() as client:
@@ -241,36 +239,36 @@ def read_next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     """Trigger once and return the four bytes of the sequence number in the result.
 
     Raises:
-        NotObserved: the number's place is not known, or no result comes.
+        NotObserved: the number's offset is not known, or no result comes.
     """
     offset = camera.options.sequence_offset
     if offset is None:
         raise NotObserved(
-            "the place of the sequence number in a result is not known: --camera-sequence-offset"
+            "the offset of the sequence number in a result is not known: --camera-sequence-offset"
         )
     camera.wait_until_waiting(client)
     result = client.trigger()
-    begin = offset + (0 if "no_id" in camera.wire.dialect.quirks else camera.wire.word_size)
+    begin = offset + (0 if "no_id" in camera.codec.dialect.quirks else camera.codec.word_size)
     field = result.body[begin : begin + 4]
     if len(field) < 4:
-        raise NotObserved(f"a result has no four bytes at {offset}: {camera.wire.describe(result)}")
+        raise NotObserved(f"a result is too short for {offset}: {camera.codec.describe(result)}")
     return field
 
 
 @check(
     {"": "SC-C50, inferred", "b16": "SC-C50, published"},
     needs=Allow.NUMBER | Allow.TRIGGER,
-    dialects=SMART,
+    dialects=SMART_DIALECTS,
     contradictions=("C6",),
 )
 def sequence_number_is_set(camera: CameraUnderTest) -> None:
-    """Set sequence number is the number of the next run; the next run has one more."""
+    """The number of the command "Set sequence number" is that of the next run, which counts on."""
     number = 0x01020304
-    has_no_id(camera)  # raises if the number's place is unknown
+    has_no_id(camera)  # raises if the number's offset is unknown
     little, big = number.to_bytes(4, "little"), number.to_bytes(4, "big")
     with camera.session() as client:
         camera.ensure_ready(client)
-        client.write(camera.wire.make_frame(MessageId.SET_SEQUENCE_NUMBER, little))
+        client.write(camera.codec.make_frame(MessageId.SET_SEQUENCE_NUMBER, little))
         first = read_next_number(camera, client)
         second = read_next_number(camera, client)
     if camera.dialect == "b16" and first == big:
@@ -293,7 +291,7 @@ def input_data_is_taken(camera: CameraUnderTest) -> None:
     if data is None:
         raise NotObserved("it is not known what input data the application takes: --camera-input")
     inspection_seconds = inspection_time(camera)
-    bits = camera.wire.bits
+    bits = camera.codec.bits
     with camera.session() as client:
         camera.ensure_ready(client)
         start_index = len(client.received)
@@ -310,13 +308,13 @@ def input_data_is_taken(camera: CameraUnderTest) -> None:
             )
 
 
-@check("MV31, published", needs=Allow.REBOOT, dialects=SMART, contradictions=("C9",))
+@check("MV31, published", needs=Allow.REBOOT, dialects=SMART_DIALECTS, contradictions=("C9",))
 def reboot_restarts_the_camera(camera: CameraUnderTest) -> str:
     """0x43 restarts the camera: the session ends, and it comes back."""
     return f"{observe_restart(camera).seconds:.1f} s"
 
 
-@check("no document, inferred", needs=Allow.REBOOT, dialects=SMART)
+@check("no document, inferred", needs=Allow.REBOOT, dialects=SMART_DIALECTS)
 def stopped_after_a_reboot(camera: CameraUnderTest) -> None:
     """A camera that has restarted is stopped."""
     observed = observe_restart(camera)

@@ -133,7 +133,7 @@ class CameraConformance:
 
     @pytest.mark.parametrize("item", ITEMS, ids=lambda item: item.name)
     def test_camera(self, camera_report: CameraReport, item: Item) -> None:
-        """The camera follows the documents; without one, a quirk's setting describes it."""
+        """The camera follows the documents; where there is none, a quirk's value describes it."""
         finding = judge_item(camera_report.camera, item)
         camera_report.add(finding)
         if finding.failed:
@@ -149,7 +149,7 @@ def _failure_text(finding: CameraFinding) -> str:
         [
             f"{finding.item.about} ({finding.source}, {finding.grade})",
             f"expected: {finding.expected}",
-            f"came:     {finding.observed}",
+            f"observed: {finding.observed}",
             *finding.wire,
         ]
     )

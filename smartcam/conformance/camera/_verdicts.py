@@ -14,11 +14,11 @@ class Differs(Exception):  # noqa: N818 - it is a verdict on the camera
 
     def __str__(self) -> str:
         """Return both behaviours as text."""
-        return f"expected: {self.expected}; came: {self.observed}"
+        return f"expected: {self.expected}; observed: {self.observed}"
 
 
 class Undescribed(Differs):
-    """No value of a question's quirk describes the observed behaviour; the question fails."""
+    """The camera behaves as no value of the quirk describes that the question is about."""
 
 
 class NotObserved(Exception):  # noqa: N818 - it is a verdict on the experiment

@@ -50,8 +50,8 @@ def frames_with_id(frames: Iterable[ReceivedFrame], message_id: int) -> list[Rec
 class Bits:
     """Masks of a status word's bits by meaning; 0 if no bit has the meaning.
 
-    Source: SC-A30, SC-B33 (published) for smart cameras; ID-b 210 and the example of ID-a 227
-    (published and derived) for BVS ID.
+    Sources, by the keys of docs/sources.md: SC-A30, SC-B33 (published) for smart cameras; ID-b 210
+    and the example of ID-a 227 (published and derived) for BVS ID.
     """
 
     waiting: int
@@ -168,11 +168,11 @@ class RawDialect:
         size = self._body_sizes().get(frame.message_id)
         if size is None:
             return f"message {frame.message_id:#04x} is not one that a camera sends"
-        least, exact = size
-        if len(frame.body) < least or (exact and len(frame.body) != least):
+        min_size, exact = size
+        if len(frame.body) < min_size or (exact and len(frame.body) != min_size):
             more = "" if exact else " or more"
             name = MessageId(frame.message_id).name
-            return f"{name} has {len(frame.body)} bytes of body: expected {least}{more}"
+            return f"{name} has {len(frame.body)} bytes of body: expected {min_size}{more}"
         return None
 
     def _body_sizes(self) -> Mapping[int, tuple[int, bool]]:

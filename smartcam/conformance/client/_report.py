@@ -24,7 +24,7 @@ class ClientFinding(NamedTuple):
     scene: str  # special condition of the camera
     task: str  # task of the client
     wrong: str  # mistake of the client
-    expects: str  # behaviour that the documents require of a client
+    reason: str  # reason of the rule
     source: str  # source in the documents
     wire: tuple[str, ...]  # messages on the wire, one line each
     output: str  # output of the client
@@ -34,7 +34,7 @@ class ClientFinding(NamedTuple):
         lines = [
             f"{self.check} ({self.grade}; {self.camera}): {self.wrong}",
             f"  task: {self.task}; camera: {self.scene}",
-            f"  expected: {self.expects}",
+            f"  because: {self.reason}",
             f"  source: {self.source} (docs/sources.md)",
             "  on the wire (> from the client):",
             *(f"    {line}" for line in self.wire or ("nothing",)),
@@ -67,7 +67,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
         scene=run.scene.about,
         task=str(run.task),
         wrong=wrong,
-        expects=check.expects,
+        reason=check.reason,
         source=check.source,
         wire=tuple(run.lines),
         output=output,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from smartcam.conformance._dialects import SMART
+from smartcam.conformance._dialects import SMART_DIALECTS
 from smartcam.conformance.client._scenes import read_container
 from smartcam.models import Status
 from smartcam.protocols import messages as m
@@ -23,24 +23,24 @@ STATUS_GRACE = 0.05
 
 def _find_wrong_result(run: ClientRun) -> str | None:
     """Return the first mistake in the client's results; too few results are no mistake."""
-    scene, sent_turns, last_turn = run.scene, run.sent_turns, -1
+    scene, sent_runs, last_run = run.scene, run.sent_runs, -1
     for number, data in enumerate(run.outcome.results, 1):
         label = f"result {number}, {data[:32].hex(' ') or 'empty'},"
         content = read_container(data)
         if content is None:
-            return f"{label} is {len(data)} bytes long; the containers have 8 after the id"
-        application, turn = content
+            return f"{label} is {len(data)} bytes long; expected 8 after the application's id"
+        application, run_number = content
         if application != scene.application:
             return f"{label} is of application {application}, not of {scene.application}"
-        if turn not in sent_turns:
+        if run_number not in sent_runs:
             return f"{label} was never sent"
-        if turn in scene.stale:
+        if run_number in scene.stale:
             return f"{label} is of an inspection that was under way before the client's trigger"
-        if turn == last_turn:
+        if run_number == last_run:
             return f"{label} is of the same inspection as the one before"
-        if turn < last_turn:
+        if run_number < last_run:
             return f"{label} is of an earlier inspection than the one before"
-        last_turn = turn
+        last_run = run_number
     if len(run.outcome.results) > scene.result_count:
         return f"it gave {len(run.outcome.results)} results, {scene.result_count} were wanted"
     return None
@@ -181,7 +181,7 @@ def stops_first(run: ClientRun) -> str | None:
         if isinstance(request.message, (m.Start, m.Stop)):
             running = isinstance(request.message, m.Start)
         elif isinstance(request.message, m.SwitchApplication):
-            if running and run.dialect.name in SMART:
+            if running and run.dialect.name in SMART_DIALECTS:
                 return f"{_message_name(request)} came while the application ran"
             return None
     return "it did not send SwitchApplication"

@@ -26,7 +26,7 @@ CLIENT_END_TIMEOUT = 0.3
 """Seconds that the camera waits for the last messages of a client that has ended."""
 
 MAX_LINES = 40
-"""Largest number of lines of the wire that a finding shows: the last ones."""
+"""Largest number of messages that a finding shows, one a line: the last ones."""
 
 
 class RecordedMessage(NamedTuple):
@@ -54,9 +54,9 @@ class ClientRun:
     """A client's attempt at a task.
 
     Attributes:
-        scene: the camera.
-        task: the task.
-        dialect: name of the dialect that was spoken.
+        scene: the camera, its faults and the task.
+        task: the task as the client got it.
+        dialect: dialect of the camera.
         outcome: outcome as the client reports it.
         messages: messages on the wire, in the order in which the camera saw them.
         timeout: seconds that the client had.
@@ -79,15 +79,15 @@ class ClientRun:
         )
 
     @property
-    def sent_turns(self) -> list[int]:
+    def sent_runs(self) -> list[int]:
         """Run numbers of the results that the scene's application sent, in order."""
-        turns: list[int] = []
+        numbers: list[int] = []
         for message in self.messages:
             if isinstance(message.message, ResultContainer) and not message.lost:
                 content = read_container(message.message.data)
                 if content is not None and content[0] == self.scene.application:
-                    turns.append(content[1])
-        return turns
+                    numbers.append(content[1])
+        return numbers
 
     def status_before(self, index: int) -> Status | None:
         """Return the last status that the camera sent before message ``index``, if there is one."""
@@ -139,7 +139,7 @@ async def run_scene(
         running=scene.running,
         quirks=dict(scene.quirks),
     ) as camera:
-        camera.inject(*scene.faults(camera.spoken))
+        camera.inject(*scene.faults(camera.wire_dialect))
         task = Task(
             verb=scene.verb,
             number=scene.number,
@@ -153,13 +153,13 @@ async def run_scene(
         outcome = await client.perform(task, timeout)
         await _wait_for_last_message(camera)
         messages = tuple(
-            _record_entry(camera.spoken, entry, started_at)
+            _record_entry(camera.wire_dialect, entry, started_at)
             for entry in _join_ignored_frames(camera.log)
         )
     return ClientRun(
         scene=scene,
         task=task,
-        dialect=camera.spoken,
+        dialect=camera.wire_dialect,
         outcome=outcome,
         messages=messages,
         timeout=timeout,

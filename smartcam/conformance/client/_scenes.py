@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from smartcam.conformance._dialects import EVERY_DIALECT, SMART
+from smartcam.conformance._dialects import EVERY_DIALECT, SMART_DIALECTS
 from smartcam.emulator import faults as f
 from smartcam.protocols import Frame
 
@@ -34,26 +34,26 @@ WAITING_STATUS = 0x280
 _CONTAINER = struct.Struct("<ii")
 
 
-def container(application: int, turn: int) -> bytes:
+def container(application: int, run_number: int) -> bytes:
     """Return the data of a result: its application, and the number of the run."""
-    return _CONTAINER.pack(application, turn)
+    return _CONTAINER.pack(application, run_number)
 
 
 def read_container(data: bytes) -> tuple[int, int] | None:
     """Return the application and the run of a result's data; None for other data."""
     if len(data) != _CONTAINER.size:
         return None
-    application, turn = _CONTAINER.unpack(data)
-    return application, turn
+    application, run_number = _CONTAINER.unpack(data)
+    return application, run_number
 
 
 def _make_application(number: int, **other: Any) -> dict[str, Any]:
     def values(run: Run) -> dict[str, int]:
-        return {"application": number, "turn": run.turn}
+        return {"application": number, "run_number": run.run_index}
 
     return {
         "id": number,
-        "layout": "application: int32, turn: int32",
+        "layout": "application: int32, run_number: int32",
         "generator": values,
         "load_time": 0.1,
         "processing_time": 0.02,
@@ -81,7 +81,7 @@ class Scene:
         name: name of the scene.
         about: text about the special condition of the scene, for people.
         verb: verb of the task.
-        number: number of the task.
+        number: N or ID of the task, as in :class:`~smartcam.conformance.client._tasks.Task`.
         active: application that is loaded at first.
         running: True if the camera is in run mode at first.
         faults: function that returns the faults for a dialect.
@@ -143,10 +143,10 @@ def _split_every_byte(dialect: FramedDialect) -> Sequence[BaseFault]:
 
 def _announce_impossible_length(dialect: FramedDialect) -> Sequence[BaseFault]:
     header = dialect.header
-    number = dialect.encode_frame(Frame(0x20, b""))[: len(header.magic)]
+    magic = dialect.encode_frame(Frame(0x20, b""))[: len(header.magic)]
     size = b"\xff" * (4 if header.code == "I" else 2)
-    code = (0x20).to_bytes(len(size), "little")
-    data = number + (code + size if header.id_first else size + code)
+    message_id = (0x20).to_bytes(len(size), "little")
+    data = magic + (message_id + size if header.id_first else size + message_id)
     return [f.Insert(data=data, on="ResultContainer", where="instead", times=None)]
 
 
@@ -253,7 +253,7 @@ SCENES: Mapping[str, Scene] = {
             ),
             verb="switch",
             number=OTHER,
-            dialects=SMART,
+            dialects=SMART_DIALECTS,
         ),
         Scene(
             name="late_switch_answer",
@@ -272,7 +272,7 @@ SCENES: Mapping[str, Scene] = {
             name="stopped",
             about="the application does not run",
             running=False,
-            dialects=SMART,
+            dialects=SMART_DIALECTS,
         ),
         *(
             Scene(name=name, about=about, faults=_fixed_faults(fault))

@@ -104,7 +104,7 @@ class ClientConformance:
 
     @classmethod
     def pytest_generate_tests(cls, metafunc: pytest.Metafunc) -> None:
-        """Make a test of each check for each camera that it applies to."""
+        """Make a test of each check for each dialect and transport that it applies to."""
         if "client_case" not in metafunc.fixturenames:
             return
         options = read_options(metafunc.config)

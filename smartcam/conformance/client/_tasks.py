@@ -58,7 +58,7 @@ class Task:
     Attributes:
         verb: the first word of the task.
         number: N or ID; None for one trigger.
-        url: the camera's address in smartcam's form, with the dialect pinned.
+        url: the camera's address in smartcam's form, which names the dialect.
         host: name or address of the camera's host.
         port: number of the camera's port.
         transport: ``tcp`` or ``udp``.
@@ -213,7 +213,7 @@ class CommandClient(Client):
         cwd: folder to run it in; default the current one.
 
     Raises:
-        ConfigurationError: the command has no place for the task or for the camera's address.
+        ConfigurationError: the command has no field for the task or for the camera's address.
     """
 
     def __init__(self, command: str | Sequence[str], cwd: str | None = None) -> None:
@@ -232,7 +232,7 @@ class CommandClient(Client):
         text = " ".join(self._template)
         if "{task}" not in text or not ("{url}" in text or "{port}" in text):
             raise ConfigurationError(
-                f"client command {text!r}: it needs {{task}}, and {{url}} or {{host}} and {{port}}"
+                f"client command {text!r}: it needs {{task}}, and {{url}} or {{port}}"
             )
 
     def arguments(self, task: Task) -> list[str]:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 LOST_CLOCK = datetime(1970, 1, 1, tzinfo=UTC)
-"""Time that the clock shows after a restart (loss published for a sibling, value inferred).
+"""Time that the clock shows after a restart: lost by a related camera's manual; value inferred.
 
 The camera's clock has no time zone; UTC stands here because our times need one.
 """
@@ -101,7 +101,7 @@ class InputQueue:
 
 
 @dataclass(slots=True)
-class RunChange:
+class RunFaults:
     """The changes that faults make to one inspection."""
 
     delay: int = 0  # additional duration of the inspection, nanoseconds

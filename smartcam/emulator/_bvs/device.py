@@ -28,7 +28,7 @@ from smartcam._arguments import (
 )
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.emulator._bvs.behaviour import SMART_CAMERA, Behaviour
-from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK, CalendarClock, InputQueue, RunChange
+from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK, CalendarClock, InputQueue, RunFaults
 from smartcam.emulator._bvs.quirks import Quirks
 from smartcam.emulator._clock import NANOSECONDS, nanoseconds
 from smartcam.emulator._inspected import InspectedApplication, InspectionOrder
@@ -97,10 +97,10 @@ class _Inspection(NamedTuple):
     """The values of a running inspection that were fixed when it began."""
 
     number: int
-    turn: int
+    run_index: int
     time: float
     input: Mapping[str, Any] | None
-    change: RunChange
+    faults: RunFaults
 
 
 class LastReport(NamedTuple):
@@ -128,7 +128,7 @@ class Device:
         behaviour: behaviour of the camera in its dialect.
 
     Attributes:
-        around: every operator's action (:meth:`start`, :meth:`stop`, :meth:`trigger`,
+        action_context: every operator's action (:meth:`start`, :meth:`stop`, :meth:`trigger`,
             :meth:`switch_application`, :meth:`reboot`, :meth:`set_condition`, :meth:`set_endian`)
             happens inside this context. A server sets a context that first updates the device's
             time and afterwards sends the messages that the action caused.
@@ -152,7 +152,7 @@ class Device:
         self._applications = _by_id(applications)
         self.quirks: Quirks = quirks or Quirks()
         self.scene: TableScene = scene or TableScene()
-        self.around: Callable[[], AbstractContextManager[object]] = nullcontext
+        self.action_context: Callable[[], AbstractContextManager[object]] = nullcontext
         self._on_entered: Callable[[DeviceState], None] | None = None
         self._entered_states: list[DeviceState] = []
         self._last_word = 0  # status word when states were last noted
@@ -174,7 +174,7 @@ class Device:
         self._inspector: Inspector | None = None  # inspector of the present run
         self._held_busy = False
         self._triggers_to_drop = 0  # number of triggers still to be dropped
-        self._run_change = RunChange()  # changes to the running inspection, or else to the next one
+        self._run_faults = RunFaults()  # faults of the running inspection, or else of the next one
         # a reference value (BVS ID) is kept until the next one, and is not queued
         depth = 1 if behaviour.acknowledges else self.quirks.input_queue_depth
         self._inputs = InputQueue(depth)
@@ -291,7 +291,7 @@ class Device:
     def connect(self) -> None:
         """Begin a session: send the answer, then the status if the dialect sends one.
 
-        Source: SC manual p. 28, 29 (published); that ``bid`` sends no status is inferred.
+        Source: SC manual p. 28, 29 (published); no status in dialect ``bid``: inferred.
         """
         self._has_session, self._switch_answer_due = True, False
         self.sessions += 1
@@ -353,18 +353,18 @@ class Device:
 
     def start(self) -> None:
         """Enter run mode, as by the camera's own pages."""
-        with self.around():
+        with self.action_context():
             self._enter_run_mode()
             self._advance(self._now)
 
     def stop(self) -> None:
         """Leave run mode, as by the camera's own pages."""
-        with self.around():
+        with self.action_context():
             self._leave_run_mode()
 
     def trigger(self) -> bool:
         """Trigger by the digital input; return True if an inspection began."""
-        with self.around():
+        with self.action_context():
             taken = self._trigger()
             self._advance(self._now)
         return taken
@@ -387,7 +387,7 @@ class Device:
         application = check_application(application, owner="device")
         running = check_flag(running, "running", "device")
         target = self._applications[self._check_known(application)]
-        with self.around():
+        with self.action_context():
             if self._mode in {Mode.SWITCHING, Mode.REBOOTING}:
                 return False
             self._load(target, answer=False, running=running)
@@ -401,7 +401,7 @@ class Device:
             seconds: until the restart is done; None: the quirk ``reboot_time``.
         """
         seconds = check_seconds_or_none(seconds, "seconds", "device")
-        with self.around():
+        with self.action_context():
             self._reboot(seconds)
 
     def set_condition(self, condition: Status, on: bool) -> None:
@@ -419,7 +419,7 @@ class Device:
             raise ConfigurationError(
                 f"device: only {OPERATOR_CONDITIONS} can be set, got {condition}"
             )
-        with self.around():
+        with self.action_context():
             bits = condition.value
             self._conditions = self._conditions | bits if on else self._conditions & ~bits
             if self._has_system_error:
@@ -432,7 +432,7 @@ class Device:
         Other values are reported unchanged, and containers are little endian.
         """
         endian = check_integer(endian, "endian", 0, 0xFFFFFFFF, "device")
-        with self.around():
+        with self.action_context():
             self._endian = endian
             self._send_changed_status()
 
@@ -445,7 +445,7 @@ class Device:
             seconds: duration; None: until a reboot or :meth:`end_faults`.
         """
         seconds = check_seconds_or_none(seconds, "seconds", "device")
-        with self.around():
+        with self.action_context():
             if self._mode is Mode.REBOOTING:
                 return
             self._held_busy = True
@@ -470,17 +470,17 @@ class Device:
         late = check_seconds(late, "late", "device")
         silent = check_flag(silent, "silent", "device")
         extra = check_integer(extra, "extra", 0, MAX_EXTRA, "device")
-        with self.around():
-            self._run_change.delay += nanoseconds(late)
-            self._run_change.sends_nothing |= silent
-            self._run_change.extra_copies += extra
+        with self.action_context():
+            self._run_faults.delay += nanoseconds(late)
+            self._run_faults.sends_nothing |= silent
+            self._run_faults.extra_copies += extra
             if _Event.INSPECTED in self._events:
                 when, action = self._events[_Event.INSPECTED]
                 self._events[_Event.INSPECTED] = (when + nanoseconds(late), action)
 
     def end_faults(self) -> None:
         """Undo all faults: BUSY is cleared, and triggers are accepted again."""
-        with self.around():
+        with self.action_context():
             self._forget_faults()
             self._send_changed_status()
 
@@ -492,7 +492,7 @@ class Device:
         self._held_busy = False
         self._events.pop(_Event.BUSY_ENDS, None)
         self._triggers_to_drop = 0
-        self._run_change = RunChange()
+        self._run_faults = RunFaults()
 
     # ------------------------------------------------------------------ requests
 
@@ -535,7 +535,7 @@ class Device:
                 pass
 
     def _acknowledge(self, request: m.Request, code: int) -> None:
-        """Answer a request that other cameras do not answer."""
+        """Acknowledge a request, if the dialect acknowledges such requests."""
         answer = request.answer
         if self.behaviour.acknowledges and answer and issubclass(answer, m.Acknowledgement):
             self._send(answer(code=code))
@@ -628,7 +628,7 @@ class Device:
     def _reboot(self, seconds: float | None = None) -> None:
         """Restart: the session ends without a message.
 
-        Source: mvBlueGEMINI manual p. 31 (published for the sibling).
+        Source: mvBlueGEMINI manual p. 31 (published for a related camera).
         """
         if self._mode is Mode.REBOOTING:
             return
@@ -665,7 +665,7 @@ class Device:
     def _set_active_application(self, application: Application) -> None:
         """Make an application the active one."""
         self._active = application
-        self._period = application.period
+        self._period = application.repeat_after
         self._containers: dict[tuple[int, ByteOrder], m.ResultContainer] = {}
         self._runs = 0  # runs since the application was loaded
 
@@ -725,7 +725,7 @@ class Device:
         if not self._can_run or self._processing:  # the last run is late
             return
         self._begin_run()
-        if not self._run_change.delay and _Event.INSPECTED in self._events:
+        if not self._run_faults.delay and _Event.INSPECTED in self._events:
             # a run never overlaps with the next, whatever the rounding
             (end_at, action), (next_begin, _) = (
                 self._events[_Event.INSPECTED],
@@ -735,8 +735,8 @@ class Device:
 
     def _begin_run(self) -> None:
         """Begin a run with the next number and the next input container."""
-        change = self._run_change
-        run = _Inspection(self._next_number, self._runs, self.time, self._next_input(), change)
+        faults = self._run_faults
+        run = _Inspection(self._next_number, self._runs, self.time, self._next_input(), faults)
         self._next_number = (self._next_number + 1) % _NUMBER_COUNT
         self._runs += 1
         self._processing = True
@@ -744,7 +744,7 @@ class Device:
         if isinstance(self._active, InspectedApplication):
             self._inspect(self._active, run)
         else:
-            end_at = self._now + nanoseconds(self._active.processing_time) + change.delay
+            end_at = self._now + nanoseconds(self._active.processing_time) + faults.delay
             self._events[_Event.INSPECTED] = (end_at, functools.partial(self._finish_run, run))
         self._send_changed_status()
 
@@ -758,21 +758,21 @@ class Device:
     def _inspected(self, run: _Inspection, values: Values | None) -> None:
         """Use an inspector's result; a fault may delay the run's end."""
         self._inspector = None
-        with self.around():
+        with self.action_context():
             finish = functools.partial(self._finish_run, run, values)
-            self._events[_Event.INSPECTED] = (self._now + run.change.delay, finish)
+            self._events[_Event.INSPECTED] = (self._now + run.faults.delay, finish)
             self._advance(self._now)
 
     def _finish_run(self, run: _Inspection, values: Values | None = None) -> None:
         """Send the result, and set Waiting for Trigger (the order is a quirk)."""
         self._processing = False
-        self._run_change = RunChange()
+        self._run_faults = RunFaults()
         result = self._result(run, values)
         if self.quirks.waiting_before_result:
             self._send_changed_status()
-        if result is not None and not run.change.sends_nothing:
+        if result is not None and not run.faults.sends_nothing:
             self.last_report = LastReport(self.time, self._byte_order, result)
-            for _ in range(1 + run.change.extra_copies):
+            for _ in range(1 + run.faults.extra_copies):
                 self._send(result)
         self._send_changed_status()
 
@@ -780,7 +780,7 @@ class Device:
         """Return the result; equal results of an application are built only once."""
         if self._period is None:
             return self._build_result(run, values)
-        key = (run.turn % self._period, self._byte_order)
+        key = (run.run_index % self._period, self._byte_order)
         result = self._containers.get(key)
         if result is None:
             result = self._build_result(run, values)
@@ -795,7 +795,7 @@ class Device:
             if not isinstance(application, InspectedApplication):
                 data = application.container(
                     number=run.number,
-                    turn=run.turn,
+                    run_index=run.run_index,
                     time=run.time,
                     scene=self.scene,
                     values=run.input,
@@ -815,7 +815,7 @@ class Device:
     def _void_run(self) -> None:
         """Drop the running inspection: it gives no result (inferred)."""
         if self._processing:
-            self._run_change = RunChange()
+            self._run_faults = RunFaults()
         self._processing = False
         self._events.pop(_Event.INSPECTED, None)
         inspector, self._inspector = self._inspector, None

@@ -1,11 +1,11 @@
 """The open questions about real cameras, as options.
 
 Each field is one open question: its default is the emulator's choice, its description gives the
-reason and its grade. Grades: *published* in a manual of this product or a sibling, *inferred*,
+reason and its grade. Grades: *published* in a manual of this product or a related one, *inferred*,
 *recommended* (nothing is known; some choice had to be made).
 
 ``device.py`` and ``behaviour.py`` in this folder implement most of them; the link and the camera
-implement ``bad_frame`` and ``second_client``, ``protocols/_bvs.py`` :meth:`Quirks.of_the_wire`.
+implement ``bad_frame`` and ``second_client``, ``protocols/_bvs.py`` those of ``of_the_wire``.
 """
 
 from __future__ import annotations
@@ -96,14 +96,14 @@ class Quirks(EmulatorData):
         default=30.0,
         description=(
             "How long a reboot keeps the camera off the network: about 30 s (mvBlueGEMINI manual "
-            "p. 31, published for the sibling)."
+            "p. 31, published for a related camera)."
         ),
     )
     code: bool = Field(
         default=False,
         description=(
             "b16: answers begin with a result code, as those of BVS ID do. What BVS SC answers in "
-            "this dialect is unknown (off, the bodies of the 32-bit dialects narrowed: inferred)."
+            "this dialect is open (off: as in the 32-bit dialects, but 16-bit numbers; inferred)."
         ),
     )
     no_id: bool = Field(

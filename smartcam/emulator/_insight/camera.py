@@ -51,11 +51,11 @@ if TYPE_CHECKING:
     from smartcam.emulator._scenario.scenario import Scenario
     from smartcam.protocols import Protocol
 
-MAX_ORDERED = 1000
-"""Largest number of answers to future commands that may be set."""
+MAX_NEXT_CODES = 1000
+"""Largest number of codes that may wait to replace the answers of commands."""
 
 
-class _Ordered(NamedTuple):
+class _NextCode(NamedTuple):
     """An answer to a future command, which replaces the command's own."""
 
     code: int
@@ -78,7 +78,7 @@ class EmulatedInSight(LineCamera):
         image: the 8 bit grey image that the camera sees; default a pattern.
         evaluations: answers to ``EV``: expression to the text that is sent; others fail.
         info: lines of the answer to ``GI``, instead of the emulator's own.
-        quirks: unknown behaviour of real cameras: :class:`InSightQuirks` or a mapping.
+        quirks: choices where real cameras are unknown: :class:`InSightQuirks` or a mapping.
         options: options of :class:`~smartcam.emulator.LineCamera`.
 
     Attributes:
@@ -135,12 +135,12 @@ class EmulatedInSight(LineCamera):
             info=info,
             quirks=validated(InSightQuirks, {} if quirks is None else quirks, "quirks"),
         )
-        self._ordered: deque[_Ordered] = deque()
+        self._next_codes: deque[_NextCode] = deque()
         self._commands_received: Tally[str] = Tally()
         self._clock_offset = 0  # clock minus device's time, nanoseconds; the latter may stand still
         self._was_online = online
         super().__init__(**options)
-        self.device.around = self.step
+        self.device.action_context = self.step
 
     @classmethod
     def from_scenario(cls, plan: Scenario, **given: Any) -> Self:
@@ -159,7 +159,7 @@ class EmulatedInSight(LineCamera):
             next(iter(INSIGHT.dialects)),
             ROWS,
             line_end=words.LINE_END,
-            ends=words.COMMAND_ENDS,
+            client_line_end=words.COMMAND_ENDS,
             max_line=words.MAX_LINE_BYTES,
             encoding=words.ENCODING,
         )
@@ -233,7 +233,7 @@ class EmulatedInSight(LineCamera):
     # ------------------------------------------------------------------ the operator
 
     def set_online(self, online: bool) -> None:
-        """Go online, or hold the camera offline, as by hand or an input; ``SO1`` then gets -5."""
+        """Switch the camera online, or hold it offline, as an operator; then ``SO1`` gets -5."""
         self.device.set_online(check_flag(online, "online", "emulator"))
 
     def set_image(self, image: NDArray[np.uint8]) -> None:
@@ -264,7 +264,6 @@ class EmulatedInSight(LineCamera):
 
         The codes of several calls are used in the order of the calls.
 
-
         Args:
             code: the code.
             command: the two letters of the command; default the next command of any kind.
@@ -275,9 +274,9 @@ class EmulatedInSight(LineCamera):
         code = check_integer(code, "code", -(1 << 31), (1 << 31) - 1, "emulator")
         if command is not None:
             command = check_text(command, "command", "emulator", least=1, most=100)
-        if len(self._ordered) >= MAX_ORDERED:
-            raise ConfigurationError(f"{MAX_ORDERED} answers are ordered already")
-        self._ordered.append(_Ordered(code, None if command is None else command.upper()))
+        if len(self._next_codes) >= MAX_NEXT_CODES:
+            raise ConfigurationError(f"{MAX_NEXT_CODES} codes wait already")
+        self._next_codes.append(_NextCode(code, None if command is None else command.upper()))
 
     def drop_connections(self) -> None:
         """End every connection at once, like a broken network. Running events continue."""
@@ -364,7 +363,7 @@ class EmulatedInSight(LineCamera):
     def execute(self, client: TelnetClient, line: str) -> None:
         """Carry out a line of a logged-in client."""
         mnemonic = line[:2].upper()
-        code = self._take_ordered(mnemonic)
+        code = self._take_next_code(mnemonic)
         if code is not None:
             client.respond(str(code).encode("ascii") + words.LINE_END)
         else:
@@ -373,11 +372,11 @@ class EmulatedInSight(LineCamera):
 
     # ------------------------------------------------------------------ inside
 
-    def _take_ordered(self, mnemonic: str) -> int | None:
-        for index, ordered in enumerate(self._ordered):
-            if ordered.command in {None, mnemonic}:
-                del self._ordered[index]
-                return ordered.code
+    def _take_next_code(self, mnemonic: str) -> int | None:
+        for index, answer in enumerate(self._next_codes):
+            if answer.command in {None, mnemonic}:
+                del self._next_codes[index]
+                return answer.code
         return None
 
     def _clients_by_number(self) -> list[TelnetClient]:

@@ -126,19 +126,19 @@ class InSightCommands:
             is_sized = code == StatusCode.DONE and self.quirks.event_answer == "sized"
             respond(_sized_answer("") if is_sized else _code_answer(code))
 
-        self._request_event(argument, report_code, at_image=True)
+        self._request_event(argument, report_code, after_image=True)
 
     def _set_event_and_wait(self, argument: str, respond: Respond) -> None:
-        self._request_event(argument, lambda code: respond(_code_answer(code)), at_image=False)
+        self._request_event(argument, lambda code: respond(_code_answer(code)), after_image=False)
 
     def _request_event(
-        self, argument: str, report_code: Callable[[StatusCode], None], *, at_image: bool
+        self, argument: str, report_code: Callable[[StatusCode], None], *, after_image: bool
     ) -> None:
         event = _parse_integer(argument)
         if event is None or not 0 <= event <= words.TRIGGER_EVENT:
             report_code(StatusCode.INVALID_ARGUMENT)
         else:
-            self._device.request_event(event, report_code, at_image=at_image)
+            self._device.request_event(event, report_code, after_image=after_image)
 
     # ------------------------------------------------------------------ jobs
 
@@ -181,8 +181,8 @@ class InSightCommands:
     def _key_of_name(self, name: str) -> str | None:
         """Return the key of a cell with a name, None if there is no such cell.
 
-        Only names have keys in lower case, so a position such as ``A1``, which needs three digits,
-        is not found.
+        The keys of names are in lower case, those of positions are not (``A001``), so a position is
+        never found here.
         """
         key, job = name.lower(), self._device.job
         return key if job is not None and key in job.sources else None
@@ -209,7 +209,7 @@ class InSightCommands:
 
         def on_written(future: asyncio.Future[CodedImage | None]) -> None:
             if not future.cancelled():
-                with device.around():
+                with device.action_context():
                     self._send_image(future.result(), respond)
 
         writing_future.add_done_callback(on_written)

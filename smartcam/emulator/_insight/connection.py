@@ -32,7 +32,7 @@ def _read_code(line: str) -> int:
 
 
 def _read_value(line: str) -> int:
-    """Return the number after the status code, or the number that means no job."""
+    """Return the number after the status code, or UNNAMED_APPLICATION without one."""
     code, _, value = line.partition("\r\n")
     return int(value) if int(code) == words.StatusCode.DONE else m.UNNAMED_APPLICATION
 
@@ -64,7 +64,7 @@ ROWS = (
     LineRow(m.Trigger, "SW8", m.TriggerAnswer, lambda line: m.TriggerAnswer(code=_read_code(line))),
     LineRow(m.ReadImage, "RI", m.Image, lambda line: m.Image(code=_read_code(line), data=b"")),
 )
-"""The commands that are requests of the library; faults name them by these requests."""
+"""The commands that are requests of the library; a fault's ``on`` is the name of the request."""
 
 
 class _LoginState(enum.Enum):

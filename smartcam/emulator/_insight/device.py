@@ -86,7 +86,7 @@ class InSightDevice:
         # active job; None for one that was never saved
         self.job: Job | None = next(iter(self.jobs.values()), None)
         # context around an operator's actions; the emulator sets one that sends messages at its end
-        self.around: Callable[[], AbstractContextManager[object]] = nullcontext
+        self.action_context: Callable[[], AbstractContextManager[object]] = nullcontext
         # function that returns the image of the last run, if an inspector takes the pictures
         self.get_last_image: Callable[[], Any] | None = None
         self.runs: int = 0  # number of acquisitions with a result since the device was created
@@ -188,7 +188,7 @@ class InSightDevice:
 
     def set_online(self, online: bool) -> None:
         """Go online, or hold the camera offline, as by hand or an input: then ``SO1`` fails."""
-        with self.around():
+        with self.action_context():
             self._set_online_state(wanted=self._wanted_online or online, allowed=online)
 
     def start(self) -> None:
@@ -201,8 +201,8 @@ class InSightDevice:
 
     def trigger(self) -> bool:
         """Trigger by the input; return False if the camera does not accept that, as for ``SE8``."""
-        with self.around():
-            return self._begin_run(TRIGGER_EVENT, None, at_image=False)
+        with self.action_context():
+            return self._begin_run(TRIGGER_EVENT, None, after_image=False)
 
     def load(self, job: str | int) -> None:
         """Load a job by hand, at once and in either mode; a running run ends without a result.
@@ -213,7 +213,7 @@ class InSightDevice:
         next_job = self.find(job)
         if self._loading:
             raise ConfigurationError(f"job {job!r}: another one is being loaded")
-        with self.around():
+        with self.action_context():
             self._abort_run()
             self.job = next_job
             self._reset_job()
@@ -223,7 +223,7 @@ class InSightDevice:
 
         Without pictures the running run fails, and so does every trigger.
         """
-        with self.around():
+        with self.action_context():
             self._has_no_pictures = blind
             if blind:
                 self._abort_run()
@@ -239,7 +239,7 @@ class InSightDevice:
         """
         if self._loading:
             return False
-        with self.around():
+        with self.action_context():
             self.load(application)
             self.set_online(running)
         return True
@@ -273,13 +273,13 @@ class InSightDevice:
 
         self.after(next_job.load_time, on_loaded)
 
-    def request_event(self, event: int, on_code: OnCode, *, at_image: bool) -> None:
+    def request_event(self, event: int, on_code: OnCode, *, after_image: bool) -> None:
         """Cause an event, 0 to 8, for a client; ``on_code`` gets the code.
 
         It gets the code after the image was taken (``SE``), or after the cells were computed
         (``SW``).
         """
-        if not self._begin_run(event, on_code, at_image=at_image):
+        if not self._begin_run(event, on_code, after_image=after_image):
             on_code(StatusCode.FAILED)
 
     def request_value(self, key: str, kind: str, value: CellValue) -> StatusCode:
@@ -311,7 +311,7 @@ class InSightDevice:
         else:
             self._abort_run()
 
-    def _begin_run(self, event: int, on_code: OnCode | None, *, at_image: bool) -> bool:
+    def _begin_run(self, event: int, on_code: OnCode | None, *, after_image: bool) -> bool:
         job = _UNSAVED if self.job is None else self.job
         acquires = event == TRIGGER_EVENT
         if (
@@ -322,13 +322,13 @@ class InSightDevice:
             return False
         run = self._running_event = _PendingEvent(on_code)
         if acquires and isinstance(job, InspectedJob):
-            self._inspect(job, run, at_image=at_image)
+            self._inspect(job, run, after_image=after_image)
             return True
 
         def on_image() -> None:
             if run.is_finished:
                 return
-            if at_image:
+            if after_image:
                 run.report(StatusCode.DONE)
             self.after(job.processing_time, on_done)
 
@@ -343,16 +343,16 @@ class InSightDevice:
         self.after(job.acquisition_time if acquires else 0.0, on_image)
         return True
 
-    def _inspect(self, job: InspectedJob, run: _PendingEvent, *, at_image: bool) -> None:
+    def _inspect(self, job: InspectedJob, run: _PendingEvent, *, after_image: bool) -> None:
         """Start the inspection of a picture for a run."""
 
         def on_image() -> None:
-            with self.around():
-                if at_image and not run.is_finished:
+            with self.action_context():
+                if after_image and not run.is_finished:
                     run.report(StatusCode.DONE)
 
         def on_done(values: Values | None) -> None:
-            with self.around():
+            with self.action_context():
                 if run.is_finished:
                     return
                 self._running_event = self._inspector = None
@@ -395,7 +395,7 @@ class InSightDevice:
                 self.busy or self._has_no_pictures
             ):  # skip the run if the last one still runs
                 run = self._running_event = _PendingEvent(None)
-                self._inspect(job, run, at_image=False)
+                self._inspect(job, run, after_image=False)
             self.after(period, run_once)
 
         self.after(period, run_once)

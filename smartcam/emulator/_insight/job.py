@@ -249,7 +249,7 @@ def cell_key(name: str) -> str:
     """Return the key of a cell or of a cell's name: ``A012``, or the name in lower case.
 
     Raises:
-        ConfigurationError: the text is neither; a ValueError, so it counts for pydantic.
+        ConfigurationError: the text is neither. It is a ValueError, as pydantic expects.
     """
     try:
         return words.parse_cell(name).wire

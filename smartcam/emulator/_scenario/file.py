@@ -59,8 +59,8 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
         for index, scenario in enumerate(cameras_of(file)):
             problem = scenario.mistake()
             if problem is not None:
-                place, text = problem
-                return file.place_in_file(index, place), text
+                path, text = problem
+                return file.path_in_file(index, path), text
         return None
 
     return cameras_of(read_model(path, "scenario", ScenarioFile, "applications", mistake))

@@ -64,6 +64,6 @@ def make_plan(
     plan = base.model_copy(update=changes)
     mistake = plan.mistake()
     if mistake is not None:
-        place, text = mistake
-        raise ConfigurationError(f"emulator: {'.'.join(str(part) for part in place)}: {text}")
+        path, text = mistake
+        raise ConfigurationError(f"emulator: {'.'.join(str(key) for key in path)}: {text}")
     return plan

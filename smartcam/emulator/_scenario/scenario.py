@@ -24,7 +24,7 @@ MAX_CUES = 1000
 T = TypeVar("T")
 
 Mistake: TypeAlias = tuple[tuple[str | int, ...], str]
-"""The place of a mistake in a scenario, and its reason."""
+"""The path of the field with a mistake in a scenario, and the reason."""
 
 
 class Scenario(EmulatorData):
@@ -36,7 +36,7 @@ class Scenario(EmulatorData):
     )
     dialect: str = Field(
         default=HANDBOOK.name,
-        description="name of the wire dialect; default handbook, of another protocol its first",
+        description="name of the wire dialect; default handbook for bvs, else the first one",
     )
     transport: Literal["tcp", "udp"] = Field(default="tcp", description="tcp or udp")
     port: int = Field(default=0, ge=0, le=65_535, description="port; 0 takes a free one")
@@ -101,7 +101,7 @@ class Scenario(EmulatorData):
         return any(cue.is_random for cue in self.timeline)
 
     def mistake(self) -> Mistake | None:
-        """Return the place of something that the camera cannot do, and the reason; or None."""
+        """Return the path of a field that the camera cannot do, and the reason; or None."""
         from smartcam.emulator._makes import emulated_class  # that module imports this one
 
         try:
@@ -170,19 +170,19 @@ class ScenarioFile(Scenario):
         }
         return Scenario(**merged)
 
-    def place_in_file(self, index: int, place: tuple[str | int, ...]) -> tuple[str | int, ...]:
-        """Return the place in the file of a place in one camera."""
+    def path_in_file(self, index: int, path: tuple[str | int, ...]) -> tuple[str | int, ...]:
+        """Return a field's path in the file; ``path``: its path in the camera ``index``."""
         if not self.cameras:
-            return place
+            return path
         camera = self.cameras[index]
-        name, *inner = place
+        name, *inner = path
         if name == "timeline" and isinstance(inner[0], int):
             own_index = inner[0] - len(self.timeline)
-            return place if own_index < 0 else ("cameras", index, name, own_index, *inner[1:])
+            return path if own_index < 0 else ("cameras", index, name, own_index, *inner[1:])
         if name == "applications" and isinstance(inner[0], int):
             own_index = inner[0] - len(camera.applications)
-            return ("cameras", index, *place) if own_index < 0 else (name, own_index, *inner[1:])
-        return ("cameras", index, *place) if name in camera.model_fields_set else place
+            return ("cameras", index, *path) if own_index < 0 else (name, own_index, *inner[1:])
+        return ("cameras", index, *path) if name in camera.model_fields_set else path
 
 
 def _first_duplicate(values: Iterable[T]) -> T | None:

@@ -43,6 +43,6 @@ _BITS: Mapping[int, DeviceState] = {
 """Bits of the status word that are states."""
 
 
-def risen_states(bits: int) -> list[DeviceState]:
-    """Return the states of the bits of a status word that have just been set."""
-    return [state for bit, state in _BITS.items() if bits & bit]
+def risen_states(new_bits: int) -> list[DeviceState]:
+    """Return the states of the bits of a status word that were not set before."""
+    return [state for bit, state in _BITS.items() if new_bits & bit]

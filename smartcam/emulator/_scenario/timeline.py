@@ -100,7 +100,7 @@ class Cue(EmulatorData):
         default=1,
         ge=1,
         le=1_000_000,
-        description="the first time it applies to; with `entering` and `command`",
+        description="number of the first occurrence it is for; with `entering` and `command`",
     )
     times: int | None = Field(
         default=None,
@@ -111,7 +111,7 @@ class Cue(EmulatorData):
         ),
     )
     after: _Seconds = Field(default=0.0, description="seconds later")
-    spread: _Seconds = Field(default=0.0, description="most seconds later by chance, all as likely")
+    spread: _Seconds = Field(default=0.0, description="largest random additional delay, uniform, s")
     chance: float = Field(
         default=1.0, gt=0, le=1, description="probability that it happens, each time"
     )

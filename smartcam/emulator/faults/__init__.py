@@ -11,8 +11,8 @@ change the count, and inserted or duplicated messages are not counted. The fault
 ``nth`` message and to those directly after it, ``times`` in all. If several faults apply to one
 message, they act in the order in which they were given, each on the result of the one before.
 
-*Wire faults* change the messages on the wire. Those on messages of the camera count its messages
-to a client, those on messages of a client count whole frames of any client, before the camera
+*Wire faults* change the messages on the wire. A fault on messages of the camera counts its messages
+to one client, a fault on messages of a client counts whole frames of all clients, before the camera
 receives them. *Device faults* are events of the camera. They count the messages that its device
 handles: a Connect, and the messages of the session.
 
@@ -212,8 +212,8 @@ class Duplicate(WireFault):
 class Insert(CameraWireFault):
     """A message or bytes that the camera did not send: exactly one of ``message`` and ``data``.
 
-    Later faults in the list do not change an insertion before or after the message; an insertion
-    instead of the message counts as the message.
+    Later faults in the list do not change what was inserted, unless it is inserted instead of the
+    message.
     """
 
     kind: Literal["insert"] = "insert"
@@ -318,14 +318,14 @@ class Reset(EndingFault):
 
 
 class Close(EndingFault):
-    """The connection ends in order (FIN). On UDP the camera forgets the session silently."""
+    """The connection is closed normally (FIN). On UDP the camera forgets the session silently."""
 
     kind: Literal["close"] = "close"
 
 
 # ---------------------------------------------------------------------- of the device
 
-Place = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+SceneNumber = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
 
 
 class Refuse(DeviceFault):
@@ -451,20 +451,20 @@ class ChangeByteOrder(DeviceFault):
 
 
 class MovePart(DeviceFault):
-    """A part of the scene moves; a new name adds a part."""
+    """A workpiece of the scene moves; a new name adds one."""
 
     kind: Literal["move_part"] = "move_part"
-    part: str = Field(min_length=1, max_length=200, description="Name of the part.")
-    x: Place = Field(description="To the right, m.")
-    y: Place = Field(description="Away from the table's front, m.")
-    theta: Place = Field(default=0.0, description="Counter-clockwise, rad.")
+    part: str = Field(min_length=1, max_length=200, description="Name of the workpiece.")
+    x: SceneNumber = Field(description="To the right, m.")
+    y: SceneNumber = Field(description="Away from the table's front, m.")
+    theta: SceneNumber = Field(default=0.0, description="Counter-clockwise, rad.")
 
 
 class RemovePart(DeviceFault):
-    """A part is removed from the scene."""
+    """A workpiece is removed from the scene."""
 
     kind: Literal["remove_part"] = "remove_part"
-    part: str = Field(min_length=1, max_length=200, description="Name of the part.")
+    part: str = Field(min_length=1, max_length=200, description="Name of the workpiece.")
 
 
 class ClearFaults(DeviceFault):

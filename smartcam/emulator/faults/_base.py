@@ -33,9 +33,9 @@ _SENDERS = {sender.value: sender for sender in m.Sender}
 
 
 def message_name(value: object) -> object:
-    """Return the name of a message class; anything else unchanged."""
+    """Return the name of a message class; anything else unchanged, but no bool."""
     if isinstance(value, bool):
-        raise ValueError("a message's name or id")  # noqa: TRY004  pydantic wants a ValueError
+        raise ValueError("expected a message's name or id")  # noqa: TRY004  pydantic wants a ValueError
     return value.__name__ if isinstance(value, type) else value
 
 
@@ -155,7 +155,7 @@ class BaseFault(EmulatorData):
             raise ValueError(f"{cls.__name__} cannot act on messages of the {sender.value}")
 
     @property
-    def speaker(self) -> m.Sender | None:
+    def awaited_sender(self) -> m.Sender | None:
         """Sender of the message that the fault waits for, None if it acts at once."""
         if isinstance(self.on, str):
             return MESSAGE_NAMES[self.on].sender
@@ -187,7 +187,7 @@ class EndingFault(WireFault):
     when: Literal["before", "after"] = Field(
         default="before",
         description=(
-            "`before`: in place of the message, which does not pass. `after`: right after it; a "
+            "`before`: instead of the message, which is not delivered. `after`: right after it; a "
             "message of the client is then received, and the camera's first answer is sent."
         ),
     )

@@ -38,12 +38,12 @@ class Transmission:
     )  # seconds before each part but the first
     delay: float = 0.0  # seconds before the first part
     overtaken: bool = False  # whether later parts may pass this one while it waits
-    # number of later parts to wait for, and the longest wait in seconds
+    # number of later transmissions that this one waits for, and the longest wait in seconds
     gather: tuple[int, float] | None = None
-    # without an order: whether it is sent after the parts that it waits for, not with them
+    # only on UDP: whether it is sent after them, not in one datagram with them
     after_gathered: bool = False
     end: Ending | None = None  # event of the connection after it
-    faults: list[str] = field(
+    effects: list[str] = field(
         default_factory=list[str]
     )  # kinds, or names of rules, that acted on it
 
@@ -61,22 +61,22 @@ T = TypeVar("T", bound=Transmission)
 
 
 class _WaitingTransmission(Generic[T]):
-    """A waiting transmission; ``missing_count``: number of later parts for which it still waits."""
+    """A waiting transmission; ``missing_count``: number of later ones for which it still waits."""
 
     __slots__ = (
-        *("due_at", "gather_until", "gathered", "missing_count", "pause_is_due", "sent"),
+        *("due_at", "gather_until", "gathered", "missing_count", "pause_is_due", "transmission"),
         "turns_left",
     )
 
-    def __init__(self, sent: T, now: int) -> None:
-        self.sent = sent
+    def __init__(self, transmission: T, now: int) -> None:
+        self.transmission = transmission
         self.due_at = now + nanoseconds(
-            sent.delay
+            transmission.delay
         )  # instant when its next part may pass, nanoseconds
-        self.missing_count, seconds = sent.gather or (0, 0.0)
+        self.missing_count, seconds = transmission.gather or (0, 0.0)
         # time until which it waits for later parts, nanoseconds
         self.gather_until = self.due_at + nanoseconds(seconds)
-        self.gathered: list[T] = []  # parts that it waited for, without an order
+        self.gathered: list[T] = []  # transmissions that go with it, in one datagram
         self.pause_is_due = False  # whether a part was sent, and its pause has not begun
         self.turns_left = 0  # turns of the timer before the next part is sent
 
@@ -87,7 +87,7 @@ class _WaitingTransmission(Generic[T]):
 
     def pause(self, now: int, turns: int) -> None:
         """Begin the pause before the next part."""
-        seconds = self.sent.pauses.pop(0)
+        seconds = self.transmission.pauses.pop(0)
         self.pause_is_due, self.due_at = False, now + nanoseconds(seconds)
         self.turns_left = 0 if seconds else turns
 
@@ -103,13 +103,13 @@ class DelayLine(Generic[T]):
     _: KW_ONLY
     # True (TCP): nothing passes a waiting transmission unless it may be overtaken, and all
     # transmissions of one time are carried together. False (UDP): each part is carried by itself
-    ordered: bool
+    keeps_order: bool
     wake: Callable[[], None]  # called when run() is due
     # gets due transmissions and the bytes of each, for one write; the function may stop() the line
     carry: Callable[[list[tuple[T, bytes]]], None]
     end: Callable[[Ending], None]  # ends the connection after a transmission
     on_dropped: Callable[[T], None]  # called with each transmission that was dropped by close()
-    turns: int = 0  # turns of the event loop that a pause of no time takes
+    turns: int = 0  # turns of the event loop for a pause of 0 seconds
 
     def __post_init__(self) -> None:
         self.size: int = 0  # bytes of all waiting transmissions
@@ -122,18 +122,18 @@ class DelayLine(Generic[T]):
     def __len__(self) -> int:
         return len(self._queue) + len(self._unordered)
 
-    def put(self, sent: Iterable[T], amount: int = 1) -> None:
+    def put(self, transmissions: Iterable[T], amount: int = 1) -> None:
         """Add the transmissions of a message; call :meth:`run` next.
 
-        For transmissions that wait for a number of later ones, they count as ``amount``.
+        Together they count as ``amount`` later ones for the transmissions that wait already.
         """
         now = self._now
         gatherer = self._count_new(amount, now)
-        for transmission in sent:
+        for transmission in transmissions:
             self.size += transmission.size
             if gatherer is not None and not transmission.delay:
                 gatherer.gathered.append(transmission)
-            elif self.ordered and not transmission.overtaken:
+            elif self.keeps_order and not transmission.overtaken:
                 self._queue.append(_WaitingTransmission(transmission, now))
             else:
                 self._unordered.append(_WaitingTransmission(transmission, now))
@@ -168,7 +168,7 @@ class DelayLine(Generic[T]):
         self._queue.clear()
         self._unordered.clear()
         for waiting in dropped:
-            for transmission in (waiting.sent, *waiting.gathered):
+            for transmission in (waiting.transmission, *waiting.gathered):
                 self.on_dropped(transmission)
 
     @property
@@ -180,23 +180,21 @@ class DelayLine(Generic[T]):
         waiting = [entry for entry in (*self._queue, *self._unordered) if entry.missing_count > 0]
         for entry in waiting:
             entry.missing_count -= amount
-            if entry.sent.after_gathered and entry.missing_count <= 0:
+            if entry.transmission.after_gathered and entry.missing_count <= 0:
                 entry.due_at = max(entry.due_at, now)
-        gatherers = [
-            entry for entry in waiting if not self.ordered and not entry.sent.after_gathered
-        ]
-        return gatherers[0] if gatherers else None
+        gatherers = (entry for entry in waiting if not entry.transmission.after_gathered)
+        return None if self.keeps_order else next(gatherers, None)
 
     def _send_unordered(self) -> None:
-        """Send due transmissions that have no order; queue due ones that others may overtake."""
+        """Send due datagrams; on TCP, queue the due transmissions that others could overtake."""
         now = self._now
         due_entries = [entry for entry in self._unordered if entry.send_at <= now]
         for entry in sorted(
-            due_entries, key=lambda entry: (entry.send_at, entry.sent.after_gathered)
+            due_entries, key=lambda entry: (entry.send_at, entry.transmission.after_gathered)
         ):
             if entry not in self._unordered:  # closed meanwhile
                 return
-            if self.ordered:
+            if self.keeps_order:
                 self._unordered.remove(entry)
                 self._queue.append(entry)
             else:
@@ -204,22 +202,22 @@ class DelayLine(Generic[T]):
 
     def _send_datagrams(self, entry: _WaitingTransmission[T]) -> None:
         """Send the due parts, one datagram each; joined parts are one datagram."""
-        sent = entry.sent
-        if sent.gather is not None and not sent.after_gathered:
+        transmission = entry.transmission
+        if transmission.gather is not None and not transmission.after_gathered:
             self._unordered.remove(entry)
-            gatherers = [sent, *entry.gathered]
-            self._carry_batch([self._take_next(each, whole=True) for each in gatherers])
-            for each in gatherers:
+            joined = [transmission, *entry.gathered]
+            self._carry_batch([self._take_next(each, whole=True) for each in joined])
+            for each in joined:
                 self._finish(each)
             return
         entry.missing_count = 0
         while entry in self._unordered and entry.due_at <= self._now:
-            self._carry_batch([self._take_next(sent)])
-            if sent.parts:
+            self._carry_batch([self._take_next(transmission)])
+            if transmission.parts:
                 entry.pause(self._now, 0)
             elif entry in self._unordered:
                 self._unordered.remove(entry)
-                self._finish(sent)
+                self._finish(transmission)
 
     def _send_queued(self) -> None:
         batch: list[tuple[T, bytes]] = []
@@ -230,27 +228,27 @@ class DelayLine(Generic[T]):
             if oldest.turns_left or oldest.due_at > self._now:
                 break
             oldest.missing_count = 0
-            sent = oldest.sent
-            batch.append(self._take_next(sent))
-            if sent.parts:
+            transmission = oldest.transmission
+            batch.append(self._take_next(transmission))
+            if transmission.parts:
                 oldest.pause_is_due = True
                 batch = self._carry_batch(batch)
                 continue
             self._queue.popleft()
-            if sent.end is not None:
+            if transmission.end is not None:
                 batch = self._carry_batch(batch)
                 if self.stopped:  # bytes before the end were not sent yet
                     self._queue.appendleft(oldest)
                 else:
-                    self._finish(sent)
+                    self._finish(transmission)
         self._carry_batch(batch)
 
-    def _take_next(self, sent: T, *, whole: bool = False) -> tuple[T, bytes]:
-        data = sent.take()
-        while whole and sent.parts:
-            data += sent.take()
+    def _take_next(self, transmission: T, *, whole: bool = False) -> tuple[T, bytes]:
+        data = transmission.take()
+        while whole and transmission.parts:
+            data += transmission.take()
         self.size -= len(data)
-        return sent, data
+        return transmission, data
 
     def _carry_batch(self, batch: list[tuple[T, bytes]]) -> list[tuple[T, bytes]]:
         """Carry a batch and return an empty one."""
@@ -258,9 +256,9 @@ class DelayLine(Generic[T]):
             self.carry(batch)
         return []
 
-    def _finish(self, sent: T) -> None:
-        if sent.end is not None:
-            self.end(sent.end)
+    def _finish(self, transmission: T) -> None:
+        if transmission.end is not None:
+            self.end(transmission.end)
 
     def _set_timer(self) -> None:
         """Set the timer for the next transmission."""

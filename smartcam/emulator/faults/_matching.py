@@ -38,7 +38,7 @@ _log = logging.getLogger("smartcam.emulator")
 
 
 @dataclass(slots=True, eq=False)
-class Row:
+class WaitingFault:
     """A fault that waits for messages, and how many it has seen."""
 
     fault: Fault
@@ -68,19 +68,19 @@ class FaultQueue:
     _supported_kinds: frozenset[str] = frozenset(FAULTS)  # kinds of faults that the camera can do
 
     def __post_init__(self) -> None:
-        self.wire_on_camera: list[Row] = []  # wire faults on messages of the camera
-        self.wire_on_client: list[Row] = []  # wire faults on messages of a client
-        self.device_on_camera: list[Row] = []  # device faults on messages of the camera
-        self.device_on_client: list[Row] = []  # device faults on messages of a client
+        self.camera_wire_faults: list[WaitingFault] = []
+        self.client_wire_faults: list[WaitingFault] = []
+        self.camera_device_faults: list[WaitingFault] = []
+        self.client_device_faults: list[WaitingFault] = []
         # the last faults that have happened, oldest first
         self.fired: deque[FiredFault] = deque(maxlen=MAX_FIRED)
-        self._at_once: list[Row] = []
-        self._all: list[Row] = []
+        self._at_once: list[WaitingFault] = []
+        self._all: list[WaitingFault] = []
 
     @property
     def waiting(self) -> list[Fault]:
         """The faults that wait, in the order in which they were given."""
-        return [row.fault for row in self._all]
+        return [each.fault for each in self._all]
 
     def add(self, given: Iterable[BaseFault | Mapping[str, Any]]) -> None:
         """Add faults after the waiting ones.
@@ -94,46 +94,48 @@ class FaultQueue:
         if len(self._all) + len(faults) > MAX_FAULTS:
             raise ConfigurationError(f"at most {MAX_FAULTS} faults can wait at one time")
         for fault in faults:
-            row = Row(fault, fault.times)
-            self._all.append(row)
-            self._list_of(fault).append(row)
+            waiting_fault = WaitingFault(fault, fault.times)
+            self._all.append(waiting_fault)
+            self._list_of(fault).append(waiting_fault)
 
-    def by_frame(self, rows: list[Row], frame: Frame) -> list[Fault]:
-        """Return the faults among ``rows`` that a client's frame triggers, in order."""
-        if not rows:
+    def by_frame(self, candidates: list[WaitingFault], frame: Frame) -> list[Fault]:
+        """Return the faults among ``candidates`` that a client's frame triggers, in order."""
+        if not candidates:
             return []
         try:
             message = self._dialect.decode(m.Sender.CLIENT, frame)
         except MessageError:
             message = m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
         name = self._dialect.message_type(m.Sender.CLIENT, frame.message_id).__name__
-        return self._fire_matching(rows, name, frame.message_id, message)
+        return self._fire_matching(candidates, name, frame.message_id, message)
 
-    def by_message(self, rows: list[Row], message: m.Message) -> list[Fault]:
-        """Return the faults among ``rows`` that a message triggers, as :meth:`by_frame`."""
+    def by_message(self, candidates: list[WaitingFault], message: m.Message) -> list[Fault]:
+        """Return the faults among ``candidates`` that a message triggers, as :meth:`by_frame`."""
         number = self._dialect.message_id(message)
-        unnamed = isinstance(message, m.UnknownMessage)  # a refusal that is only a code
-        kind = type(message) if unnamed else self._dialect.message_type(message.sender, number)
-        return self._fire_matching(rows, kind.__name__, number, message)
+        is_unknown = isinstance(message, m.UnknownMessage)  # the camera refuses with the id alone
+        kind = type(message) if is_unknown else self._dialect.message_type(message.sender, number)
+        return self._fire_matching(candidates, kind.__name__, number, message)
 
     def at_once(self) -> list[Fault]:
         """Remove and return the faults that wait for no message, in order."""
-        rows = list(self._at_once)
-        self._forget(rows)
-        return self._record([row.fault for row in rows], None)
+        candidates = list(self._at_once)
+        self._forget(candidates)
+        return self._record([each.fault for each in candidates], None)
 
     def clear(self) -> None:
         """Forget all waiting faults."""
         self._forget(list(self._all))
 
     def _fire_matching(
-        self, rows: list[Row], name: str, message_id: int, message: m.Message
+        self, candidates: list[WaitingFault], name: str, message_id: int, message: m.Message
     ) -> list[Fault]:
-        fired_rows = [
-            row for row in rows if row.fault.fits(name, message_id) and row.count_message()
+        fired = [
+            each
+            for each in candidates
+            if each.fault.fits(name, message_id) and each.count_message()
         ]
-        self._forget([row for row in fired_rows if row.times_left == 0])
-        return self._record([row.fault for row in fired_rows], message)
+        self._forget([each for each in fired if each.times_left == 0])
+        return self._record([each.fault for each in fired], message)
 
     def _record(self, faults: list[Fault], message: m.Message | None) -> list[Fault]:
         for fault in faults:
@@ -141,18 +143,18 @@ class FaultQueue:
             self.fired.append(FiredFault(self._clock.now, fault, message))
         return faults
 
-    def _forget(self, rows: list[Row]) -> None:
-        for row in rows:
-            self._list_of(row.fault).remove(row)
-            self._all.remove(row)
+    def _forget(self, candidates: list[WaitingFault]) -> None:
+        for each in candidates:
+            self._list_of(each.fault).remove(each)
+            self._all.remove(each)
 
-    def _list_of(self, fault: Fault) -> list[Row]:
-        speaker = fault.speaker
-        if speaker is None:
+    def _list_of(self, fault: Fault) -> list[WaitingFault]:
+        sender = fault.awaited_sender
+        if sender is None:
             return self._at_once
         if isinstance(fault, WireFault):
-            return self.wire_on_camera if speaker is m.Sender.CAMERA else self.wire_on_client
-        return self.device_on_camera if speaker is m.Sender.CAMERA else self.device_on_client
+            return self.camera_wire_faults if sender is m.Sender.CAMERA else self.client_wire_faults
+        return self.camera_device_faults if sender is m.Sender.CAMERA else self.client_device_faults
 
     def _check(self, number: int, fault: Fault) -> None:
         """Refuse a fault that this camera does not support."""

@@ -126,7 +126,7 @@ class WireMessage(Transmission):
             self,
             parts=list(self.parts),
             pauses=list(self.pauses),
-            faults=list(self.faults),
+            effects=list(self.effects),
             passed_bytes=bytearray(),
         )
 
@@ -196,7 +196,7 @@ def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: WireCodec) -> _Sent:
     for message in sent:
         result.append(message)
         if message.changeable:
-            message.faults.append(fault.kind)
+            message.effects.append(fault.kind)
             result += [message.copy() for _ in range(fault.copies)]
     return result
 
@@ -207,13 +207,13 @@ def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
         return sent
     inserted = fault.inserted
     data = dialect.encode(inserted) if inserted is not None else fault.data or b""
-    insertion = cut_datagram(data, dialect)
-    insertion.faults.append(fault.kind)
+    insertion = parse_one(data, dialect)
+    insertion.effects.append(fault.kind)
     insertion.changeable = fault.where == "instead"
     if insertion.changeable:
         for index in indices:
             sent[index].drop()
-            sent[index].faults.append(fault.kind)
+            sent[index].effects.append(fault.kind)
     insert_at = indices[0] if fault.where == "before" else indices[-1] + 1
     return [*sent[:insert_at], insertion, *sent[insert_at:]]
 
@@ -224,7 +224,7 @@ def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: WireCodec)
         for message in sent:
             if message.changeable:
                 message.drop()
-                message.faults.append(fault.kind)
+                message.effects.append(fault.kind)
     sent[-1].end = sent[-1].end or Ending(fault.kind, fault.kind, seconds)
     return sent
 
@@ -249,12 +249,12 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireC
             continue
         for sent_message in sent:
             if sent_message.changeable:
-                sent_message.faults.append(fault.kind)
+                sent_message.effects.append(fault.kind)
                 _CHANGES[type(fault)](fault, sent_message)
     return sent
 
 
-def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage]:
+def parse(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage]:
     """Return the messages that are complete with these bytes: frames, and bytes between them.
 
     The framer keeps the bytes of an unfinished frame.
@@ -274,8 +274,8 @@ def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage
         messages.append(WireMessage.of(frame, dialect.encode_frame(frame)))
 
 
-def cut_datagram(data: bytes, dialect: WireCodec) -> WireMessage:
-    """Return a datagram as a message, with its frame if it is exactly one."""
-    messages = cut(data, dialect.framer(len(data)), dialect)
+def parse_one(data: bytes, dialect: WireCodec) -> WireMessage:
+    """Return a datagram as a message, with its frame if the bytes are exactly one frame."""
+    messages = parse(data, dialect.framer(len(data)), dialect)
     is_one_frame = [message.original for message in messages] == [data]
     return messages[0] if is_one_frame else WireMessage.of(data, data)

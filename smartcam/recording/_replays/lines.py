@@ -264,7 +264,7 @@ class ReplayedLines(LineCamera):
             return TicketedClient(self, link, server)
         return super().make_client(link, server)
 
-    def begun(self, client: LineClient, message: HeardLine) -> None:
+    def on_raw_line(self, client: LineClient, message: HeardLine) -> None:
         """Store the key of a client's line: the recorded answer with this key is sent to it."""
         if isinstance(client, TicketedClient):
             client.ticket = self.lines.request_key(message.data)
@@ -401,9 +401,9 @@ class ReplayedLines(LineCamera):
 
             self.after(piece.seconds / self._speed, say)
 
-    def lost(self, link: ClientLink) -> None:
+    def forget_link(self, link: ClientLink) -> None:
         """Remove a closed link; a second call does nothing."""
         client = self._clients.get(link)
         if client is not None:
             self._line_counts.pop(client, None)
-        super().lost(link)
+        super().forget_link(link)

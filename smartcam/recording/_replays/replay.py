@@ -149,7 +149,7 @@ class _PlayedApplication(Application):
         self,
         *,
         number: int,
-        turn: int,
+        run_index: int,
         time: float,
         scene: TableScene,
         values: Mapping[str, Any] | None = None,
@@ -297,12 +297,12 @@ class ReplayedCamera(EmulatedCamera):
             self._change_timer = None
         await super().stop()
 
-    def received(self, link: ClientLink, message: m.Message) -> None:
+    def handle_message(self, link: ClientLink, message: m.Message) -> None:
         """Handle a message; after a SetSequenceNumber, containers get the client's numbers."""
         if isinstance(message, m.SetSequenceNumber):
             for track in self._tracks.values():
                 track.sequence_field = self._sequence_field
-        super().received(link, message)
+        super().handle_message(link, message)
 
     # ------------------------------------------------------------------ after each step
 

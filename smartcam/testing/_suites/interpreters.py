@@ -201,7 +201,7 @@ class InterpreterSuite(ExplainedChecks):
         value = interpret(self.make(sample.layout), sample.data)
         text = json.dumps(jsonable(value), allow_nan=False)
         address = _ADDRESS.search(text)
-        assert address is None, f"JSON has no word for {address and address[0]!r} in {value!r}"
+        assert address is None, f"{value!r} has no JSON: it contains {address and address[0]!r}"
 
     def test_big_endian_gives_the_same_value(self, sample: ContainerSample) -> None:
         """Check both byte orders; the camera's status tells the order, in ``reader.context``."""
@@ -220,20 +220,20 @@ class InterpreterSuite(ExplainedChecks):
 
     # ------------------------------------------------------------------ bytes that do not fit
 
-    def test_cut_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
+    def test_cut_container_gives_value_or_error(self, sample: ContainerSample) -> None:
         """Check each length: it gives a value, or an InterpretationError with the expectation."""
         interpreter = self.make(sample.layout)
         for data in (b"", *_prefixes(sample.data)):
             check_outcome(interpreter, data)
 
-    def test_longer_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
+    def test_longer_container_gives_value_or_error(self, sample: ContainerSample) -> None:
         """Check that bytes after a container cause no other kind of error either."""
         interpreter = self.make(sample.layout)
         for more in TRAILING_BYTES:
             check_outcome(interpreter, sample.data + more)
             check_outcome(interpreter, sample.data + sample.data + more)
 
-    def test_any_bytes_are_a_value_or_told(self, sample: ContainerSample) -> None:
+    def test_any_bytes_give_value_or_error(self, sample: ContainerSample) -> None:
         """Check any bytes, since the user may have named the wrong interpreter."""
         from smartcam.testing._suites import strategies
 
@@ -257,7 +257,7 @@ class InterpreterSuite(ExplainedChecks):
                 for order in ("little", "big"):
                     check_outcome(interpreter, data, byte_order=order)
 
-    def test_any_context_is_borne(self, sample: ContainerSample) -> None:
+    def test_any_context_is_accepted(self, sample: ContainerSample) -> None:
         """Check unusual names, numbers and options of the client."""
         interpreter = self.make(sample.layout)
         for options in (
@@ -273,7 +273,7 @@ class InterpreterSuite(ExplainedChecks):
             for data in (sample.data, sample.data[:-1], b"\x01" * len(sample.data)):
                 check_outcome(interpreter, data, **options)
 
-    # ------------------------------------------------------------------ self-description
+    # ------------------------------------------------------------------ bursts, layouts, plug-ins
 
     def test_containers_of_a_burst_are_read_as_one_by_one(self, sample: ContainerSample) -> None:
         """Check that a PlainInterpreter's ``read_all`` and ``interpret`` do what ``read`` does."""
@@ -428,11 +428,11 @@ def _mutable_parts(value: object) -> list[object]:
         for part in _nested_values(value)
         if isinstance(part, kinds)
         or bool(getattr(getattr(part, "flags", None), "writeable", False))
-        or _is_open(part)
+        or _is_mutable_dataclass(part)
     ]
 
 
-def _is_open(value: object) -> bool:
+def _is_mutable_dataclass(value: object) -> bool:
     """Return True if a value is an object of a dataclass that is not frozen."""
     if not is_dataclass(value) or isinstance(value, type):
         return False

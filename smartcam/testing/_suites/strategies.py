@@ -1,4 +1,4 @@
-"""Hypothesis strategies for the suites: bytes, and places to cut them.
+"""Hypothesis strategies for the suites: bytes, and offsets to cut them at.
 
 Hypothesis refuses a method that several classes inherit as a test, so :func:`run_with_examples`
 defines one for each call. Hypothesis' profile sets the number of examples.
@@ -28,19 +28,19 @@ MAX_NOISE_BYTES = 200
 
 
 def run_with_examples(check: Callable[[DataObject], None]) -> None:
-    """Call a check with one drawing after the other; the smallest drawing that fails is shown.
+    """Call a check with one example after the other; the smallest one that fails is shown.
 
     Raises:
-        AssertionError: the check's error, with the drawing as a note.
+        AssertionError: the check's error, with the example as a note.
     """
     suppressed_checks = [HealthCheck.too_slow, HealthCheck.data_too_large]
 
     @settings(deadline=None, report_multiple_bugs=False, suppress_health_check=suppressed_checks)
     @given(data=st.data())
-    def drawn(data: DataObject) -> None:
+    def check_example(data: DataObject) -> None:
         check(data)
 
-    drawn()
+    check_example()
 
 
 def noise(samples: Sequence[bytes]) -> SearchStrategy[bytes]:
@@ -65,7 +65,7 @@ def _change_byte(data: bytes, offset: int, byte: int) -> bytes:
 
 
 def draw_pieces(data: DataObject, whole: bytes) -> list[bytes]:
-    """Draw places to cut bytes at, and return the pieces; none is empty."""
-    places = data.draw(st.lists(st.integers(0, len(whole)), max_size=8), label="cut at")
-    edges = sorted({0, *places, len(whole)})
+    """Draw offsets to cut bytes at, and return the pieces; none is empty."""
+    offsets = data.draw(st.lists(st.integers(0, len(whole)), max_size=8), label="cut at")
+    edges = sorted({0, *offsets, len(whole)})
     return [whole[begin:end] for begin, end in pairwise(edges)]

@@ -35,7 +35,7 @@ BOTH_STALL = Ending("half_open", Stall.name)
 class Edit(Transmission):
     """Bytes to send, or an action between them."""
 
-    at: int = 0  # place in the stream at which the rule named by ``faults`` acts
+    at: int = 0  # offset in the stream at which the rule named by ``faults`` acts
 
 
 def _pause_edit(seconds: float) -> Edit:
@@ -128,7 +128,7 @@ class Editor:
             self._ended = True
 
     def _note_rule(self, rule: PlacedRule) -> None:
-        self._edits.append(Edit([], faults=[rule.name], at=self.position))
+        self._edits.append(Edit([], effects=[rule.name], at=self.position))
 
     def _pass_piece(self, piece: bytes) -> None:
         drip_pause: float | None = None

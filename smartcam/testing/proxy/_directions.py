@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from smartcam.emulator._inside import DelayLine, Ending, RealClock
 from smartcam.testing.proxy._byte_edits import Edit, Editor
-from smartcam.testing.proxy._rules import MAX_HOLD_BYTES, DelayBytes, Direction, Rate
+from smartcam.testing.proxy._rules import MAX_RULE_BYTES, DelayBytes, Direction, Rate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 CHUNK = 1 << 16
 """Size of one read in bytes."""
 
-MAX_HELD_BYTES = 1 << 18
+MAX_QUEUED_BYTES = 1 << 18
 """Number of waiting bytes in one direction at which the proxy stops reading. One more chunk and
 inserted bytes may be added. The number exceeds the bytes that a rule may hold back."""
 
@@ -56,7 +56,7 @@ class Pipe:
         self._editor = Editor(rules)
         self._delay_line = DelayLine[Edit](
             RealClock(),
-            ordered=True,
+            keeps_order=True,
             turns=TURNS_BETWEEN_WRITES,
             wake=self.run,
             carry=self._carry,
@@ -139,10 +139,10 @@ class Pipe:
         for edit in edits:
             edit.delay = delay
             has_no_action = edit.end is None and edit.gather is None and not edit.pauses
-            self._delay_line.put([edit], edit.size if has_no_action else MAX_HOLD_BYTES)
+            self._delay_line.put([edit], edit.size if has_no_action else MAX_RULE_BYTES)
 
     def _update_reading(self) -> None:
-        should_read = not (self._eof or self._stopped or self.held_bytes >= MAX_HELD_BYTES)
+        should_read = not (self._eof or self._stopped or self.held_bytes >= MAX_QUEUED_BYTES)
         if should_read and not self._reading:
             self._loop.add_reader(self.source, self._receive)
         elif self._reading and not should_read:
@@ -153,8 +153,8 @@ class Pipe:
 
     def _carry(self, batch: list[tuple[Edit, bytes]]) -> None:
         for edit, data in batch:
-            while edit.faults:
-                self._connection.note(edit.faults.pop(0), self._direction, edit.at)
+            while edit.effects:
+                self._connection.note(edit.effects.pop(0), self._direction, edit.at)
             self._unsent += data
         if not self._write_out():
             self._delay_line.stop()
@@ -179,8 +179,8 @@ class Pipe:
     def _write(self, data: bytearray) -> int:
         """Write once and return the number of written bytes.
 
-        If it is 0, the socket is full, and :meth:`run` is called when it is writable, or the
-        connection is lost.
+        0: the socket is full, and :meth:`run` is called once it is writable; or the connection is
+        lost.
         """
         try:
             written = self.target.send(data)

@@ -17,7 +17,8 @@ class Entry(NamedTuple):
     Attributes:
         what: a rule's name in lower case, or ``connect``, ``eof`` (a side sends no more), ``lost``
             (a side reset the connection), ``no target``, ``too many``, ``not accepted``,
-            ``resume``, ``full`` and ``refused`` (a datagram that was not sent).
+            ``resume``, ``full`` (a datagram was dropped, since too many wait) and ``refused`` (a
+            datagram could not be sent).
         connection: number of the connection, from 1; 0 for an entry without one.
         direction: ``up`` or ``down``; empty for an entry about both.
         at: offset in the sender's stream, or number of the datagram; None for an action that the

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.testing.proxy._rules import Rule
 
 
-class Proxied(ABC):
+class ClientTraffic(ABC):
     """The traffic of one client with the target."""
 
     def __init__(self, relay: Relay[Any], number: int) -> None:
@@ -41,7 +41,7 @@ class Proxied(ABC):
         """End the traffic at once, on TCP with RST."""
 
 
-C = TypeVar("C", bound=Proxied)
+C = TypeVar("C", bound=ClientTraffic)
 
 
 class Relay(ABC, Generic[C]):
@@ -81,7 +81,7 @@ class Relay(ABC, Generic[C]):
             member.add_rules(rules)
 
     def cut(self, connection: int | None) -> None:
-        """End one connection, or all, in order."""
+        """End one connection, or all, after the bytes that have passed."""
         for member in self.select_clients(connection):
             member.cut()
 
@@ -91,7 +91,7 @@ class Relay(ABC, Generic[C]):
             member.reset()
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
-        """Pass nothing any more."""
+        """Pass nothing any more; a subclass stalls a single connection."""
         if connection is None:
             self.stalled |= set(DIRECTIONS if direction is None else [direction])
 

@@ -1,17 +1,17 @@
 """The rules of a link proxy: small values, in one list.
 
 A rule is for one direction, ``up`` from client to camera or ``down`` from camera to client, and for
-one connection or for every one. On TCP there are two kinds of place:
+one connection or for every one. On TCP there are two kinds of rule:
 
 - A *point* is reached as soon as ``at`` bytes have come from the sender: 0 is reached when the
   connection is made, a message's size right after its last byte.
 - A *range* begins with byte ``at``, counted from 0, and is ``count`` bytes long.
 
-Offsets count the sender's bytes, before the effects of other rules. Rules at one place act in the
+Offsets count the sender's bytes, before the effects of other rules. Rules at one offset act in the
 order of the list. On UDP a rule picks datagrams: one by its number, or each with a probability.
 
-The emulator's :mod:`~smartcam.emulator.faults` act on messages; rules know none. If a fault has
-the same verb, the rule's name includes its object.
+The emulator's :mod:`~smartcam.emulator.faults` act on messages; rules know none. If a fault has a
+name like ``Drop``, the rule's name says what it drops: ``DropBytes``, ``DropDatagrams``.
 """
 
 from __future__ import annotations
@@ -34,9 +34,8 @@ DIRECTIONS: tuple[Direction, Direction] = ("up", "down")
 MAX_COPY_BYTES = 1 << 20
 """Largest number of bytes that one rule may insert or duplicate: the proxy keeps them in memory."""
 
-MAX_HOLD_BYTES = 1 << 16
-"""Largest number of bytes that one rule may hold back: fewer than the proxy keeps before it stops
-reading."""
+MAX_RULE_BYTES = 1 << 16
+"""Largest number of bytes that one rule may hold back: fewer than MAX_QUEUED_BYTES."""
 
 
 _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
@@ -45,9 +44,9 @@ _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
 _BOUNDS: Mapping[str, _Bound] = {
     "direction": ("direction must be 'up' or 'down'", lambda direction: direction in DIRECTIONS),
     "connection": ("connections count from 1", lambda number: number is None or number >= 1),
-    "at": ("at must be 0 or more bytes", lambda place: place >= 0),
+    "at": ("at must be 0 or more bytes", lambda offset: offset >= 0),
     "count": ("count must be 1 or more bytes", lambda count: count is None or count >= 1),
-    "size": (f"size must be 1 to {MAX_HOLD_BYTES} bytes", lambda size: 1 <= size <= MAX_HOLD_BYTES),
+    "size": (f"size must be 1 to {MAX_RULE_BYTES} bytes", lambda size: 1 <= size <= MAX_RULE_BYTES),
     "data": (
         f"data must be 1 to {MAX_COPY_BYTES} bytes",
         lambda data: 1 <= len(data) <= MAX_COPY_BYTES,
@@ -128,7 +127,7 @@ class StreamRule(Rule):
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedRule(StreamRule):
-    """A rule for a place in the stream, ``at`` bytes from its beginning."""
+    """A rule for a point in the stream, ``at`` bytes from its beginning."""
 
     at: int = 0
 
@@ -158,7 +157,7 @@ class RangeRule(PlacedRule):
 
 
 class Cut(PointRule):
-    """End the connection in order: FIN to both sides, after the bytes that have passed.
+    """Close the connection normally: FIN to both sides, after the bytes that have passed.
 
     Later bytes are read and dropped, so that no reset overtakes the end.
     """
@@ -176,8 +175,8 @@ class Stall(PointRule):
     """Keep both sides open and pass nothing any more, until ``resume`` is called.
 
     Args:
-        both: stop the other direction, too, like a dead peer. Ends of the stalled sides are not
-            noticed.
+        both: stop the other direction, too, like a dead peer. That a stalled side closes its
+            connection is not noticed.
     """
 
     both: bool = False
@@ -319,12 +318,12 @@ class DatagramRule(Rule):
         return self if self.number is None else replace(self, number=self.number + by)
 
 
-class Lose(DatagramRule):
+class DropDatagrams(DatagramRule, name="drop"):
     """Drop the datagram."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Repeat(DatagramRule):
+class DuplicateDatagrams(DatagramRule, name="duplicate"):
     """Send the datagram more than once.
 
     Args:
@@ -335,7 +334,7 @@ class Repeat(DatagramRule):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Late(DatagramRule):
+class DelayDatagrams(DatagramRule, name="delay"):
     """Send the datagram later; others overtake it.
 
     Args:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from smartcam._accepting import BACKLOG, Acceptor, Places
 from smartcam.testing.proxy._directions import CHUNK, Pipe, end_sending
-from smartcam.testing.proxy._relay import Proxied, Relay
+from smartcam.testing.proxy._relay import ClientTraffic, Relay
 from smartcam.testing.proxy._rules import DIRECTIONS, Direction, StreamRule
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.testing")
 
 MAX_CONNECTIONS = 64
-"""Largest number of open connections. For another one, the proxy closes the connection that has
+"""Largest number of open connections. To accept one more, the proxy closes the connection that has
 waited longest for the target's first answer."""
 
 CONNECT_TIMEOUT = 5.0
@@ -46,7 +46,7 @@ HARD_END = struct.pack("ii", 1, 0)
 """Value of SO_LINGER, 0 seconds, with which closing a socket sends RST."""
 
 
-class ProxiedConnection(Proxied):
+class ProxiedConnection(ClientTraffic):
     """A client's socket, a socket to the target, and a pipe in each direction."""
 
     def __init__(self, relay: StreamRelay, number: int, client: socket.socket) -> None:
@@ -76,10 +76,10 @@ class ProxiedConnection(Proxied):
 
     @property
     def keeps_place(self) -> bool:
-        """True once bytes have passed in both directions."""
+        """True once bytes have passed in both directions: it is not closed for a new connection."""
         return len(self._carried) == len(DIRECTIONS)
 
-    def close_for(self, why: str) -> None:
+    def close_for(self, reason: str) -> None:
         """Log that the connection was turned away, and reset it."""
         self.note("turned away")
         self.reset()

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from smartcam._accepting import Places
 from smartcam.emulator._inside import DelayLine, RealClock, Transmission
 from smartcam.exceptions import ConfigurationError
-from smartcam.testing.proxy._relay import Proxied, Relay
+from smartcam.testing.proxy._relay import ClientTraffic, Relay
 from smartcam.testing.proxy._rules import (
     DIRECTIONS,
     DatagramRule,
+    DelayDatagrams,
     Direction,
-    Late,
-    Lose,
+    DropDatagrams,
+    DuplicateDatagrams,
     Reorder,
-    Repeat,
 )
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ MAX_WAITING_DATAGRAMS = 1024
 """Largest number of datagrams that rules hold back; more are lost and counted as ``full``."""
 
 
-class _Peer(Proxied):
+class _Peer(ClientTraffic):
     """One client's address and its own socket to the target."""
 
     def __init__(self, relay: DatagramRelay, number: int, address: Any) -> None:
@@ -91,12 +91,12 @@ class _Peer(Proxied):
             if not rule.picks(number, rng):
                 continue
             self.note(rule.name, direction, number)
-            if isinstance(rule, Lose):
+            if isinstance(rule, DropDatagrams):
                 return
-            if isinstance(rule, Repeat):
+            if isinstance(rule, DuplicateDatagrams):
                 transmission.parts += [data] * rule.copies
                 transmission.pauses += [0.0] * rule.copies
-            elif isinstance(rule, Late):
+            elif isinstance(rule, DelayDatagrams):
                 transmission.delay += rule.seconds + rng.random() * rule.jitter
             elif isinstance(rule, Reorder):
                 transmission.gather, transmission.after_gathered = (
@@ -117,7 +117,7 @@ class _Peer(Proxied):
         """True if the target has answered the client recently."""
         return self._loop.time() - self._answered_at < ANSWERED_GRACE
 
-    def close_for(self, why: str) -> None:
+    def close_for(self, reason: str) -> None:
         """Log that the client was turned away, and forget it."""
         self.note("turned away")
         self.reset()
@@ -143,7 +143,7 @@ class _Peer(Proxied):
     def _make_delay_line(self, direction: Direction) -> DelayLine[Transmission]:
         return DelayLine(
             RealClock(),
-            ordered=False,
+            keeps_order=False,
             wake=lambda: self._delay_lines[direction].run(),
             carry=functools.partial(self._send, direction),
             end=lambda _: None,
@@ -243,7 +243,7 @@ class DatagramRelay(Relay[_Peer]):
             peer, str(address[0]), asyncio.get_running_loop().time()
         )
         if refusal:
-            peer.close_for("all other clients were answered recently")
+            peer.close_for(refusal)
             return None
         self.log.note("connect", self._last_number)
         return peer

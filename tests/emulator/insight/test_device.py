@@ -157,7 +157,7 @@ def test_active_job_is_the_first_or_the_one_that_is_named() -> None:
 def test_things_happen_in_order_each_at_its_own_time() -> None:
     device = InSightDevice([Job(file="a", acquisition_time=0.25, processing_time=0.5)], online=True)
     told: list[tuple[int, StatusCode]] = []
-    device.request_event(8, lambda code: told.append((device.now, code)), at_image=False)
+    device.request_event(8, lambda code: told.append((device.now, code)), after_image=False)
     device.after(0.5, lambda: told.append((device.now, StatusCode.UNRECOGNIZED)))
     assert device.next_event_at == SECOND // 4
     device.advance_to(10 * SECOND)
@@ -172,7 +172,7 @@ def test_run_is_broken_off_when_the_camera_goes_offline_and_tells_once(tenths: i
     job = Job(file="a", acquisition_time=0.1, processing_time=0.1)
     device = InSightDevice([job], online=True)
     told: list[StatusCode] = []
-    device.request_event(8, told.append, at_image=False)
+    device.request_event(8, told.append, after_image=False)
     device.advance_to(tenths * SECOND // 10)
     assert device.busy
     device.set_online(False)

@@ -271,7 +271,7 @@ async def test_ordered_answers_are_bounded() -> None:
     emulator = EmulatedInSight()
     for _ in range(1000):
         emulator.answer_next(0)
-    with pytest.raises(ConfigurationError, match="1000 answers are ordered already"):
+    with pytest.raises(ConfigurationError, match="1000 codes wait already"):
         emulator.answer_next(0)
 
 

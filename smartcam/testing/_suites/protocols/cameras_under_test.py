@@ -29,7 +29,7 @@ class LiveCamera:
     """A camera that is up, with ``COUNTER`` active and ready to run.
 
     A subclass implements ``url``, and each of the other methods that its camera supports. A check
-    that needs a missing method is skipped, with this reason.
+    that needs a missing method is skipped, and the report names the method.
 
     Attributes:
         COUNTER: id of the application that answers each trigger with the number of the run, from 0.
@@ -55,7 +55,7 @@ class LiveCamera:
         raise NotImplementedError
 
     @property
-    def unpinned(self) -> str:
+    def url_without_dialect(self) -> str:
         """The camera's URL without the options that a client can find out."""
         return self.url.partition("?")[0]
 
@@ -101,7 +101,7 @@ class CameraKind:
         numbers_with_sequence: ``numbers`` with the number marked as the sequence number, if
             that can be set.
         raw_request: id of a request that has an answer, None if there is none.
-        foreign_request: an id of a type that the protocol's request ids do not have.
+        foreign_request: an id of a wrong Python type: text if the request ids are numbers.
         silent_request: id of a request that the camera leaves without an answer, None if there is
             none; unused if there are result codes.
         datagrams: True for a camera over UDP: messages may be lost, and the client gets no end of

@@ -80,7 +80,7 @@ class Conversation:
         return self.name
 
     def group(self, protocol: Protocol) -> tuple[Dialect, ...]:
-        """Return the dialects that a client may use on the link: one, or several of one name.
+        """Return the dialects with which a client may begin on the link; all begin alike.
 
         Raises:
             ConfigurationError: the dialect has no such quirk, or cannot use a parameter.
@@ -131,7 +131,7 @@ class Player:
     def step(
         self, step: Step, chunks: Sequence[bytes] | None = None, *, use_buffer: bool = True
     ) -> None:
-        """Do one step; ``chunks`` are the bytes received in this step, cut at other places.
+        """Do one step; ``chunks`` are the bytes received in this step, cut at other offsets.
 
         With ``use_buffer``, received bytes of a stream are written into the machine's own buffer.
 

@@ -24,7 +24,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Framer, Spelled
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, parse_address
-from smartcam.testing._suites.protocols.parameters import Parameters
+from smartcam.testing._suites.protocols.parameters import SuiteBase
 from smartcam.testing._suites.protocols.words import (
     MESSAGES,
     MESSAGES_BY_CAPABILITY,
@@ -51,7 +51,7 @@ def _is_printable_line(text: object) -> bool:
     return isinstance(text, str) and bool(text.strip()) and text.isprintable()
 
 
-class DialectChecks(Parameters):
+class DialectChecks(SuiteBase):
     """The checks of every protocol and dialect, without a camera."""
 
     # ------------------------------------------------------------------ the protocol
@@ -88,7 +88,7 @@ class DialectChecks(Parameters):
         assert loaded is self.protocol, f"the entry point {name!r} gives {loaded!r:.300}"
 
     def test_every_dialect_is_tried(self) -> None:
-        """Check that a client tries each dialect, and only the pinned one if one is pinned."""
+        """Check that a client tries each dialect, and only the given one if one is given."""
         protocol = self.protocol
         used_transports = set(protocol.schemes.values())
         surplus = set(protocol.detection) - used_transports
@@ -104,7 +104,7 @@ class DialectChecks(Parameters):
             for name in protocol.dialects:
                 (group,) = protocol.dialect_groups(transport, name)
                 others = {dialect.name for dialect in group} - {name}
-                assert not others, f"pinned {name!r} over {transport.value} tries {others}, too"
+                assert not others, f"given {name!r} over {transport.value} tries {others}, too"
 
     def test_model_picks_the_protocol(self) -> None:
         """Check that a bare host with a model, in any case of letters, is of this protocol."""
@@ -174,7 +174,7 @@ class DialectChecks(Parameters):
             unknown = set(dialect.fields(kind)) - {name for name, _ in m.wire_fields(kind)}
             assert not unknown, f"fields({kind.__name__}) has {unknown}"
 
-    def test_message_that_it_has_not_is_unsupported(self, dialect: Dialect) -> None:
+    def test_message_unknown_to_the_dialect_is_unsupported(self, dialect: Dialect) -> None:
         """Check that the error for a missing message names the dialect."""
         for kind in MESSAGES:
             if dialect.has(kind):
@@ -203,7 +203,7 @@ class DialectChecks(Parameters):
         if dialect.capabilities.result_codes:
             assert verdicts - {Verdict.DONE}, "result_codes, but every code says done"
 
-    def test_any_frame_can_be_spelled(self, dialect: Dialect) -> None:
+    def test_any_frame_can_be_shown(self, dialect: Dialect) -> None:
         """Check that a trace shows whatever comes, and never fails."""
         from smartcam.testing._suites import strategies
 
@@ -242,7 +242,7 @@ class DialectChecks(Parameters):
         assert "no such quirk" in text, f"{text}: expected the name of the quirk in it"
 
     def test_address_is_read_back(self, dialect: Dialect) -> None:
-        """Check that a URL with everything pinned is read back, and has no password."""
+        """Check that a URL with all options is read back, and has no password."""
         parameters: list[tuple[tuple[str, str], ...]] = [()]
         parameters += [
             tuple(conversation.parameters.items())

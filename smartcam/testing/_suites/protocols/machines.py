@@ -1,4 +1,4 @@
-"""Check the properties of a machine that a link relies on, with the bytes of conversations."""
+"""Check a protocol's state machine as a link uses it, with the bytes of conversations."""
 # ruff: noqa: S101 - these are tests, which are in the package so that others can run them
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Counters, ResultBurst
 from smartcam.testing._suites.protocols.conversations import Player, Received, Sent
 from smartcam.testing._suites.protocols.dialects import check_described
-from smartcam.testing._suites.protocols.parameters import Parameters
+from smartcam.testing._suites.protocols.parameters import SuiteBase
 from smartcam.testing._suites.protocols.words import REQUESTS, make_example
 
 if TYPE_CHECKING:
@@ -48,18 +48,18 @@ MAX_MESSAGES = 1000
 """Number of messages in endless bytes after which the check accepts them as valid messages."""
 
 MAX_MEMORY_FACTOR = 2
-"""Largest growth of a machine's memory with endless bytes, in multiples of ``max_waiting``."""
+"""Largest growth of a machine's memory with endless bytes: this times ``max_pending_bytes``."""
 
 
-class MachineChecks(Parameters):
+class MachineChecks(SuiteBase):
     """The checks of every protocol's machine, without a socket.
 
     Attributes:
-        max_waiting: largest number of bytes of incomplete messages that a machine may keep, if it
-            accepts payloads of 4 KiB.
+        max_pending_bytes: largest number of bytes of incomplete messages that a machine may
+            keep, if it accepts payloads of 4 KiB.
     """
 
-    max_waiting: ClassVar[int] = 1 << 16
+    max_pending_bytes: ClassVar[int] = 1 << 16
 
     # ------------------------------------------------------------------ conversations
 
@@ -85,8 +85,8 @@ class MachineChecks(Parameters):
         joined_stream = dataclasses.replace(stream, steps=_join_deliveries(stream.steps))
         Player(self.protocol, joined_stream).play()
 
-    def test_any_cutting_of_any_bytes_tells_the_same(self, stream: Conversation) -> None:
-        """Check any cut of bytes that no camera sends as well."""
+    def test_any_cutting_of_any_bytes_gives_the_same_events(self, stream: Conversation) -> None:
+        """Check any cut also with bytes that no camera sends."""
         from smartcam.testing._suites import strategies
 
         step_indices = range(len(stream.steps) + 1)
@@ -135,7 +135,7 @@ class MachineChecks(Parameters):
 
         strategies.run_with_examples(check)
 
-    def test_end_of_the_link_is_told_once(self, stream: Conversation) -> None:
+    def test_end_of_the_link_is_reported_once(self, stream: Conversation) -> None:
         """Check an end anywhere, also within an answer; nothing is read after it."""
         for step_index, halves in _stop_points(stream):
             player = Player(self.protocol, stream).play(step_index)
@@ -171,29 +171,29 @@ class MachineChecks(Parameters):
         datagrams = machine.transport is Transport.UDP
         chunk = filler * (60_000 if datagrams else 4096)
         before = tracemalloc.get_traced_memory()[0]
-        for _ in range(4 * self.max_waiting // len(chunk)):
+        for _ in range(4 * self.max_pending_bytes // len(chunk)):
             machine.receive_data(chunk)
             events = machine.events()
             failed = any(isinstance(event, LinkFailed) for event in events)
             messages += len(events)
             waiting = len(machine.pending)
-            assert waiting <= self.max_waiting, f"{where}: {waiting} bytes are kept"
+            assert waiting <= self.max_pending_bytes, f"{where}: {waiting} bytes are kept"
             if failed:
                 assert waiting == 0, f"{where}: {waiting} bytes are kept of a link that failed"
                 break
             if datagrams:
                 assert waiting == 0, f"{where}: {waiting} bytes of a datagram are kept"
             if messages > MAX_MESSAGES:
-                break  # reports are messages
+                break  # the endless bytes are valid messages
         memory_growth = tracemalloc.get_traced_memory()[0] - before
-        assert memory_growth <= MAX_MEMORY_FACTOR * self.max_waiting, (
+        assert memory_growth <= MAX_MEMORY_FACTOR * self.max_pending_bytes, (
             f"{where}: the machine has grown by {memory_growth} bytes"
         )
 
     # ------------------------------------------------------------------ requests
 
     def test_request_before_the_session_is_refused(self, conversation: Conversation) -> None:
-        """Check that a request is a LocalProtocolError; then the conversation goes as written."""
+        """Check that a request raises an error; then the conversation goes as written."""
         player = Player(self.protocol, conversation)
         dialect = player.machine.dialect
         for kind in REQUESTS:
@@ -208,7 +208,7 @@ class MachineChecks(Parameters):
         player.take_output()
         player.play()
 
-    def test_message_that_it_has_not_is_refused(self, conversation: Conversation) -> None:
+    def test_message_unknown_to_the_dialect_is_refused(self, conversation: Conversation) -> None:
         """Check the refusal at any time, and that the conversation then goes as written."""
         for step_index in range(len(conversation.steps) + 1):
             player = Player(self.protocol, conversation).play(step_index)
@@ -221,7 +221,7 @@ class MachineChecks(Parameters):
     def test_second_request_while_the_answer_is_owed_is_refused(
         self, conversation: Conversation
     ) -> None:
-        """Check the refusal, since answers do not name their request; a status answers two."""
+        """Check the refusal, since answers do not name requests; status requests may overlap."""
         for step_index, step in enumerate(conversation.steps):
             if isinstance(step, Sent) and isinstance(step.message, m.Request):
                 player = Player(self.protocol, conversation).play(step_index + 1)
@@ -235,7 +235,7 @@ class MachineChecks(Parameters):
                     )
                     player.play()
 
-    def test_answer_that_nobody_asked_for_is_not_told(self, conversation: Conversation) -> None:
+    def test_answer_that_nobody_asked_for_is_not_reported(self, conversation: Conversation) -> None:
         """Check that the machine drops the answer: a later request could take it for its own."""
         for step_index, answer, data in _unrequested_answers(conversation):
             player = Player(self.protocol, conversation).play(step_index)
@@ -285,13 +285,13 @@ class MachineChecks(Parameters):
             items: list[Any] = take()
             assert items == [], f"{name}() gave {items} before anything was said"
             items.append(None)
-            assert take() == [], f"{name}() gives what its caller did to an earlier list"
+            assert take() == [], f"{name}() has returned an earlier list again, with its changes"
         player.play()
         machine.adopt(machine.candidates[0])
         assert list(machine.candidates) == [machine.dialect], f"adopt() left {machine.candidates}"
 
     def test_state_follows_the_session(self, conversation: Conversation) -> None:
-        """Check the states: connecting after Connect, connected after its answer, then failed."""
+        """Check the states after Connect, after its answer, and after a failure."""
         player = Player(self.protocol, conversation)
         machine = player.machine
         for step_index, step in enumerate(conversation.steps):
@@ -307,7 +307,7 @@ class MachineChecks(Parameters):
                     code = machine.dialect.code(event.code, m.Connect)
                     if code.verdict is Verdict.DONE or not machine.dialect.fields(type(event)):
                         assert state is State.CONNECTED, f"{where}: it is {state}"
-                if isinstance(event, type):
+                if isinstance(event, type):  # a failure is written as its class
                     assert state is State.FAILED, f"{where}: it is {state}"
 
     def test_bytes_are_counted(self, conversation: Conversation) -> None:

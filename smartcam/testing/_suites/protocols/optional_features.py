@@ -27,7 +27,7 @@ from smartcam.testing._suites.protocols.client_checks import (
     wait_until,
     with_event_loop,
 )
-from smartcam.testing._suites.protocols.parameters import Parameters
+from smartcam.testing._suites.protocols.parameters import SuiteBase
 
 if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 LEAP_DAY = datetime(2024, 2, 29, 23, 59, 30)  # noqa: DTZ001 - the camera's clock has no zone
 
 
-class OptionalFeatureChecks(Parameters):
+class OptionalFeatureChecks(SuiteBase):
     """The checks of optional features: each works, or raises an error and the session goes on."""
 
     @with_event_loop

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.conversations import Conversation
 
 
-class Parameters(ExplainedChecks):
-    """Base of the suites: the values that an author gives.
+class SuiteBase(ExplainedChecks):
+    """Base of the suites: the values that the author of a protocol gives.
 
     Attributes:
         protocol: the protocol of the entry point.

@@ -31,7 +31,7 @@ from smartcam.testing._suites.protocols.client_checks import (
     wait_until,
     with_event_loop,
 )
-from smartcam.testing._suites.protocols.parameters import Parameters
+from smartcam.testing._suites.protocols.parameters import SuiteBase
 
 if TYPE_CHECKING:
     from smartcam import Camera
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 FAST_RECONNECT = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
 
 
-class SessionChecks(Parameters):
+class SessionChecks(SuiteBase):
     """Checks of a session: opening, closing, loss, and takeover by another client."""
 
     @with_event_loop
-    async def test_connect_pinned_knows_the_camera(self, camera_kind: CameraKind) -> None:
+    async def test_connect_with_the_dialect_knows_the_camera(self, camera_kind: CameraKind) -> None:
         """Check that URL, application and status are known after ``connect()``."""
         async with open_session(camera_kind) as (live, camera):
             assert camera.connected
@@ -56,11 +56,11 @@ class SessionChecks(Parameters):
             await camera.wait_ready()
 
     @with_event_loop
-    async def test_connect_unpinned_finds_out_and_pins_it(self, camera_kind: CameraKind) -> None:
+    async def test_connect_without_the_dialect_finds_it_out(self, camera_kind: CameraKind) -> None:
         """Check that the client finds out the dialect and adds it to its URL."""
         async with camera_kind.open() as live:
             camera = smartcam.connect(
-                live.unpinned, interpret_as=camera_kind.numbers, reconnect=None
+                live.url_without_dialect, interpret_as=camera_kind.numbers, reconnect=None
             )
             events = camera.events()
             async with camera:
@@ -104,7 +104,7 @@ class SessionChecks(Parameters):
                 assert Status.RUNNING in second.status
 
     @with_event_loop
-    async def test_lost_camera_is_told_and_comes_back(self, camera_kind: CameraKind) -> None:
+    async def test_lost_camera_is_reported_and_comes_back(self, camera_kind: CameraKind) -> None:
         """Check for Disconnected, then Reconnected, and that triggers work again."""
         async with open_session(camera_kind, reconnect=FAST_RECONNECT, liveness_timeout=0.4) as (
             live,
@@ -150,7 +150,7 @@ class SessionChecks(Parameters):
             check_balance(camera.statistics())
 
     @with_event_loop
-    async def test_newcomer_takes_the_camera_or_stands_beside(
+    async def test_second_client_takes_the_camera_or_is_served_too(
         self, camera_kind: CameraKind
     ) -> None:
         """Check that the second client is served; an exclusive camera drops the first client."""

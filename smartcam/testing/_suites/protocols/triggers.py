@@ -37,13 +37,13 @@ from smartcam.testing._suites.protocols.client_checks import (
     wait_until,
     with_event_loop,
 )
-from smartcam.testing._suites.protocols.parameters import Parameters
+from smartcam.testing._suites.protocols.parameters import SuiteBase
 
 if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
 
 
-class TriggerChecks(Parameters):
+class TriggerChecks(SuiteBase):
     """Triggers: each has one outcome, and its own result."""
 
     @with_event_loop
@@ -69,8 +69,8 @@ class TriggerChecks(Parameters):
             check_balance(camera.statistics())
 
     @with_event_loop
-    async def test_trigger_in_another_application_goes_back(self, camera_kind: CameraKind) -> None:
-        """Check that the application from before is active afterwards."""
+    async def test_trigger_in_another_application_is_undone(self, camera_kind: CameraKind) -> None:
+        """Check that the application that was active before is active afterwards."""
         skip_without_applications(camera_kind, OTHER)
         async with open_session(camera_kind) as (_, camera):
             result = await camera.trigger(OTHER)
@@ -82,7 +82,7 @@ class TriggerChecks(Parameters):
             assert (await camera.trigger()).application == COUNTER
 
     @with_event_loop
-    async def test_trigger_whose_result_does_not_fit_is_told_and_the_next_one_taken(
+    async def test_trigger_whose_result_does_not_fit_fails_and_the_next_one_works(
         self, camera_kind: CameraKind
     ) -> None:
         """Check for an InterpretationError, after which the session continues."""
@@ -104,7 +104,7 @@ class TriggerChecks(Parameters):
             for _ in range(3):
                 with pytest.raises(TriggerTimeoutError) as caught:
                     await camera.trigger(timeout=SHORT_TIMEOUT)
-                if "no trigger was sent" not in str(caught.value):  # as on a slow machine
+                if "no trigger was sent" not in str(caught.value):  # a slow machine may send none
                     inspections += 1
                 assert await trigger_and_read(camera) == inspections
                 inspections += 1
@@ -168,7 +168,7 @@ class TriggerChecks(Parameters):
             assert await trigger_and_read(camera) == 0
 
     @with_event_loop
-    async def test_trigger_of_another_application_than_the_one_named_is_told(
+    async def test_trigger_of_another_application_than_the_named_one_fails(
         self, camera_kind: CameraKind
     ) -> None:
         """Check for a WrongApplicationError after an operator has switched."""
@@ -306,5 +306,5 @@ class TriggerChecks(Parameters):
             check_balance(statistics)
             if camera.capabilities.unasked_results:
                 await wait_until(lambda: camera.statistics().received >= 5)
-            (account,) = statistics.subscribers
-            assert (account.taken, account.name) == (1, "results")
+            (counts,) = statistics.subscribers
+            assert (counts.taken, counts.name) == (1, "results")
