@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SESSION_TRIES = 3
+SESSION_ATTEMPTS = 3
 """Number of links tried for a session: the first attempt after an old session may fail (T 3.1.4,
 published)."""
 
 DETECTION_TIMEOUT = 10.0
 """Seconds for finding out the dialect."""
 
-RESTORE_TRIES = 2
+RESTORE_ATTEMPTS = 2
 """Number of sessions tried for restoring the state from before."""
 
 
@@ -209,7 +209,7 @@ class CameraUnderTest:
 
     def _open_session(self, stack: contextlib.ExitStack) -> RawClient:
         reason = ""
-        for index in range(SESSION_TRIES):
+        for index in range(SESSION_ATTEMPTS):
             attempt = contextlib.ExitStack()
             try:
                 client = attempt.enter_context(self.link())
@@ -388,7 +388,7 @@ class CameraUnderTest:
         if not self._state_changed or before is None or (self.not_restored and not retry):
             return
         old_reason, self.gone_reason = self.gone_reason, ""
-        for _ in range(RESTORE_TRIES):
+        for _ in range(RESTORE_ATTEMPTS):
             try:
                 with self.session() as client:
                     self._restore_state(client, before)

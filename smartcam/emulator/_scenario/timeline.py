@@ -84,7 +84,7 @@ class Cue(EmulatorData):
         ge=0.001,
         le=86_400,
         allow_inf_nan=False,
-        description="again and again, so many seconds after the last time; with `at`",
+        description="seconds after which it happens again, each time; with `at`",
     )
     entering: DeviceState | None = Field(
         default=None, description="when the camera enters this state"

@@ -146,7 +146,7 @@ class BaseFault(EmulatorData):
     def _check_count(cls, value: int | None, info: ValidationInfo) -> int | None:
         at_once = info.data.get("on") is None and info.data.get("sender") is None
         if cls.can_act_at_once and at_once and value != 1:
-            raise ValueError("without a message to wait for it happens once, at once")
+            raise ValueError("a fault that waits for no message happens once, at once")
         return value
 
     @classmethod

@@ -45,7 +45,7 @@ class Transmission:
     end: Ending | None = None  # event of the connection after it
     effects: list[str] = field(
         default_factory=list[str]
-    )  # kinds, or names of rules, that acted on it
+    )  # kinds of faults, or names of rules, that acted on it; the reason of a loss
 
     @property
     def size(self) -> int:

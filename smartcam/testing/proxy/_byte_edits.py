@@ -35,7 +35,7 @@ BOTH_STALL = Ending("half_open", Stall.name)
 class Edit(Transmission):
     """Bytes to send, or an action between them."""
 
-    at: int = 0  # offset in the stream at which the rule named by ``faults`` acts
+    at: int = 0  # offset in the stream at which the rule named by ``effects`` acts
 
 
 def _pause_edit(seconds: float) -> Edit:

@@ -70,7 +70,7 @@ class MachineChecks(SuiteBase):
         assert m.Connect in kinds, f"{conversation}: no step sends Connect"
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
-        """Check any cut of a stream: each piece may come alone, or with the next."""
+        """Check any cut of a conversation over TCP: pieces may come alone, or with the next."""
         for use_buffer in (True, False):
             for split in (_split_bytewise, _keep_whole):
                 player = Player(self.protocol, stream)
