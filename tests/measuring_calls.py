@@ -158,7 +158,7 @@ def measuring_calls() -> dict[str, Call]:
             {"calibration": plane, "origin": (0.0, 0.0), "theta": 0.0},
         ),
         "compare": (
-            calibration.compare,
+            calibration.compare_lenses,
             {"a": lens, "b": lens.camera, "distance": 0.5, "shape": (5, 5)},
         ),
         "draw_scene": (calibration.draw_scene, {"calibration": lens, "title": ""}),
@@ -198,8 +198,8 @@ def measuring_calls() -> dict[str, Call]:
         "load_calibration": (calibration.load_calibration, {"path": "nowhere.json"}),
         "locate": (calibration.locate, {"view": views[0], "camera": lenskit.LEFT}),
         "make_sheet": (calibration.make_sheet, {"target": lenskit.BOARD, "page": "A4"}),
-        "scaled": (
-            calibration.scaled,
+        "scale_target": (
+            calibration.scale_target,
             {"target": lenskit.BOARD, "measured_ruler": (0.1, 0.1)},
         ),
         "suggest_views": (

@@ -144,7 +144,7 @@ async def compare(
     options: Options,
 ) -> None:
     """Compare two calibrations."""
-    from smartcam.calibration._inside import compare_lenses, rig_difference
+    from smartcam.calibration._inside import compare_estimates, rig_difference
 
     first, second = _read(a, unit), _read(b, unit)
     if len(first.lenses) != len(second.lenses):
@@ -153,7 +153,7 @@ async def compare(
             f"{len(second.lenses)}"
         )
     comparisons = [
-        compare_lenses(lens, other, distance=distance)
+        compare_estimates(lens, other, distance=distance)
         for lens, other in zip(first.lenses, second.lenses, strict=True)
     ]
     for name, comparison in zip(first.names, comparisons, strict=True):

@@ -84,7 +84,7 @@ async def _serve_file(
             calibrations={name: value for name, value in calibrations.items() if value is not None},
             hand_eyes={name: value for name, value in hand_eyes.items() if value is not None},
             wanted=lambda agent, _camera: agent == file.agent_name,
-            desks=server.calibrations,
+            calibrations_by_camera=server.calibrations,
         ) as ros:
             yield ros
 

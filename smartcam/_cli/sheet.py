@@ -198,13 +198,13 @@ async def _write_sheet(
     for path in outputs:
         if _lower_suffix(path) not in {".svg", ".pdf"}:
             raise click.UsageError(f"-o {path}: expected a name that ends with .svg or .pdf")
-    from smartcam.calibration import make_sheet, scaled
+    from smartcam.calibration import make_sheet, scale_target
     from smartcam.calibration._inside import target_from_description
 
     new_sheet = make_sheet(target_from_description({"kind": kind, **target_settings}), page=page)
     target = new_sheet.target
     if measured_rulers is not None:
-        target = scaled(target, measured_rulers)
+        target = scale_target(target, measured_rulers)
     data = replace(new_sheet, target=target).data
     for path in outputs:
         _write(path, new_sheet.pdf() if _lower_suffix(path) == ".pdf" else new_sheet.svg().encode())

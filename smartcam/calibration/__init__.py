@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._hand_eye.equations import RobotSigmas
     from smartcam.calibration._hand_eye.result import HandEyeCalibration
     from smartcam.calibration._hand_eye.time_offset import estimate_time_offset
-    from smartcam.calibration._lens.comparison import compare
+    from smartcam.calibration._lens.comparison import compare_lenses
     from smartcam.calibration._lens.guide import suggest_views
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
     from smartcam.calibration._lens.poses import locate
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._plane.moving_camera import MovingCamera
     from smartcam.calibration._plane.tool import fit_tool_tip
     from smartcam.calibration._plane.touches import fit_touches
-    from smartcam.calibration._printing.sheets import make_sheet, scaled
+    from smartcam.calibration._printing.sheets import make_sheet, scale_target
     from smartcam.calibration._sheet.calibration import (
         SheetCalibration,
         calibrate_sheet,
@@ -92,7 +92,7 @@ __all__ = [
     "calibrate_sheet",
     "calibrate_stereo",
     "chain_of",
-    "compare",
+    "compare_lenses",
     "draw_scene",
     "draw_uncertainty",
     "draw_views",
@@ -105,7 +105,7 @@ __all__ = [
     "load_calibration",
     "locate",
     "make_sheet",
-    "scaled",
+    "scale_target",
     "suggest_views",
     "target_from_data",
     "target_to_data",
@@ -123,7 +123,7 @@ if not TYPE_CHECKING:
             "_hand_eye.equations": "RobotSigmas",
             "_hand_eye.result": "HandEyeCalibration",
             "_hand_eye.time_offset": "estimate_time_offset",
-            "_lens.comparison": "compare",
+            "_lens.comparison": "compare_lenses",
             "_lens.guide": "suggest_views",
             "_lens.intrinsics": "IntrinsicCalibration calibrate_intrinsics",
             "_lens.poses": "locate",
@@ -131,7 +131,7 @@ if not TYPE_CHECKING:
             "_plane.moving_camera": "MovingCamera",
             "_plane.tool": "fit_tool_tip",
             "_plane.touches": "fit_touches",
-            "_printing.sheets": "make_sheet scaled",
+            "_printing.sheets": "make_sheet scale_target",
             "_sheet.calibration": "SheetCalibration calibrate_sheet fit_corners",
             "_solvers": "Chain Height PlaneProjection ToolOffset chain_of",
             "_stereo.calibration": "StereoCalibration calibrate_stereo",

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.comparison import (
         Lens,
         LensComparison,
-        compare_lenses,
+        compare_estimates,
         rig_difference,
     )
     from smartcam.calibration._lens.uncertainty import MapFigures
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._steps import Input
     from smartcam.calibration.wizards._thesis import (
         CalibrationCamera,
-        CalibrationDesks,
+        CalibrationsByCamera,
         CalibrationStart,
         PixelPoseRequest,
         StepRequest,
@@ -55,8 +55,8 @@ __all__ = [
     "WIZARD",
     "AnyCalibration",
     "CalibrationCamera",
-    "CalibrationDesks",
     "CalibrationStart",
+    "CalibrationsByCamera",
     "CameraInfo",
     "Input",
     "LengthUnit",
@@ -70,7 +70,7 @@ __all__ = [
     "StoredLenses",
     "Target",
     "ThesisCalibration",
-    "compare_lenses",
+    "compare_estimates",
     "decode_picture",
     "doubt_text",
     "draw",
@@ -93,7 +93,7 @@ if not TYPE_CHECKING:
             "_drawing.files": "draw_file",
             "_files.load": "AnyCalibration",
             "_least_squares": "independent_parts",
-            "_lens.comparison": "LensComparison Lens compare_lenses rig_difference",
+            "_lens.comparison": "LensComparison Lens compare_estimates rig_difference",
             "_lens.uncertainty": "MapFigures",
             "_plane.drawing": "draw",
             "_printing.sheets": "target_from_description",
@@ -106,7 +106,7 @@ if not TYPE_CHECKING:
             "wizards._listing": "list_calibrations",
             "wizards._pictures": "PictureFolder MAX_PICTURE_BYTES SUFFIXES decode_picture",
             "wizards._steps": "Input",
-            "wizards._thesis": "CalibrationCamera CalibrationDesks CalibrationStart "
+            "wizards._thesis": "CalibrationCamera CalibrationsByCamera CalibrationStart "
             "PixelPoseRequest StepRequest ThesisCalibration",
             "wizards._verification": "WIZARD",
             "wizards._view_suggestions": "STANDARD_VIEWS suggest_view",

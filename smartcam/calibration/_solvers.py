@@ -69,7 +69,7 @@ class Poses(NamedTuple):
         flat = np.atleast_2d(np.asarray(points, dtype=np.float64))
         angles = np.zeros(len(flat)) if thetas is None else np.asarray(thetas, dtype=np.float64)
         if flat.shape != (len(angles), 2):
-            raise Code.SHAPE.unexpected(
+            raise Code.SHAPE.error_with_value(
                 f"poses on a plane: expected points of shape ({len(angles)}, 2)",
                 (len(angles), 2),
                 flat.shape,
@@ -208,14 +208,16 @@ class PlaneProjection:
     def __init__(self, matrix: ArrayLike) -> None:
         rows = as_points(matrix, 3, "projection")
         if len(rows) != 4:
-            raise Code.SHAPE.unexpected("projection: expected shape (4, 3)", (4, 3), rows.shape)
+            raise Code.SHAPE.error_with_value(
+                "projection: expected shape (4, 3)", (4, 3), rows.shape
+            )
         self.matrix: Array = rows.copy()
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses in the robot's frame."""
         points, (x, y, z, w) = poses.points, poses.quaternions.T
         if points[:, 2].any() or x.any() or y.any():
-            raise Code.OUT_OF_PLANE.refusal(
+            raise Code.OUT_OF_PLANE.error(
                 "projection: expected poses in the camera's plane, turned about its z, got some "
                 "with a height or a tilt"
             )
@@ -223,7 +225,7 @@ class PlaneProjection:
         depth = camera_points @ self.matrix[3, :2] + self.matrix[3, 2]
         if not np.all(depth > 0):
             hidden_point = camera_points[int(np.argmin(depth))].tolist()
-            raise Code.OUT_OF_FIELD.refusal(
+            raise Code.OUT_OF_FIELD.error(
                 f"projection: expected points that the camera can see, got {hidden_point}: behind "
                 "the plane's horizon",
                 got=hidden_point,
@@ -262,7 +264,7 @@ class Height:
         direction = as_vector(normal, 3, "normal")
         length = float(np.linalg.norm(direction))
         if not length > 0:
-            raise Code.SHORT_LEVER.refusal(
+            raise Code.SHORT_LEVER.error(
                 f"height: expected a normal, got {direction.tolist()}", "a length above 0", length
             )
         self.height: float = float(as_vector([height], 1, "height")[0])
@@ -281,7 +283,7 @@ class Height:
         rays = self.viewpoint - points
         distances = rays @ self.normal
         if not np.all(distances > max(self.height, 0.0)):
-            raise Code.SHORT_LEVER.refusal(
+            raise Code.SHORT_LEVER.error(
                 f"height: expected the viewpoint more than {max(self.height, 0.0):g} m above each "
                 f"point, got {float(distances.min()):g} m",
                 self.height,
@@ -432,7 +434,7 @@ def check_frames(
     frames = {part.pose.header.frame_id for part in localizations}
     if frame is not None and not frames <= {frame}:
         others = ", ".join(sorted(frames - {frame}))
-        raise Code.WRONG_FRAME.refusal(
+        raise Code.WRONG_FRAME.error(
             f"{prefix}expected poses in the frame {frame!r}, got some in {others!r}", frame, others
         )
 

@@ -127,13 +127,13 @@ class Charuco:
         _check_lengths(self.kind, square=self.square, marker=self.marker)
         _check_flags(self.kind, legacy_pattern=self.legacy_pattern)
         if not isinstance(self.dictionary, str):
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"charuco: expected the name of a dictionary, got {excerpt(self.dictionary)}",
                 "DICT_5X5_250",
                 self.dictionary,
             )
         if self.marker >= self.square:
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"charuco: expected a marker smaller than its square ({self.square:g} m), "
                 f"got {self.marker:g} m",
                 self.square,
@@ -179,14 +179,14 @@ class CircleGrid:
         mean_diameter = (self.diameter + (self.origin_diameter or self.diameter)) / 2
         min_distance = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
         if mean_diameter >= min_distance:
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"circles: expected dots that do not touch each other at a distance of "
                 f"{min_distance:g} m, got a mean diameter of two neighbours of {mean_diameter:g} m",
                 min_distance,
                 mean_diameter,
             )
         if self.origin_diameter is not None and self.origin_diameter <= self.diameter:
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"circles: expected origin_diameter larger than the other dots' "
                 f"({self.diameter:g} m), got {self.origin_diameter:g} m",
                 self.diameter,
@@ -252,7 +252,7 @@ class MarkerGrid:
         _check_whole(self.kind, 1, border=self.border)
         _check_whole(self.kind, 0, first_id=self.first_id)
         if not isinstance(self.dictionary, str) or self.columns * self.rows < 2:
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"{self.kind}: expected the name of a dictionary and two markers or more, got "
                 f"{excerpt(self.dictionary)} and {self.columns} x {self.rows}",
                 got=(self.dictionary, self.columns, self.rows),
@@ -330,7 +330,7 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
     kind_name = fields.pop("kind", None)
     target_class = _KINDS.get(kind_name) if isinstance(kind_name, str) else None
     if target_class is None:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"target: expected a kind of {sorted(_KINDS)}, got {excerpt(kind_name)}",
             sorted(_KINDS),
             kind_name,
@@ -338,7 +338,7 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
     try:
         return target_class(**fields)
     except TypeError as exc:
-        raise Code.SHAPE.refusal(f"target: {exc}", got=sorted(fields)) from exc
+        raise Code.SHAPE.error(f"target: {exc}", got=sorted(fields)) from exc
 
 
 def resized(target: T, factor: float, digits: int | None = None) -> T:
@@ -366,7 +366,7 @@ def _grid(columns: int, rows: int, spacing: float) -> Array:
 def _check_counts(kind: str, columns: Any, rows: Any, minimum: int = 3) -> None:
     _check_whole(kind, minimum, columns=columns, rows=rows)
     if columns * rows > MAX_POINTS:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"{kind}: expected at most {MAX_POINTS} points, "
             f"got {excerpt(columns)} x {excerpt(rows)}",
             MAX_POINTS,
@@ -377,7 +377,7 @@ def _check_counts(kind: str, columns: Any, rows: Any, minimum: int = 3) -> None:
 def _check_whole(kind: str, minimum: int, **numbers: Any) -> None:
     for name, number in numbers.items():
         if not isinstance(number, int) or isinstance(number, bool) or number < minimum:
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"{kind}: expected {name} to be a whole number of at least {minimum}, "
                 f"got {excerpt(number)}",
                 minimum,
@@ -388,7 +388,7 @@ def _check_whole(kind: str, minimum: int, **numbers: Any) -> None:
 def _check_flags(kind: str, **flags: Any) -> None:
     for name, flag in flags.items():
         if not isinstance(flag, bool):
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"{kind}: expected {name} to be True or False, got {excerpt(flag)}",
                 "True or False",
                 flag,
@@ -399,14 +399,14 @@ def _check_lengths(kind: str, **lengths: Any) -> None:
     for name, length in lengths.items():
         is_number = isinstance(length, int | float) and not isinstance(length, bool)
         if is_number and MAX_LENGTH_M < length < math.inf:
-            raise Code.UNIT_UNKNOWN.refusal(
+            raise Code.UNIT_UNKNOWN.error(
                 f"{kind}: expected {name} to be a length of {MAX_LENGTH_M:g} m at most, got "
                 f"{excerpt(length)} m; is it in millimetres?",
                 MAX_LENGTH_M,
                 length,
             )
         if not (is_number and math.isfinite(length) and length > 0):
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"{kind}: expected {name} to be a length in metres, got {excerpt(length)}",
                 "metres",
                 length,

@@ -35,7 +35,7 @@ MAX_ANGLE: Final = 2 * math.pi + 1e-3
 def metres_of(unit: object, label: str) -> float:
     """Return the metres per unit, or raise UNIT_UNKNOWN; ``label`` names the lengths."""
     if not isinstance(unit, str) or unit not in METRES_PER_UNIT:
-        raise Code.UNIT_UNKNOWN.refusal(
+        raise Code.UNIT_UNKNOWN.error(
             f"{label}: expected a unit of length of {', '.join(METRES_PER_UNIT)}, got {unit!r}",
             list(METRES_PER_UNIT),
             unit,
@@ -45,7 +45,7 @@ def metres_of(unit: object, label: str) -> float:
 
 def no_unit_error(label: str) -> CalibrationError:
     """Return the error about a file that may be in metres or in millimetres."""
-    return Code.UNIT_UNKNOWN.refusal(
+    return Code.UNIT_UNKNOWN.error(
         f"{label}: expected to know the unit of its lengths, which neither the file nor its format "
         'says; give it as unit="m" or unit="mm", or as --unit on the command line',
         list(METRES_PER_UNIT),
@@ -55,7 +55,7 @@ def no_unit_error(label: str) -> CalibrationError:
 def check_length(metres: float, label: str) -> None:
     """Raise UNIT_UNKNOWN for a length, metres, that does not occur in a robot's cell."""
     if metres > MAX_UNASKED_M:
-        raise Code.UNIT_UNKNOWN.refusal(
+        raise Code.UNIT_UNKNOWN.error(
             f"{label}: expected at most {MAX_UNASKED_M:g} m, got {metres:g} m; is it in "
             'millimetres? Give unit="mm" then, or unit="m" if it is not',
             MAX_UNASKED_M,
@@ -67,7 +67,7 @@ def check_angles(radians: Sequence[float], label: str) -> None:
     """Raise UNIT_UNKNOWN for angles of more than a whole turn."""
     largest = max(map(abs, radians))
     if largest > MAX_ANGLE:
-        raise Code.UNIT_UNKNOWN.refusal(
+        raise Code.UNIT_UNKNOWN.error(
             f"{label}: expected angles in radians, a whole turn at most, got {largest:g}; are they "
             "in degrees? Multiply them by pi / 180",
             2 * math.pi,

@@ -48,7 +48,7 @@ class TargetView(storage.Stored):
     Raises:
         CalibrationError: ``SHAPE``: the target or the size is not valid, arrays do not fit
             together, or ids are unknown to the target, repeated or not ascending; ``NOT_FINITE``;
-            ``NO_COVARIANCE``.
+            ``NOT_A_COVARIANCE``.
     """
 
     _label: ClassVar[str] = "view"
@@ -73,7 +73,7 @@ class TargetView(storage.Stored):
         points = as_points(self.points, 2, f"{label}: points").copy()
         if len(points) != len(ids):
             expected = f"{label}: points: expected shape ({len(ids)}, 2) as there are ids"
-            raise Code.SHAPE.unexpected(expected, (len(ids), 2), points.shape)
+            raise Code.SHAPE.error_with_value(expected, (len(ids), 2), points.shape)
         covariance = as_covariances(self.covariance, len(ids), f"{label}: covariance").copy()
         check_size(self.size, label)
         for name, value in (("ids", ids), ("points", points), ("covariance", covariance)):
@@ -129,7 +129,7 @@ def check_type(value: Any, types: type | tuple[type, ...], label: str) -> Any:
     if isinstance(value, types):
         return value
     type_names = [type_.__name__ for type_ in (types if isinstance(types, tuple) else (types,))]
-    raise Code.SHAPE.unexpected(
+    raise Code.SHAPE.error_with_value(
         f"{label}: expected a {' or '.join(type_names)}", type_names, describe_type(value)
     )
 
@@ -149,7 +149,7 @@ def as_views(views: Iterable[TargetView], label: str) -> list[TargetView]:
 def as_list(values: Any, types: type | tuple[type, ...], label: str) -> list[Any]:
     """Return values as a list; raise SHAPE unless each is of one of the types."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: expected a list of them", "a list", describe_type(values)
         )
     return [check_type(value, types, f"{label} {number}") for number, value in enumerate(values)]
@@ -158,15 +158,15 @@ def as_list(values: Any, types: type | tuple[type, ...], label: str) -> list[Any
 def as_covariances(values: Any, count: int, label: str) -> Array:
     """Return covariances of points in an image, (``count``, 2, 2).
 
-    Raises SHAPE or NOT_FINITE; or NO_COVARIANCE: a matrix is not symmetric or has a negative
+    Raises SHAPE or NOT_FINITE; or NOT_A_COVARIANCE: a matrix is not symmetric or has a negative
     variance.
     """
     try:
         matrices = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.unexpected(f"{label}: expected numbers", (count, 2, 2), exc) from exc
+        raise Code.SHAPE.error_with_value(f"{label}: expected numbers", (count, 2, 2), exc) from exc
     if matrices.shape != (count, 2, 2):
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: expected shape ({count}, 2, 2)", (count, 2, 2), matrices.shape
         )
     covariances = as_points(matrices.reshape(-1, 4), 4, label).reshape(-1, 2, 2)
@@ -182,7 +182,7 @@ def as_covariances(values: Any, count: int, label: str) -> Array:
     wrong = np.flatnonzero(uneven | negative | (trace < 0))
     if len(wrong):
         matrix = covariances[wrong[0]].tolist()
-        raise Code.NO_COVARIANCE.refusal(
+        raise Code.NOT_A_COVARIANCE.error(
             f"{label}: expected symmetric matrices of no negative variance, got {matrix} in row "
             f"{wrong[0]}",
             "covariances",
@@ -195,19 +195,19 @@ def _as_ids(values: Any, point_count: int, label: str) -> np.ndarray[tuple[int],
     try:
         array = np.asarray(values)
     except ValueError as exc:
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: ids: expected whole numbers", "(N,)", str(exc)
         ) from exc
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         received = f"{array.dtype} of shape {array.shape}"
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: ids: expected whole numbers of shape (N,)", "(N,)", received
         )
     wrong = array[(array < 0) | (array >= point_count)]
     if len(wrong) and wrong[0] < 0:
-        raise Code.SHAPE.unexpected(f"{label}: ids: expected 0 or more", 0, int(wrong[0]))
+        raise Code.SHAPE.error_with_value(f"{label}: ids: expected 0 or more", 0, int(wrong[0]))
     if len(wrong):
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: ids: expected less than {point_count}", point_count, int(wrong[0])
         )
     ids = array.astype(np.intp)
@@ -215,5 +215,5 @@ def _as_ids(values: Any, point_count: int, label: str) -> np.ndarray[tuple[int],
     if len(unsorted):
         received = ids[unsorted[0] : unsorted[0] + 2].tolist()
         expected = f"{label}: ids: expected each once, ascending (points in the order of the ids)"
-        raise Code.SHAPE.unexpected(expected, "ascending", received)
+        raise Code.SHAPE.error_with_value(expected, "ascending", received)
     return ids

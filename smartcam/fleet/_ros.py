@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from smartcam._client._inside import Interpretation
     from smartcam.calibration import HandEyeCalibration
-    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.calibration._inside import CalibrationsByCamera
     from smartcam.fleet._bus.address import FleetAddress
     from smartcam.frames import FrameSource
     from smartcam.models import Calibration
@@ -86,7 +86,7 @@ class RosFleet(Server):
         hand_eyes: hand-eye calibrations of the cameras, by name.
         wanted: function of an agent's name and a camera's name that returns whether the camera
             gets a node.
-        desks: calibrations of the agent's cameras; None if there is no folder for them.
+        calibrations_by_camera: calibrations made by the agent; None if there is no folder for them.
 
     Raises:
         ConfigurationError: the domain is not valid, or rclpy is wanted and not installed.
@@ -107,9 +107,9 @@ class RosFleet(Server):
         calibrations: Mapping[str, Calibration] | None = None,
         hand_eyes: Mapping[str, HandEyeCalibration] | None = None,
         wanted: Callable[[str, str], bool] = lambda _agent, _camera: True,
-        desks: CalibrationDesks | None = None,
+        calibrations_by_camera: CalibrationsByCamera | None = None,
     ) -> None:
-        self._desks = desks
+        self._calibrations_by_camera = calibrations_by_camera
         self._section, self._camera_options, self._wanted = section, dict(cameras or {}), wanted
         self._settings, self._frames = settings or {}, frames or {}  # the server adds entries later
         self._hand_eyes, self._controls = hand_eyes or {}, controls or {}
@@ -194,7 +194,9 @@ class RosFleet(Server):
             is_agent_alive=lambda: camera.met,
             frames=self._frames.get(name, {}),
             controls=self._controls.get(name),
-            calibrations=None if self._desks is None else self._desks.of(name),
+            calibrations=None
+            if self._calibrations_by_camera is None
+            else self._calibrations_by_camera.of(name),
         )
 
     @property

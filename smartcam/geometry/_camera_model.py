@@ -48,7 +48,7 @@ def _as_coefficients(values: ArrayLike) -> Array:
     try:
         coefficients = np.reshape(values, (-1, 1))
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"distortion: expected numbers of shape (K,): {exc!s:.200}", "(K,)"
         ) from exc
     return as_points(coefficients, 1, "distortion")[:, 0].copy()
@@ -79,12 +79,12 @@ class CameraModel(Stored):
         count = len(coefficient_names(self.distortion_model))
         distortion = _as_coefficients(self.distortion)
         if len(distortion) != count:
-            raise Code.SHAPE.unexpected(
+            raise Code.SHAPE.error_with_value(
                 f"{self.distortion_model}: expected {count} coefficients", count, len(distortion)
             )
         has_form = matrix.shape == (3, 3) and not (matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).any()
         if not (has_form and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[2, 2] == 1):
-            raise Code.SHAPE.unexpected(
+            raise Code.SHAPE.error_with_value(
                 "camera matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal "
                 "lengths and no skew",
                 "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",

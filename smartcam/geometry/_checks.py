@@ -19,7 +19,7 @@ def check_choice(value: object, among: Sequence[str], label: str) -> None:
     if not isinstance(word, str) or word not in among:
         known = list(among)
         message = f"{label}: expected one of {known}, got {excerpt(value)}"
-        raise Code.SHAPE.refusal(message, known, value)
+        raise Code.SHAPE.error(message, known, value)
 
 
 def check_size(values: Any, label: str) -> None:
@@ -28,4 +28,4 @@ def check_size(values: Any, label: str) -> None:
     is_pair = isinstance(values, tuple | list) and len(values) == 2
     if not is_pair or not all(isinstance(value, integers) and value > 0 for value in values):
         expected = f"{label}: size: expected width and height in pixels"
-        raise Code.SHAPE.unexpected(expected, "(width, height)", values)
+        raise Code.SHAPE.error_with_value(expected, "(width, height)", values)

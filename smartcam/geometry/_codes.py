@@ -142,18 +142,18 @@ class Code(enum.StrEnum):
     """A file of another program that does not follow its format."""
 
     # covariances and known lenses
-    NO_COVARIANCE = "NO_COVARIANCE"
+    NOT_A_COVARIANCE = "NOT_A_COVARIANCE"
     """A matrix that is not a covariance: not symmetric, or with a negative variance."""
     SWAPPED_LENSES = "SWAPPED_LENSES"
     """The known lenses of the two cameras are exchanged."""
     WRONG_LENS = "WRONG_LENS"
     """A known lens reproduces the views worse than a lens that is fitted to them."""
 
-    def refusal(self, text: str, expected: object = None, got: object = None) -> CalibrationError:
+    def error(self, text: str, expected: object = None, got: object = None) -> CalibrationError:
         """Return an error; ``text`` names the expected and the given value."""
         return CalibrationError(text, code=self, expected=expected, got=got)
 
-    def unexpected(
+    def error_with_value(
         self, text: str, expected: object = None, got: object = None
     ) -> CalibrationError:
         """Return an error; ``text`` names the expected value, and ``got`` is appended."""
@@ -161,7 +161,7 @@ class Code(enum.StrEnum):
             shown_value = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
         except Exception:  # noqa: BLE001 - a foreign class may raise any
             shown_value = excerpt(got)
-        return self.refusal(f"{text}, got {shown_value}", expected, got)
+        return self.error(f"{text}, got {shown_value}", expected, got)
 
     def remark(self, text: str) -> Remark:
         """Return a remark with this code."""

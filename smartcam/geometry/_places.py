@@ -123,7 +123,7 @@ class PlacePattern(Sequence[Transform]):
         lengths = float(np.linalg.norm(row_vector)), float(np.linalg.norm(column_vector))
         sine = float(np.linalg.norm(normal)) / max(lengths[0] * lengths[1], 1e-300)
         if not sine >= MIN_SINE:
-            raise Code.NOT_RIGID.refusal(
+            raise Code.NOT_RIGID.error(
                 f"{caller}: expected a row and a column at 30 degrees or more to each other, got "
                 f"{math.degrees(math.asin(min(sine, 1.0))):.3g} degrees",
                 MIN_SINE,

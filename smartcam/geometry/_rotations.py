@@ -42,22 +42,22 @@ def as_points(values: ArrayLike, columns: int, label: str) -> Array:
             raise TypeError("got complex numbers")
         points = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"{label}: expected numbers of shape (N, {columns}): {exc!s:.200}", f"(N, {columns})"
         ) from exc
     if points.ndim != 2 or points.shape[1] != columns:
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: expected shape (N, {columns})", f"(N, {columns})", points.shape
         )
     if not np.isfinite(points).all():
         row = int(np.argmin(np.isfinite(points).all(axis=1)))
-        raise Code.NOT_FINITE.refusal(
+        raise Code.NOT_FINITE.error(
             f"{label}: expected finite numbers, got {points[row].tolist()} in row {row}",
             "finite numbers",
             points[row].tolist(),
         )
     if points.size and not np.abs(points).max() <= MAX_COORDINATE:
-        raise Code.NOT_FINITE.refusal(
+        raise Code.NOT_FINITE.error(
             f"{label}: expected numbers up to {MAX_COORDINATE:g}, got {np.abs(points).max():g}",
             MAX_COORDINATE,
             float(np.abs(points).max()),
@@ -81,7 +81,7 @@ def check_finite(values: Array, label: str) -> None:
 
 def not_finite_error(label: str, actual: object) -> CalibrationError:
     """Return the error for a calibration's result that is not finite."""
-    return Code.NOT_FINITE.refusal(
+    return Code.NOT_FINITE.error(
         f"{label}: expected finite numbers, the calibration gives {actual}: it is damaged, or this "
         "is far outside of what it was made for",
         "finite numbers",
@@ -164,7 +164,7 @@ def frame_from_axes(x: ArrayLike, y: ArrayLike) -> Array:
     first, second = as_vector(x, 3, "first axis"), as_vector(y, 3, "second axis")
     lengths = np.linalg.norm(first), np.linalg.norm(second)
     if not all(lengths):
-        raise Code.COINCIDENT.refusal(
+        raise Code.COINCIDENT.error(
             "axes of a plane: expected two directions, got a vector of length 0",
             "two directions",
             min(map(float, lengths)),
@@ -175,7 +175,7 @@ def frame_from_axes(x: ArrayLike, y: ArrayLike) -> Array:
     normal = np.cross(first, second)
     sine = float(np.linalg.norm(normal))
     if sine < MIN_SINE:
-        raise Code.COLLINEAR.refusal(
+        raise Code.COLLINEAR.error(
             f"axes of a plane: expected at least 10 degrees between them, "
             f"got {math.degrees(math.asin(sine)):.2g}",
             MIN_SINE,

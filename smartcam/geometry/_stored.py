@@ -222,7 +222,7 @@ def _validate(kind: Any, data: Any, called: str, **known: Any) -> Any:
 
 def invalid_data_error(called: str, text: str, actual: object) -> CalibrationError:
     """Return the error for stored data that are not valid."""
-    return Code.SHAPE.refusal(f"stored {called}: {text}", got=actual)
+    return Code.SHAPE.error(f"stored {called}: {text}", got=actual)
 
 
 def check_counts(fields: Mapping[str, Any], names: Iterable[str], count: int, called: str) -> None:

@@ -69,7 +69,7 @@ class Transform:
         """Make read-only copies, and check them."""
         for name in (self.target, self.source):
             if not isinstance(name, str):
-                raise Code.SHAPE.refusal(
+                raise Code.SHAPE.error(
                     "transform: expected names of two frames, then a rotation and a translation, "
                     f"got {type(name).__name__} in place of a name",
                     "names of frames",
@@ -78,7 +78,7 @@ class Transform:
         rotation = _numbers(self.rotation, f"{self.label}: rotation")
         translation = _numbers(self.translation, f"{self.label}: translation")
         if rotation.shape != (3, 3) or translation.shape != (3,):
-            raise Code.NOT_RIGID.refusal(
+            raise Code.NOT_RIGID.error(
                 f"{self.label}: expected a (3, 3) rotation and a (3,) translation, got "
                 f"{rotation.shape} and {translation.shape}",
                 ((3, 3), (3,)),
@@ -90,7 +90,7 @@ class Transform:
         is_too_far = not np.abs(translation).max() <= MAX_COORDINATE
         if not (error < _MAX_ORTHONORMAL_DEVIATION and determinant > 0) or is_too_far:
             mirror = " (a reflection: one of the frames is left-handed)" if determinant < 0 else ""
-            raise Code.NOT_RIGID.refusal(
+            raise Code.NOT_RIGID.error(
                 f"{self.label}: expected a rotation and a finite translation, got a matrix of "
                 f"determinant {determinant:.6g}{mirror}, off by {error:.3g}, and "
                 f"{translation.tolist()}",
@@ -98,7 +98,7 @@ class Transform:
                 determinant,
             )
         if self.at is not None and getattr(self.at, "tzinfo", None) is None:
-            raise Code.BAD_TIME.unexpected(
+            raise Code.BAD_TIME.error_with_value(
                 f"{self.label}: expected a time with its time zone", "a time zone", self.at
             )
         rotation.flags.writeable = translation.flags.writeable = False
@@ -130,7 +130,7 @@ class Transform:
         with np.errstate(all="ignore"):
             length = float(np.linalg.norm(values))
         if values.shape != (4,) or not abs(length - 1.0) < _MAX_UNIT_DEVIATION:
-            raise Code.NOT_RIGID.refusal(
+            raise Code.NOT_RIGID.error(
                 f"T_{target}_{source}: expected a quaternion x, y, z, w of length 1, got "
                 f"{values.tolist()} of length {length:.6g}",
                 1.0,
@@ -147,7 +147,9 @@ class Transform:
             CalibrationError: ``NOT_RIGID``, ``BAD_TIME``.
         """
         if not isinstance(pose, Pose):
-            raise Code.SHAPE.unexpected("from_pose: expected a Pose", "Pose", type(pose).__name__)
+            raise Code.SHAPE.error_with_value(
+                "from_pose: expected a Pose", "Pose", type(pose).__name__
+            )
         header = pose.header
         return cls.from_quaternion(
             header.frame_id, source, pose.position, pose.orientation, header.stamp
@@ -175,7 +177,7 @@ class Transform:
             CalibrationError: ``BAD_TIME``: the transform has no time, which a pose needs.
         """
         if self.at is None:
-            raise Code.BAD_TIME.refusal(
+            raise Code.BAD_TIME.error(
                 f"{self.label}: expected a time for the pose's header, got none", "a time"
             )
         position = Position(*self.translation.tolist())
@@ -199,14 +201,14 @@ class Transform:
         """
         as_motion(other, f"{self.label} @", self.source, "source")
         if self.source != other.target:
-            raise Code.WRONG_FRAME.refusal(
+            raise Code.WRONG_FRAME.error(
                 f"{self.label} @ {other.label}: expected a transform into {self.source!r}, got one "
                 f"into {other.target!r}",
                 self.source,
                 other.target,
             )
         if self.at is not None and other.at is not None and self.at != other.at:
-            raise Code.NOT_SIMULTANEOUS.refusal(
+            raise Code.NOT_SIMULTANEOUS.error(
                 f"{self.label} @ {other.label}: expected both at one time, got {self.at} and "
                 f"{other.at}",
                 self.at,
@@ -232,11 +234,11 @@ class Transform:
             CalibrationError: ``WRONG_FRAME``; ``BAD_TIME``: the moment is not between the two.
         """
         if (self.target, self.source) != (later.target, later.source):
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"between: expected two of {self.label}", self.label, later.label
             )
         if self.at is None or later.at is None or not self.at <= at <= later.at:
-            raise Code.BAD_TIME.unexpected(
+            raise Code.BAD_TIME.error_with_value(
                 f"{self.label}: expected a time between {self.at} and {later.at}",
                 (self.at, later.at),
                 at,
@@ -258,7 +260,7 @@ def _numbers(values: ArrayLike, label: str) -> Array:
             raise TypeError("got complex numbers")
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.NOT_RIGID.refusal(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
+        raise Code.NOT_RIGID.error(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
 
 
 def _rows(values: ArrayLike, count: int, label: str) -> Array:
@@ -268,9 +270,9 @@ def _rows(values: ArrayLike, count: int, label: str) -> Array:
             raise TypeError("got complex numbers")
         rows = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.refusal(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
+        raise Code.SHAPE.error(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
     if rows.shape[-1:] != (count,):
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: expected shape (..., {count})", f"(..., {count})", rows.shape
         )
     return rows
@@ -282,7 +284,7 @@ def as_motion(value: object, label: str, target: str, source: str) -> Transform:
         return value
     shape = np.shape(value) if isinstance(value, np.ndarray) else ()
     kind = "None" if value is None else type(value).__name__
-    raise Code.SHAPE.refusal(
+    raise Code.SHAPE.error(
         f"{label}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
         f'matrix M (4, 4) it is Transform("{target}", "{source}", M[:3, :3], M[:3, 3])',
         "Transform",
@@ -317,10 +319,10 @@ class PoseHistory:
                 differ from those of earlier transforms.
         """
         if transform.at is None:
-            raise Code.BAD_TIME.refusal(f"{transform.label}: expected a time, got none", got=None)
+            raise Code.BAD_TIME.error(f"{transform.label}: expected a time, got none", got=None)
         if self._transforms and transform.label != self._transforms[0].label:
             expected_label = self._transforms[0].label
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"pose history: expected {expected_label} as before",
                 expected_label,
                 transform.label,
@@ -345,7 +347,7 @@ class PoseHistory:
             known = (
                 f"from {self._times[0]} to {self._times[-1]}" if self._times else "that is known"
             )
-            raise Code.BAD_TIME.refusal(
+            raise Code.BAD_TIME.error(
                 f"pose history: expected a time {known}, got {moment}: nothing is extrapolated",
                 known,
                 moment,
@@ -353,7 +355,7 @@ class PoseHistory:
         before, after = self._transforms[index - 1 : index + 1]
         gap = self._times[index] - self._times[index - 1]
         if gap > self._max_gap:
-            raise Code.BAD_TIME.refusal(
+            raise Code.BAD_TIME.error(
                 f"{before.label}: expected two poses at most {self._max_gap.total_seconds():g} s "
                 f"apart around {moment}, got {gap.total_seconds():g} s",
                 self._max_gap,

@@ -13,8 +13,8 @@ from smartcam.calibration._detection.grid_growing import (
 )
 from smartcam.calibration._detection.image import grey_image, resize_image
 from smartcam.calibration._detection.markers import (
+    MAX_MEAN_OUTLINES,
     MAX_OUTLINES,
-    MAX_OUTLINES_OF_ALL_WINDOWS,
     WINDOWS_PX,
     Markers,
     _outlines,

@@ -314,7 +314,7 @@ async def in_ros1(folder: Path, **more: Any) -> AsyncIterator[Face]:
         address = FleetAddress.parse(server.address.url)
         section = RosSection.model_validate({})
         given = (bridge.url, lambda _: None, address, section)
-        async with run_bridged_nodes(*given, desks=server.calibrations) as ros:
+        async with run_bridged_nodes(*given, calibrations_by_camera=server.calibrations) as ros:
             await ros.wait_first_attempts()
             face = Ros1Face(server, bridge)
             async with running(face.run_robot()):

@@ -21,7 +21,7 @@ from smartcam.calibration import (
     calibrate_hand_eye_from_poses,
     calibrate_intrinsics,
     calibrate_stereo,
-    compare,
+    compare_lenses,
     find_target,
 )
 from smartcam.geometry._inside import Code
@@ -121,7 +121,7 @@ def test_lenses_of_random_halves_differ_as_they_predict(side: str) -> None:
     found = []
     for both in halves(len(views(side))):
         pair = [calibrate_intrinsics([views(side)[i] for i in half]) for half in both]
-        ratio = compare(*pair).ratio
+        ratio = compare_lenses(*pair).ratio
         assert ratio is not None
         found.append(ratio)
     check_z(f"lens of OpenCV's {side} pictures", found)

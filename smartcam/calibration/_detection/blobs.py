@@ -26,22 +26,22 @@ MIN_SPOT_PIXELS = 9
 """A spot has at least this many pixels."""
 
 MIN_SPECK_PIXELS, MAX_SPECK_PIXELS = 3, 24
-"""Least and largest area of a speck, a dot of a few pixels; smaller ones are noise."""
+"""Least and largest area of a speck, a spot of a few pixels; smaller ones are noise."""
 
 MAX_PART_OF_IMAGE = 1 / 16
 """A spot covers at most this part of the image's area: a grid has nine dots or more."""
 
 MIN_ELLIPSE_SHARE = 0.85
-"""A dot fills at least this part of the ellipse with its second moments: rectangles fill 0.955,
+"""A spot fills at least this part of the ellipse with its second moments: rectangles fill 0.955,
 triangles 0.83."""
 
 MAX_ASPECT_RATIO = 6.0
-"""A dot is at most this many times as long as wide, like a circle at a tilt of 80 degrees."""
+"""A spot is at most this many times as long as wide, like a circle at a tilt of 80 degrees."""
 
 
 MIN_RECTANGLE_SHARE = 0.2
-"""A dot fills at least this part of the upright rectangle around it. A slanted ellipse six times as
-long as wide fills 0.22 of its rectangle if MIN_ELLIPSE_SHARE of the ellipse is filled."""
+"""A spot fills at least this part of the upright rectangle around it. A slanted ellipse six times
+as long as wide fills 0.22 of its rectangle if MIN_ELLIPSE_SHARE of the ellipse is filled."""
 
 
 class Spots(NamedTuple):
@@ -93,8 +93,8 @@ class Pieces(NamedTuple):
 def find_dark_pieces(image: NDArray[np.uint8], window: int) -> Pieces:
     """Return the dark pieces of an image (H, W).
 
-    ``window``: side of the square around each pixel with whose mean the pixel is compared, about
-    twice the distance between dots.
+    ``window``: side of the square around a pixel, about twice the distance between dots. The pixel
+    is compared with the mean of this square.
     """
     cv2 = load("cv2")
     smooth = cv2.blur(image, (3, 3))

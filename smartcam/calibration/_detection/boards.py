@@ -58,7 +58,7 @@ MIN_SQUARE_PIXELS = 9.0
 pixels^2."""
 
 MAX_REACH_PX = 8.0
-"""At most this many pixels around a corner are fitted: enough to see whether there is a corner."""
+"""Only pixels up to this distance from a corner are fitted: they show whether there is a corner."""
 
 MAX_CORNERS_JUDGED = 24
 """At most this many corners of a candidate are checked to decide whether it is a board."""
@@ -170,7 +170,8 @@ def find_boards(image: GreyImage, wanted_count: int, *, max_count: int) -> Itera
                 break
         if largest:
             size = _grid_size(largest)
-            has_twin = any(_grid_size(other) == size for other in grid_search)  # the rest
+            # the grids that the loop above has not taken
+            has_twin = any(_grid_size(other) == size for other in grid_search)
             points = (saddles.points[list(largest.values())] + 0.5) * factor - 0.5
             yield Board(points, np.array(list(largest), dtype=np.intp), has_twin).trim_rim()
 

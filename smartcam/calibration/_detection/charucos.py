@@ -93,6 +93,7 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     edge_steps = local_steps(
         partial(apply_homography, matrix), board_points, FITTED_SHARE * target.square
     )
+    # from an edge to one pixel before the marker beside it
     arm_widths = (1 - target.marker / target.square) / 2 / FITTED_SHARE - 1 / np.linalg.norm(
         edge_steps, axis=2
     )
@@ -123,22 +124,22 @@ def _find_board(image: GreyImage, target: Charuco) -> _Sighting:
     corner_count = len(sighting.ids)
     if sighting.other_pattern_count >= max(MIN_CORNERS, sighting.agreeing_count + 1):
         raise _other_pattern_error(target, sighting)
-    check_one_board(sighting.agreeing_count, sighting.contrary_count, _name(target))
+    check_one_board(sighting.agreeing_count, sighting.second_board_count, _name(target))
     if 2 * corner_count > max(len(target.points), 4 * MIN_CORNERS):
         return sighting
     if sighting.marker_side and len(_search_sizes(_flipped(image), target).ids) >= max(
         MIN_CORNERS, 2 * corner_count
     ):
-        raise Code.MIRRORED.refusal(
+        raise Code.MIRRORED.error(
             f"{_name(target)}: expected an image of the sheet "
             "as one reads it, got one that is mirrored",
             "the sheet as one reads it",
             "its mirror image",
         )
     if corner_count < MIN_CORNERS:
-        text = f"beside {sighting.marker_count} markers of its dictionary"
+        text = f"corners and {sighting.marker_count} markers of its dictionary"
         if sighting.marker_count:
-            text += f", of which {sighting.agreeing_count} stand to each other as on such a board"
+            text += f", {sighting.agreeing_count} of them arranged as on the board"
         raise _not_found_error(target, text, corner_count)
     return sighting
 
@@ -146,11 +147,10 @@ def _find_board(image: GreyImage, target: Charuco) -> _Sighting:
 def _other_pattern_error(target: Charuco, sighting: _Sighting) -> CalibrationError:
     """Return the error for markers that are arranged as in the other ``legacy_pattern``."""
     expected, other = target.legacy_pattern, not target.legacy_pattern
-    return Code.WRONG_TARGET.refusal(
+    return Code.WRONG_TARGET.error(
         f"{_name(target)}: expected markers as "
-        f"legacy_pattern={expected} has them, of which {sighting.agreeing_count} stand to each "
-        f"other as on that board; got {sighting.other_pattern_count} that stand as "
-        f"legacy_pattern={other} has them",
+        f"legacy_pattern={expected} has them; got {sighting.agreeing_count} that are arranged so, "
+        f"and {sighting.other_pattern_count} arranged as with legacy_pattern={other}",
         f"legacy_pattern={expected}",
         f"legacy_pattern={other}",
     )
@@ -170,7 +170,7 @@ class _Sighting(NamedTuple):
     points: Array  # (N, 2), pixels
     marker_count: int  # number of markers that were read, whether or not they lie as on the board
     agreeing_count: int  # number of read markers that are arranged as on the board
-    contrary_count: int  # number of other markers that lie as on a second board
+    second_board_count: int  # number of other markers that lie as on a second board
     other_pattern_count: int  # number of markers arranged as with the other legacy_pattern
     stray_ids: tuple[int, ...]  # ids of the markers that were left out
     # side of a marker, pixels of the given image: that of the markers that were read; if none was
@@ -227,7 +227,7 @@ def _search_image(
         return best
     board_corners = _marker_corners(board)
     markers = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), ids_read.ravel())
-    mask, contrary_count = compare_with_board(markers, board_corners)
+    mask, second_board_count = compare_with_board(markers, board_corners)
     stray_ids = tuple(sorted(markers.ids[~mask].tolist()))
     other_pattern_count = 0
     if target.rows % 2 == 0:
@@ -238,7 +238,7 @@ def _search_image(
     best = best._replace(
         marker_count=max(best.marker_count, len(mask)),
         agreeing_count=max(best.agreeing_count, int(mask.sum())),
-        contrary_count=max(best.contrary_count, contrary_count),
+        second_board_count=max(best.second_board_count, second_board_count),
         other_pattern_count=max(best.other_pattern_count, other_pattern_count),
     )
     if not mask.any():
@@ -329,7 +329,7 @@ def _side_in_grid(quads: Sequence[Array], board: Any) -> float:
 
 
 def _not_found_error(target: Charuco, reason: str, count: int) -> CalibrationError:
-    return Code.TARGET_NOT_FOUND.refusal(
+    return Code.TARGET_NOT_FOUND.error(
         f"charuco: expected at least {MIN_CORNERS} corners of a board of {target.columns} x "
         f"{target.rows} squares, found {count} {reason}",
         MIN_CORNERS,

@@ -51,9 +51,9 @@ MAX_STRAY_PX = 0.5
 """A corner is a stray if it is farther from its predicted place than this many pixels plus four
 times the median distance."""
 
-OUTER_AREA_RATIO = 0.8
-"""Only this part of the diameter of the area outside of a corner is averaged, which leaves out the
-area's rim."""
+AVERAGED_DOT_RATIO = 0.8
+"""Only this part of the diameter of the dot outside of a corner is averaged, which leaves out the
+dot's rim."""
 
 DOT_RING_SIDES = 0.3
 """Distance from the centre of the dot at the origin to the paper around it, in sides of a
@@ -82,16 +82,16 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
         if not _has_board_colours(corners, part):
             continue
         corners = _refit_strays(image, corners, candidate.is_seen, part)
-        numberings = find_arrangements(
+        arrangements = find_arrangements(
             corners.points, positions_row_by_row(part.columns, part.rows), part
         )
         if part == target:
-            arrangement, margin = _number_board(image, target, corners, numberings)
+            arrangement, margin = _number_board(image, target, corners, arrangements)
         else:
-            numbered = _number_part(image, part, corners, numberings)
-            if numbered is None:
+            arranged = _number_part(image, part, corners, arrangements)
+            if arranged is None:
                 continue
-            arrangement, margin = numbered
+            arrangement, margin = arranged
         break
     else:
         raise _not_found_error(target, search)
@@ -259,7 +259,7 @@ def _not_found_error(target: Checkerboard, search: _Search) -> CalibrationError:
     """Return the error that says which board was found instead, if there is one."""
     counts = search.largest_counts
     instead = "found none" if counts is None else f"found one of about {counts[0]} x {counts[1]}"
-    return Code.TARGET_NOT_FOUND.refusal(
+    return Code.TARGET_NOT_FOUND.error(
         f"checkerboard: expected a board of {target.columns} x {target.rows} inner corners that is "
         f"seen as a whole, {instead}",
         (target.columns, target.rows),
@@ -268,30 +268,32 @@ def _not_found_error(target: Checkerboard, search: _Search) -> CalibrationError:
 
 
 def _number_board(
-    image: GreyImage, target: Checkerboard, corners: Corners, numberings: list[Arrangement]
+    image: GreyImage, target: Checkerboard, corners: Corners, arrangements: list[Arrangement]
 ) -> tuple[Arrangement, float | None]:
     name = f"checkerboard of {target.columns} x {target.rows} corners"
     if target.origin_mark:
         levels_by_origin = {
             int(arrangement.order[0, 0]): _origin_levels(image, target, corners, arrangement)
-            for arrangement in numberings
+            for arrangement in arrangements
         }
         mean_black, mean_white = np.mean(
             [[levels.black, levels.white] for levels in levels_by_origin.values()], axis=0
         )
-        outside_count = sum(levels.area is None for levels in levels_by_origin.values())
+        outside_count = sum(levels.dot is None for levels in levels_by_origin.values())
         note = (
-            f" ({outside_count} of the 4 such areas outside of the image)" if outside_count else ""
+            f" ({outside_count} of its 4 possible places outside of the image)"
+            if outside_count
+            else ""
         )
 
         def level(order: NDArray[np.intp]) -> float:
             """Return the grey level outside of the origin, corrected for uneven light."""
-            black, white, area_level = levels_by_origin[int(order[0, 0])]
-            share = 1.0 if area_level is None else (area_level - black) / max(white - black, 1.0)
+            black, white, dot_level = levels_by_origin[int(order[0, 0])]
+            share = 1.0 if dot_level is None else (dot_level - black) / max(white - black, 1.0)
             return float(mean_black + (mean_white - mean_black) * share)
 
-        return choose_marked(numberings, level, f"{name} with a dark area at the origin{note}")
-    front_views = [arrangement for arrangement in numberings if arrangement.is_front]
+        return choose_marked(arrangements, level, f"{name} with a dark dot at the origin{note}")
+    front_views = [arrangement for arrangement in arrangements if arrangement.is_front]
     with_black_origin = [
         arrangement
         for arrangement in front_views
@@ -299,16 +301,16 @@ def _number_board(
     ]
     if front_views and not with_black_origin and target.columns % 2 == target.rows % 2 == 1:
         raise _white_origin_error(target, name)
-    return choose_rightward(with_black_origin or numberings, name), None
+    return choose_rightward(with_black_origin or arrangements, name), None
 
 
 def _white_origin_error(target: Checkerboard, label: str) -> CalibrationError:
-    """Return the error for a board whose black corners are where the target has white ones.
+    """Return the error for a board whose corner squares are black where the target's are white.
 
-    If columns and rows are both odd and differ, two opposite outer corners are black, and no turn
-    of the sheet brings a white corner to the place of a black one.
+    If columns and rows are both odd and differ, two opposite corner squares are black, and no turn
+    of the sheet brings a white one to the place of a black one.
     """
-    return Code.MIRRORED.refusal(
+    return Code.MIRRORED.error(
         f"{label}: expected a black square outside of the corner at the origin, got a white one: "
         "an image that is mirrored, or a negative, or the board is one of "
         f"{target.rows} x {target.columns}",
@@ -318,7 +320,7 @@ def _white_origin_error(target: Checkerboard, label: str) -> CalibrationError:
 
 
 def _number_part(
-    image: GreyImage, part: Checkerboard, corners: Corners, numberings: list[Arrangement]
+    image: GreyImage, part: Checkerboard, corners: Corners, arrangements: list[Arrangement]
 ) -> tuple[Arrangement, float] | None:
     """Return the numbering of a part of a board by its mark; None if no mark is seen.
 
@@ -326,20 +328,20 @@ def _number_part(
     that meet there. So a dark place inside of the board, or on another object, is not taken for the
     mark.
     """
-    numbered = []
-    for arrangement in numberings:
+    arranged = []
+    for arrangement in arrangements:
         if not arrangement.is_front or _black_origin_score(part, corners, arrangement) <= 0:
             continue
         levels = _origin_levels(image, part, corners, arrangement)
         paper_level = min(_paper_levels(image, corners.points[arrangement.order]), default=0.0)
         threshold = (levels.black + levels.white) / 2
         if (
-            levels.area is not None
-            and paper_level - levels.area >= MIN_ORIGIN_CONTRAST
+            levels.dot is not None
+            and paper_level - levels.dot >= MIN_ORIGIN_CONTRAST
             and paper_level > threshold
         ):
-            numbered.append((arrangement, paper_level - levels.area))
-    return numbered[0] if len(numbered) == 1 else None
+            arranged.append((arrangement, paper_level - levels.dot))
+    return arranged[0] if len(arranged) == 1 else None
 
 
 def _paper_levels(image: GreyImage, grid: Array) -> Iterator[float]:
@@ -367,7 +369,7 @@ class _OriginLevels(NamedTuple):
 
     black: float  # mean level of the two black squares next to the corner
     white: float  # mean level of the two white squares next to the corner
-    area: float | None  # level of the area outside of the corner; None if not in the image
+    dot: float | None  # level where the origin's dot would be; None if that is not in the image
 
 
 def _origin_levels(
@@ -378,13 +380,13 @@ def _origin_levels(
         mean_level(image, _map_near_origin(grid, centre + FITTED_SHARE * DISC_POINTS))
         for centre in SQUARE_CENTRES
     )
-    area_places = (
+    dot_places = (
         target.corner_areas[0] / target.square
-        + OUTER_AREA_RATIO * AREA_DIAMETER_SQUARES / 2 * DISC_POINTS
+        + AVERAGED_DOT_RATIO * AREA_DIAMETER_SQUARES / 2 * DISC_POINTS
     )
-    area_pixels = _map_near_origin(grid, area_places)
-    is_inside = ((area_pixels >= 0) & (area_pixels <= np.array(image.size) - 1)).all()
-    level = mean_level(image, area_pixels) if is_inside else None
+    dot_pixels = _map_near_origin(grid, dot_places)
+    is_inside = ((dot_pixels >= 0) & (dot_pixels <= np.array(image.size) - 1)).all()
+    level = mean_level(image, dot_pixels) if is_inside else None
     return _OriginLevels(sum(square_levels[:2]) / 2, sum(square_levels[2:]) / 2, level)
 
 

@@ -52,9 +52,9 @@ SMALL_SIDE_PX = 800
 """A grid is searched first in an image whose longest side has at most this many pixels."""
 
 MIN_DOT_SHARE = 0.4
-"""The image is searched at twice its size only if at least this part of a grid's dots is found in
-rows and columns among dots of a few pixels. (Doubling the size separates dots that touch each other
-at the given size.)"""
+"""The image is searched at twice its size only if at least this part of the target's dots is found
+in rows and columns among the specks. (Doubling the size separates dots that touch each other at the
+given size.)"""
 
 NEIGHBOURS = 8
 """In a grid whose dots have only a few pixels, the next dots are searched among this many
@@ -65,7 +65,7 @@ EXTRA_SPOTS = 1000
 image has more spots, only the largest are examined."""
 
 MIN_DOTS_REPORTED = 9
-"""An error reports that dots in rows and columns were found only if at least this many were."""
+"""An error mentions dots in rows and columns if at least this many were found."""
 
 MAX_OFFSET_RATIO = 0.15
 """A dot may be this far from the place that the other dots predict, as a part of the distance
@@ -83,9 +83,9 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
     Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
     """
     counts = _SearchCounts()
-    for dark_image, points, numberings in _find_grids(image, target, counts):
-        if _is_complete(dark_image, target, points[numberings[0].order.ravel()]):
-            return _make_view(dark_image, target, points, numberings, name)
+    for dark_image, points, arrangements in _find_grids(image, target, counts):
+        if _is_complete(dark_image, target, points[arrangements[0].order.ravel()]):
+            return _make_view(dark_image, target, points, arrangements, name)
         counts.max_grid_count = len(points) + 1
     raise _not_found_error(target, counts)
 
@@ -107,16 +107,16 @@ def _find_grids(
     The image is the one in which the dots are dark: the given one or its negative.
     """
     for is_negative, scale, spots in _search_image(image.uint8_levels, target):
-        for points, grid_positions in _find_layouts(spots, target, counts):
+        for points, grid_positions in _find_full_grids(spots, target, counts):
             centres = (points + 0.5) / scale - 0.5
-            numberings = find_arrangements(centres, grid_positions, target)
-            if numberings and _fits_flat_grid(target, centres[numberings[0].order.ravel()]):
+            arrangements = find_arrangements(centres, grid_positions, target)
+            if arrangements and _fits_flat_grid(target, centres[arrangements[0].order.ravel()]):
                 dark_image = (
                     GreyImage(255 - image.levels, 255 - image.uint8_levels)
                     if is_negative
                     else image
                 )
-                yield dark_image, centres, numberings
+                yield dark_image, centres, arrangements
 
 
 def _search_image(
@@ -181,7 +181,7 @@ def _contain_grid(specks: Spots, target: CircleGrid) -> bool:
     )
 
 
-def _find_layouts(
+def _find_full_grids(
     spots: Spots, target: CircleGrid, counts: _SearchCounts
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
     """Yield grids with as many dots as the target: dots (N, 2) and their grid positions (N, 2)."""
@@ -275,9 +275,9 @@ def _ring_levels(image: GreyImage, grid_map: GridMap, positions: Array, radius: 
 
 
 def _make_view(
-    image: GreyImage, target: CircleGrid, points: Array, numberings: list[Arrangement], name: str
+    image: GreyImage, target: CircleGrid, points: Array, arrangements: list[Arrangement], name: str
 ) -> TargetView:
-    arrangement, margin = _number_dots(image, target, points, numberings)
+    arrangement, margin = _number_dots(image, target, points, arrangements)
     flat_points, order = target.points[:, :2], arrangement.order.ravel()
     diameters = np.full(len(flat_points), target.diameter)
     diameters[0] = target.origin_diameter or target.diameter
@@ -316,16 +316,16 @@ def _refine_grid(
 
 
 def _number_dots(
-    image: GreyImage, target: CircleGrid, points: Array, numberings: list[Arrangement]
+    image: GreyImage, target: CircleGrid, points: Array, arrangements: list[Arrangement]
 ) -> tuple[Arrangement, float | None]:
     name = f"{target.columns} x {target.rows} dots"
     if target.origin_diameter is None:
-        return choose_rightward(numberings, name), None
+        return choose_rightward(arrangements, name), None
     flat_points = target.points[:, :2]
     rim = RING_DIRECTIONS * (target.diameter + target.origin_diameter) / 4
     gap_ring = target.spacing * (RING_DIRECTIONS / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
     levels_by_origin = {}
-    for arrangement in numberings:
+    for arrangement in arrangements:
         grid_map = GridMap(flat_points, points[arrangement.order.ravel()])
         levels_by_origin[int(arrangement.order[0, 0])] = [
             mean_level(image, grid_map(ring)) for ring in (rim, gap_ring)
@@ -339,7 +339,7 @@ def _number_dots(
         rim_level, paper_level = levels_by_origin[int(order[0, 0])]
         return rim_level * mean_paper / max(paper_level, 1.0)
 
-    return choose_marked(numberings, level, f"{name}, of which the larger one is the origin")
+    return choose_marked(arrangements, level, f"{name}, of which the larger one is the origin")
 
 
 def _not_found_error(target: CircleGrid, counts: _SearchCounts) -> CalibrationError:
@@ -351,7 +351,7 @@ def _not_found_error(target: CircleGrid, counts: _SearchCounts) -> CalibrationEr
         text = f"saw {counts.spot_count} dark spots and no such grid among them"
         if counts.max_grid_count:
             text += f", at most {counts.max_grid_count} in rows and columns"
-    return Code.TARGET_NOT_FOUND.refusal(
+    return Code.TARGET_NOT_FOUND.error(
         f"circles: expected {target.columns} x {target.rows} dots, {text}",
         count,
         counts.max_grid_count or counts.spot_count,

@@ -62,7 +62,7 @@ class Corners(NamedTuple):
     # (N,), half the step from black to white, grey levels; positive if the square between the two
     # edge steps and the opposite square are black
     gains: Array
-    # (N,), whether the fit was good; a corner that was not fitted keeps its place
+    # (N,), whether the fit was good; a corner that was not fitted is where cornerSubPix puts it
     fitted: NDArray[np.bool_]
 
 
@@ -81,8 +81,8 @@ def refine_corners(
 
     The places ``points`` (N, 2) may be off by a pixel or two. ``edge_steps`` (N, 2, 2), pixels,
     lead along the two edges; with their opposites they span the part of the four squares that is
-    fitted. ``arm_widths`` (N, 2): only pixels within this part of ``edge_steps`` from an edge are
-    fitted, since something else is printed beyond; None: all pixels are fitted.
+    fitted. ``arm_widths`` (N, 2): only pixels within this fraction of ``edge_steps`` from an edge
+    are fitted, since something else is printed beyond; None: all pixels are fitted.
     ``is_single_square``: the corner is that of one square, which lies between the first step and
     the opposite of the second one; these two are in counter-clockwise order in the image's u and v.
     """
@@ -98,7 +98,11 @@ def refine_corners(
     start_values = _start_values(start - windows.centre, edge_steps)
     evaluate = partial(_evaluate, single_square=1.0 if is_single_square else 0.0)
     fits, is_good = fit_windows(
-        evaluate, windows, start_values, pixel_values=(0, 2), max_residual_ratio=MAX_RESIDUAL_RATIO
+        evaluate,
+        windows,
+        start_values,
+        position_indices=(0, 2),
+        max_residual_ratio=MAX_RESIDUAL_RATIO,
     )
     corners, covariance, is_crossing = _crossings(fits, windows)
     corners += windows.centre
@@ -159,9 +163,9 @@ def _evaluate(windows: Windows, values: Array, single_square: float = 0.0) -> Fi
         shape, slope = edge_profile(signed_distances[side])
         shapes.append(shape)
         slopes.append(slope)
-    half = np.float32(1 - single_square / 2)
+    product_factor = np.float32(1 - single_square / 2)
     one_side, other_side = (
-        half * (np.float32(single_square) + shape) * weights for shape in shapes
+        product_factor * (np.float32(single_square) + shape) * weights for shape in shapes
     )
     first_slope = slopes[0] * other_side
     second_slope = slopes[1] * one_side

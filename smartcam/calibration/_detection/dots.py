@@ -52,8 +52,8 @@ MIN_DOTS_FOR_LENS = 20
 """The distortion of the grid by the lens, ten values for each axis, is fitted only to grids of at
 least this many dots."""
 
-# The points of a regular polygon with n corners at distance R are on average, squared,
-# R^2 / 2 (1 - 2/3 sin^2(pi / n)) from its middle; those of the unit disc 1/2.
+# The mean squared distance of a polygon's points from its centre is R^2 / 2 (1 - 2/3 sin^2(pi / n))
+# if its n corners are at distance R; for the unit disc it is 1/2.
 _ANGLES = np.arange(32) * np.pi / 16
 OUTLINE = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 OUTLINE /= np.sqrt(1 - 2 / 3 * np.sin(np.pi / 32) ** 2)
@@ -121,7 +121,7 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
 
     ``points`` (N, 2): centres, which may be off by a fraction of the radius. ``radii`` (N, 2, 2):
     from the centre to the rim along the sheet's x and y. ``reaches`` (N, 2, 2): in the same
-    directions, to where the next print begins. All are in pixels.
+    directions, to where the next printed mark begins. All are in pixels.
     """
     longest_reach = float(np.hypot(reaches[:, 0], reaches[:, 1]).max())
     if longest_reach > MAX_REACH_PX:
@@ -132,7 +132,11 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
     start_offsets = points - windows.centre
     start_values = _start_values(start_offsets, radii)
     fits, is_good = fit_windows(
-        _evaluate, windows, start_values, pixel_values=(0, 1), max_residual_ratio=MAX_RESIDUAL_RATIO
+        _evaluate,
+        windows,
+        start_values,
+        position_indices=(0, 1),
+        max_residual_ratio=MAX_RESIDUAL_RATIO,
     )
     a, b, d = fits.values[:, ELLIPSE].T
     inverse_area = a * d - b * b  # the area is pi / det S
@@ -172,8 +176,8 @@ def _start_values(centres: Array, radii: Array) -> Array:
     values[:, CENTRE] = centres
     # With the vectors to the rim as rows of W, m + W^T c is the rim for |c| = 1, so |W^-T (p - m)|
     # = 1 there. S = (W^T W)^(-1/2) is the symmetric matrix with the same lengths |S (p - m)|.
-    lengths, axes = np.linalg.eigh(radii.transpose(0, 2, 1) @ radii)
-    shape = (axes / np.sqrt(np.maximum(lengths, 0.25))[:, None]) @ axes.transpose(0, 2, 1)
+    squared_lengths, axes = np.linalg.eigh(radii.transpose(0, 2, 1) @ radii)
+    shape = (axes / np.sqrt(np.maximum(squared_lengths, 0.25))[:, None]) @ axes.transpose(0, 2, 1)
     values[:, ELLIPSE] = shape[:, [0, 0, 1], [0, 1, 1]]
     return values
 
@@ -191,17 +195,19 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
     radius = np.maximum(np.sqrt(normal_x * normal_x + normal_y * normal_y), np.float32(1e-3))
     normal_x, normal_y = normal_x / radius, normal_y / radius
     # the gradient of the radius, whose length turns it into a distance from the rim
-    by_x, by_y = a * normal_x + b * normal_y, b * normal_x + d * normal_y
-    distance_scale = 1 / np.maximum(np.sqrt(by_x * by_x + by_y * by_y), np.float32(1e-6))
+    slope_x, slope_y = a * normal_x + b * normal_y, b * normal_x + d * normal_y
+    distance_scale = 1 / np.maximum(
+        np.sqrt(slope_x * slope_x + slope_y * slope_y), np.float32(1e-6)
+    )
     scale = 1 / (np.sqrt(np.float32(2)) * blur)
     signed_distance = (radius - 1) * distance_scale * scale
-    shape, slope = edge_profile(signed_distance)
+    profile, slope = edge_profile(signed_distance)
     slope = slope * weights
     slope_scale = slope * distance_scale
-    product = shape * weights
+    product = profile * weights
     columns = (
-        slope_scale * by_x,
-        slope_scale * by_y,
+        slope_scale * slope_x,
+        slope_scale * slope_y,
         slope_scale * normal_x * x,
         slope_scale * (normal_x * y + normal_y * x),
         slope_scale * normal_y * y,

@@ -22,9 +22,9 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
 
     Corners of squares are found where two fitted edges cross, dots by an ellipse fitted to their
     rim, whose centre is corrected for perspective by the map of the whole grid. All dots of a grid
-    must be visible. Of a checkerboard some corners in each row and column must be visible, and most
-    corners of the outermost rows and columns; covered corners are left out. Any part of a
-    checkerboard is enough if it includes the mark at the origin. Of a ChArUco board at least four
+    must be visible. A checkerboard without a mark must show some corners in each row and column,
+    and most corners of the outermost rows and columns; covered corners are left out. Of one with a
+    mark at its origin, any part that includes the mark is enough. Of a ChArUco board at least four
     corners must be visible. The places of its markers are compared with the board: markers that are
     not where their ids belong are left out and named in the view's ``warnings``. Dots may be dark
     on light or light on dark; a grid with more dots than the target is refused.
@@ -34,13 +34,12 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     if only one of the possible corners has one. Otherwise the target's x points to the right of the
     image rather than to the left.
 
-    A mirrored image is refused if the print shows that it is mirrored: of a ChArUco board; of a
-    checkerboard or a grid of dots with a mark or a larger dot at its origin, unless it is square
-    (as many columns as rows; of an asymmetric grid, half as many); of a checkerboard without a mark
-    whose columns and rows are odd and differ, by its black corners; of an asymmetric grid with an
-    even count of rows that is not square. The mirror image of any other target looks like the
-    target itself after a turn: the view then has mirrored points, which nothing in a single image
-    can show.
+    Mirrored images of these targets are recognized and refused: ChArUco boards; checkerboards and
+    grids of dots with a mark or a larger dot at the origin, unless they are square (as many columns
+    as rows; of an asymmetric grid, half as many); checkerboards without a mark whose counts of
+    columns and rows are odd and differ; asymmetric grids with an even count of rows that are not
+    square. The mirror image of any other target looks like the target itself after a turn: the view
+    then has mirrored points, which nothing in a single image can show.
 
     The time spent on an image without a target is bounded, since only a limited number of saddles,
     dark spots or quadrangles is examined, and grids are grown from only a few of them.
@@ -77,6 +76,6 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
         case MarkerGrid():
             return find_marker_grid(grey, target, name)
     type_name = type(target).__name__
-    raise Code.SHAPE.unexpected(
+    raise Code.SHAPE.error_with_value(
         "target: expected a Checkerboard, Charuco, CircleGrid or MarkerGrid", got=type_name
     )

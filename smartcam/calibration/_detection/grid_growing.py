@@ -184,13 +184,13 @@ class _GridGrower:
             ):
                 for side, side_candidates in enumerate(candidates_by_side):
                     column, row = _SIDES[side]
-                    neighbour = (position[0] + column, position[1] + row)
+                    next_place = (position[0] + column, position[1] + row)
                     free_dot = next(
                         (candidate for candidate in side_candidates if candidate not in used), None
                     )
-                    if free_dot is None or neighbour in grid:
+                    if free_dot is None or next_place in grid:
                         continue
-                    grid[neighbour] = free_dot
+                    grid[next_place] = free_dot
                     used.add(free_dot)
                     step = steps.copy()
                     step[side % 2] = (column + row) * (self._points[free_dot] - self._points[dot])
@@ -198,7 +198,7 @@ class _GridGrower:
                         self._may_be_neighbours(np.array(free_dot), np.array(size_reference))
                     )
                     front.append(
-                        (neighbour, free_dot, step, free_dot if is_alike else size_reference)
+                        (next_place, free_dot, step, free_dot if is_alike else size_reference)
                     )
         return grid
 
@@ -212,22 +212,22 @@ class _GridGrower:
             has_added = False
             grid_map = GridMap(np.array(list(grid), float), self._points[list(grid.values())])
             used = set(grid.values())
-            neighbour_of_place = {
+            known_dot_beside = {
                 (x + column, y + row): dot
                 for (x, y), dot in grid.items()
                 for column, row in _SIDES
                 if (x + column, y + row) not in grid
             }
-            empty_places = np.array(list(neighbour_of_place), dtype=np.float64)
+            empty_places = np.array(list(known_dot_beside), dtype=np.float64)
             max_distances = MAX_STEP_OFFSET * np.linalg.norm(
                 local_steps(grid_map, empty_places, 1.0), axis=2
             ).min(axis=1)
             distances, nearest = self._tree.query(grid_map(empty_places))
             fit_mask = (distances < max_distances) & self._may_follow(
-                nearest, np.array(list(neighbour_of_place.values()))
+                nearest, np.array(list(known_dot_beside.values()))
             )
             for position, dot, is_fit in zip(
-                neighbour_of_place, nearest.tolist(), fit_mask.tolist(), strict=True
+                known_dot_beside, nearest.tolist(), fit_mask.tolist(), strict=True
             ):
                 if is_fit and dot not in used:
                     grid[position] = dot

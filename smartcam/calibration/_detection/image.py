@@ -67,7 +67,7 @@ def grey_image(image: Any) -> GreyImage:
         and all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in shape[:2])
     ):
         received = f"{dtype} of shape {shape}" if dtype is not None else type(image).__name__
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
             f"{MIN_SIDE_PX} to {MAX_SIDE_PX} pixels wide and high",
             "uint8 or uint16, (H, W) or (H, W, 3)",

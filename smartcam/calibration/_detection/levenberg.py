@@ -82,22 +82,22 @@ def fit_windows(
     windows: Windows,
     values: Array,
     *,
-    pixel_values: Sequence[int],
+    position_indices: Sequence[int],
     max_residual_ratio: float,
 ) -> tuple[Fits, NDArray[np.bool_]]:
     """Return the best fits, and a mask (N,) of the good ones.
 
     A fit is good if it converged, and if an edge may have its blur and gain. Fits start from
-    ``values`` (N, M), but with the best gain and offset for these values. ``pixel_values``: indices
-    of the values in pixels, by whose steps convergence is judged. ``max_residual_ratio``: largest
-    RMS of a good fit's residuals, as a part of its gain.
+    ``values`` (N, M), whose blur is set to 1 pixel, and gain and offset to the best for the others.
+    ``position_indices``: indices of the values in pixels, by whose steps convergence is judged.
+    ``max_residual_ratio``: largest RMS of a good fit's residuals, as a fraction of its gain.
     """
     values[:, BLUR], values[:, GAIN:] = 1.0, 0.0
     # The model is linear in gain and offset, so solving their normal equations once gives the best.
     level_fits = evaluate(windows, values)
     linear = level_fits.hessian[:, GAIN:, GAIN:] + DIAGONAL_OFFSET * np.eye(2)
     values[:, GAIN:] = np.linalg.solve(linear, level_fits.gradient[:, GAIN:, None])[:, :, 0]
-    fits, has_converged = _solve(evaluate, windows, values, pixel_values)
+    fits, has_converged = _solve(evaluate, windows, values, position_indices)
     blur, gain = fits.values[:, BLUR], np.abs(fits.values[:, GAIN])
     rms = np.sqrt(fits.cost / windows.counts)
     return fits, has_converged & (blur < MAX_BLUR_PIXELS) & (gain > MIN_HALF_STEP) & (
@@ -109,7 +109,7 @@ def _solve(
     evaluate: Callable[[Windows, Array], Fits],
     windows: Windows,
     values: Array,
-    pixel_values: Sequence[int],
+    position_indices: Sequence[int],
 ) -> tuple[Fits, NDArray[np.bool_]]:
     """Return the best fits, none worse than its start, and a mask (N,) of those that converged."""
     best = evaluate(windows, values)
@@ -131,7 +131,7 @@ def _solve(
         is_better = tried_fits.cost <= best.cost[active]
         best.replace_where(active, tried_fits, is_better)
         damping[active] *= np.where(is_better, 0.1, 10.0)
-        has_stopped = np.abs(step[:, pixel_values]).max(axis=1) < MAX_FINAL_STEP_PX
+        has_stopped = np.abs(step[:, position_indices]).max(axis=1) < MAX_FINAL_STEP_PX
         has_converged[active[has_stopped]] = True
         windows, active = windows.subset(~has_stopped), active[~has_stopped]
         if not len(active):

@@ -46,12 +46,12 @@ MAX_DOUBLED_PX = 2600
 def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> TargetView:
     """Find the corners of the visible markers.
 
-    Raises TARGET_NOT_FOUND or WRONG_TARGET; or SHAPE: the dictionary is unknown.
+    Raises TARGET_NOT_FOUND or WRONG_TARGET; or SHAPE: OpenCV has no such dictionary of markers.
     """
     label = f"grid of {target.columns} x {target.rows} markers"
     board_corners = target.points[target.corners, :2]
     best, stray_ids, read_count = Markers(np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)), (), 0
-    contrary_count = 0
+    second_board_count = 0
     factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
     for scale in dict.fromkeys((1 / factor, 1.0, 2.0)):
         has_few = len(best.ids) < len(board_corners) / 2
@@ -65,14 +65,17 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
             else resize_image(image.uint8_levels, scale)
         )
         markers = _read_markers(scaled_image, target, scale)
-        mask, contrary_here = compare_with_board(markers, board_corners)
-        read_count, contrary_count = max(read_count, len(mask)), max(contrary_count, contrary_here)
+        mask, second_board_here = compare_with_board(markers, board_corners)
+        read_count, second_board_count = (
+            max(read_count, len(mask)),
+            max(second_board_count, second_board_here),
+        )
         if mask.sum() > len(best.ids):
             best = markers.subset(mask)
             stray_ids = tuple(sorted((markers.ids[~mask] + target.first_id).tolist()))
-    check_one_board(len(best.ids), contrary_count, label)
+    check_one_board(len(best.ids), second_board_count, label)
     if len(best.ids) < MIN_AGREEING_MARKERS:
-        raise Code.TARGET_NOT_FOUND.refusal(
+        raise Code.TARGET_NOT_FOUND.error(
             f"{label}: expected at least {MIN_AGREEING_MARKERS} markers arranged as "
             f"on the board, found {len(best.ids)} of {read_count} markers of its dictionary",
             MIN_AGREEING_MARKERS,
@@ -95,7 +98,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
 
 
 def _read_markers(image: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Markers:
-    """Return the markers in a resized image; ids count from ``first_id``, pixels are unscaled."""
+    """Return a resized image's markers, in pixels of the given one; ids count from ``first_id``."""
     cv2: Any = load("cv2")
     count = target.columns * target.rows
     dictionary = marker_dictionary(target.dictionary, target.first_id + count, target.kind)
@@ -113,7 +116,7 @@ def _refine(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points:
     board_points = target.points[ids, :2]
     matrix = fit_homography(board_points, points)
     if matrix is None:
-        raise Code.TARGET_NOT_FOUND.refusal(
+        raise Code.TARGET_NOT_FOUND.error(
             f"{target.kind}: expected corners that are not all in a line"
         )
     modules = marker_dictionary(target.dictionary, 0, target.kind).markerSize + 2 * target.border

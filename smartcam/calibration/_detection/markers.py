@@ -32,19 +32,18 @@ MAX_VECTOR_DIFFERENCE = 0.15
 """The vector between two markers may differ from the board's by this part of its length. A number
 that is wrong by one moves a marker by a third of the longest such vector or more."""
 
-MAX_SLOPE_DIFFERENCE = 0.5
+MAX_JACOBIAN_DIFFERENCE = 0.5
 """The turns and scales of two neighbouring markers may differ by this part."""
 
 MAX_PITCHES_OFF = 0.35
 """A marker without neighbours may lie this many pitches from its predicted place."""
 
 MIN_PITCHES_AGAINST = 0.6
-"""A group of markers contradicts the board's description if it is more than this many pitches, plus
-MAX_VECTOR_DIFFERENCE times its distance from the others, away from the place that the others
-predict."""
+"""A group of markers belongs to a second board if its offset from the place that the others predict
+is larger than this many pitches plus MAX_VECTOR_DIFFERENCE times its distance from the others."""
 
-MIN_CONTRARY_MARKERS = 3
-"""A group that contradicts the description of the target has at least this many markers."""
+MIN_SECOND_BOARD_MARKERS = 3
+"""A group that belongs to a second board has at least this many markers."""
 
 MAX_NUMBERS_IN_MESSAGE = 8
 """A message lists at most this many marker numbers."""
@@ -56,7 +55,7 @@ MIN_AGREEING_MARKERS = 2
 WINDOWS_PX = (3, 13, 23)
 """Sides of the windows, pixels, whose mean separates dark from light: OpenCV's."""
 
-MAX_OUTLINES_OF_ALL_WINDOWS, MAX_OUTLINES = 1500, 4000
+MAX_MEAN_OUTLINES, MAX_OUTLINES = 1500, 4000
 """Limits for the dark outlines of an image. If the windows have more than the first number on
 average, a single window is used, and at most the second number of its outlines is examined. A board
 of 1,000 markers, the most that a dictionary has, shows some 3,000."""
@@ -77,7 +76,7 @@ class MarkerAgreement(NamedTuple):
     """The result of comparing markers with a board."""
 
     mask: NDArray[np.bool_]  # True for each marker that lies as on the board
-    contrary_count: int  # size of the largest group that contradicts the board's description
+    second_board_count: int  # size of the largest group that lies as on a second board
 
 
 def marker_dictionary(name: str, min_count: int, label: str) -> Any:
@@ -88,7 +87,7 @@ def marker_dictionary(name: str, min_count: int, label: str) -> Any:
     cv2 = load("cv2")
     number = getattr(cv2.aruco, name, None)
     if not (name.startswith("DICT_") and isinstance(number, int)):
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"{label}: expected the name of one of OpenCV's dictionaries such as "
             f"DICT_5X5_250, got {name!r}",
             "DICT_5X5_250",
@@ -97,7 +96,7 @@ def marker_dictionary(name: str, min_count: int, label: str) -> Any:
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     count = len(dictionary.bytesList)
     if min_count > count:
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"{label}: expected at least {min_count} markers in {name}", min_count, count
         )
     return dictionary
@@ -112,7 +111,7 @@ def marker_finder(image: NDArray[np.uint8], dictionary: Any, parameters: Any = N
     cv2 = load("cv2")
     options = cv2.aruco.DetectorParameters() if parameters is None else parameters
     lengths = {window: _outlines(image, window, options) for window in WINDOWS_PX}
-    if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_OUTLINES_OF_ALL_WINDOWS:
+    if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_MEAN_OUTLINES:
         window = sorted(WINDOWS_PX, key=lambda side: len(lengths[side]))[len(WINDOWS_PX) // 2]
         options.adaptiveThreshWinSizeMin = options.adaptiveThreshWinSizeMax = window
         longest = np.sort(lengths[window])[::-1]
@@ -150,14 +149,14 @@ def compare_with_board(markers: Markers, board: Array) -> MarkerAgreement:
         return MarkerAgreement(mask, 0)
     ids, quads = markers.ids[known_indices], markers.quads[known_indices]
     corners_on_board = board[ids]
-    centres, board_centres, slopes = (
+    centres, board_centres, jacobians = (
         quads.mean(axis=1),
         corners_on_board.mean(axis=1),
-        _slopes(quads, corners_on_board),
+        _jacobians(quads, corners_on_board),
     )
     pitch = _pitch(board.mean(axis=1))
     groups = _group_numbers(
-        _agreement_mask(slopes, centres, board_centres, MAX_NEIGHBOUR_PITCHES * pitch)
+        _agreement_mask(jacobians, centres, board_centres, MAX_NEIGHBOUR_PITCHES * pitch)
     )
     in_largest_group = groups == np.bincount(groups).argmax()
     matrix = fit_homography(
@@ -166,34 +165,34 @@ def compare_with_board(markers: Markers, board: Array) -> MarkerAgreement:
     if in_largest_group.sum() < MIN_AGREEING_MARKERS or matrix is None:
         return MarkerAgreement(mask, 0)
     distances = np.linalg.norm(apply_homography(matrix, board_centres) - centres, axis=1)
-    distances /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
+    distances /= pitch * np.sqrt(np.abs(np.linalg.det(jacobians)))
     group_distances = (
         np.linalg.norm(board_centres[:, None] - board_centres[in_largest_group], axis=2).min(axis=1)
         / pitch
     )
-    has_slope = _have_like_slopes(slopes, derivatives(matrix, board_centres))
+    has_like_jacobian = _have_like_jacobians(jacobians, derivatives(matrix, board_centres))
     agrees = in_largest_group | (
-        (distances < MAX_PITCHES_OFF) & has_slope & ~np.isin(ids, ids[in_largest_group])
+        (distances < MAX_PITCHES_OFF) & has_like_jacobian & ~np.isin(ids, ids[in_largest_group])
     )
     mask[known_indices[agrees]] = True
-    is_contrary = ~agrees & (
+    is_on_second_board = ~agrees & (
         distances > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * group_distances
     )
-    return MarkerAgreement(mask, int(np.bincount(groups[is_contrary], minlength=1).max()))
+    return MarkerAgreement(mask, int(np.bincount(groups[is_on_second_board], minlength=1).max()))
 
 
-def check_one_board(agreeing_count: int, contrary_count: int, label: str) -> None:
+def check_one_board(agreeing_count: int, second_board_count: int, label: str) -> None:
     """Raise WRONG_TARGET if markers are arranged as on another board, or as on several.
 
-    ``agreeing_count``: number of markers arranged as on the board. ``contrary_count``: number of
-    others that agree with each other, but not with these. ``label`` names the target.
+    ``agreeing_count``: number of markers arranged as on the board. ``second_board_count``: number
+    of others that agree with each other, but not with these. ``label`` names the target.
     """
-    if contrary_count >= MIN_CONTRARY_MARKERS and 2 * contrary_count >= agreeing_count:
-        raise Code.WRONG_TARGET.refusal(
-            f"{label}: expected markers of one such board, got {agreeing_count} arranged as "
-            f"on it and {contrary_count} arranged as on another one: columns and rows are others, "
-            "or several boards with the same numbers are in the picture",
-            f"{agreeing_count + contrary_count} markers of one board",
+    if second_board_count >= MIN_SECOND_BOARD_MARKERS and 2 * second_board_count >= agreeing_count:
+        raise Code.WRONG_TARGET.error(
+            f"{label}: expected markers of one such board, got {agreeing_count} arranged as on it "
+            f"and {second_board_count} arranged as on another one: the board has other numbers of "
+            "columns and rows, or the picture shows several boards with the same numbers",
+            f"{agreeing_count + second_board_count} markers of one board",
             agreeing_count,
         )
 
@@ -204,20 +203,20 @@ def predict_pixels(quads: Array, board_corners: Array, places: Array) -> tuple[A
     The scales (N,) are pixels per unit of the board. ``quads`` (M, 4, 2): the corners of markers in
     the image; ``board_corners``: on the board.
     """
-    slopes, centres, board_centres = (
-        _slopes(quads, board_corners),
+    jacobians, centres, board_centres = (
+        _jacobians(quads, board_corners),
         quads.mean(axis=1),
         board_corners.mean(axis=1),
     )
     vectors = places[:, None] - board_centres
     distances = np.linalg.norm(vectors, axis=2)
-    expected = centres + np.einsum("jkl,ijl->ijk", slopes, vectors)
+    expected = centres + np.einsum("jkl,ijl->ijk", jacobians, vectors)
     # a corner of a square lies between the two nearest markers, whose errors by perspective are
     # about opposite, so their predictions are averaged
     is_near = distances < 1.1 * distances.min(axis=1, keepdims=True)
     shares = is_near / is_near.sum(axis=1, keepdims=True)
     predicted: Array = np.einsum("ij,ijk->ik", shares, expected)
-    return predicted, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
+    return predicted, shares @ np.sqrt(np.abs(np.linalg.det(jacobians)))
 
 
 def stray_remarks(marker_ids: Sequence[int]) -> tuple[Remark, ...]:
@@ -231,13 +230,13 @@ def stray_remarks(marker_ids: Sequence[int]) -> tuple[Remark, ...]:
     return (Code.OUTLIER.remark(text),)
 
 
-def _slopes(quads: Array, board_corners: Array) -> Array:
+def _jacobians(quads: Array, board_corners: Array) -> Array:
     """Return the derivatives of the pixels by the board's x and y at each marker, (N, 2, 2)."""
     board_offsets = board_corners - board_corners.mean(axis=1, keepdims=True)
     pixel_offsets = quads - quads.mean(axis=1, keepdims=True)
     squares = (board_offsets**2).sum(axis=(1, 2)) / 2  # equal along x and y
-    slopes: Array = pixel_offsets.transpose(0, 2, 1) @ board_offsets / squares[:, None, None]
-    return slopes
+    jacobians: Array = pixel_offsets.transpose(0, 2, 1) @ board_offsets / squares[:, None, None]
+    return jacobians
 
 
 def _pitch(centres: Array) -> float:
@@ -247,28 +246,28 @@ def _pitch(centres: Array) -> float:
 
 
 def _agreement_mask(
-    slopes: Array, centres: Array, board_centres: Array, max_distance: float
+    jacobians: Array, centres: Array, board_centres: Array, max_distance: float
 ) -> NDArray[np.bool_]:
     """Return a mask (N, N) that is True for two markers that agree."""
     vectors = board_centres[None] - board_centres[:, None]
     distances = np.linalg.norm(vectors, axis=2)
     # the mean of both derivatives predicts one marker from the other exactly to second order
-    mean_slopes = (slopes[:, None] + slopes[None]) / 2
-    expected = np.einsum("ijkl,ijl->ijk", mean_slopes, vectors)
+    mean_jacobians = (jacobians[:, None] + jacobians[None]) / 2
+    expected = np.einsum("ijkl,ijl->ijk", mean_jacobians, vectors)
     differences = np.linalg.norm(centres[None] - centres[:, None] - expected, axis=2)
     return np.asarray(
         (distances > 0)
         & (distances <= max_distance)
         & (differences < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
-        & _have_like_slopes(slopes[:, None], slopes[None])
+        & _have_like_jacobians(jacobians[:, None], jacobians[None])
     )
 
 
-def _have_like_slopes(first: Array, second: Array) -> NDArray[np.bool_]:
-    """Return a mask of the pairs of slopes (..., 2, 2) with about the same turn and scale."""
+def _have_like_jacobians(first: Array, second: Array) -> NDArray[np.bool_]:
+    """Return a mask of the pairs of jacobians (..., 2, 2) with about the same turn and scale."""
     differences = np.linalg.norm(first - second, axis=(-2, -1))
     return np.asarray(
-        differences < MAX_SLOPE_DIFFERENCE * np.linalg.norm((first + second) / 2, axis=(-2, -1))
+        differences < MAX_JACOBIAN_DIFFERENCE * np.linalg.norm((first + second) / 2, axis=(-2, -1))
     )
 
 

@@ -55,9 +55,9 @@ def find_arrangements(
     rows, positions count the steps along the two diagonals, to the nearest points.
     """
     target_positions = _target_positions(target)
-    numberings: list[Arrangement] = []
+    arrangements: list[Arrangement] = []
     if len(points) != len(target_positions):
-        return numberings
+        return arrangements
     for step_change in _STEP_CHANGES:
         turned_positions = grid_positions @ step_change
         index_at = {
@@ -66,8 +66,8 @@ def find_arrangements(
         order = [index_at.get(position) for position in target_positions]
         if None not in order:
             order_by_rows = np.array(order, dtype=np.intp).reshape(target.rows, target.columns)
-            numberings.append(_arrangement(points, order_by_rows))
-    return numberings
+            arrangements.append(_arrangement(points, order_by_rows))
+    return arrangements
 
 
 def _shift_to_zero(grid_positions: NDArray[np.intp]) -> list[tuple[int, int]]:
@@ -78,8 +78,8 @@ def _target_positions(target: Checkerboard | CircleGrid) -> list[tuple[int, int]
     """Return the columns and rows of a target's points, as :func:`find_arrangements` takes them."""
     row, column = np.divmod(np.arange(target.columns * target.rows), target.columns)
     if isinstance(target, CircleGrid) and target.asymmetric:
-        half = 2 * column + row % 2
-        column, row = (half + row) // 2, (half - row) // 2
+        half_steps = 2 * column + row % 2
+        column, row = (half_steps + row) // 2, (half_steps - row) // 2
     return _shift_to_zero(np.stack([column, row], axis=1))
 
 
@@ -97,23 +97,23 @@ def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:
     return Arrangement(order, cross_product < 0, float(x[0] / np.hypot(*x)))
 
 
-def choose_rightward(numberings: Sequence[Arrangement], label: str) -> Arrangement:
+def choose_rightward(arrangements: Sequence[Arrangement], label: str) -> Arrangement:
     """Return the arrangement that shows the front and whose x points most to the image's right.
 
     Raises MIRRORED if no arrangement shows the front; ``label`` names the target.
     """
-    front_views = [arrangement for arrangement in numberings if arrangement.is_front]
+    front_views = [arrangement for arrangement in arrangements if arrangement.is_front]
     if not front_views:
-        raise Code.MIRRORED.refusal(
+        raise Code.MIRRORED.error(
             f"{label}: expected an image of the sheet as one reads it, got one that is mirrored",
-            "y to the left of x",
-            "y to the right of x",
+            "y pointing to the left of x",
+            "y pointing to the right of x",
         )
     return max(front_views, key=lambda arrangement: arrangement.rightward)
 
 
 def choose_marked(
-    numberings: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], label: str
+    arrangements: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], label: str
 ) -> tuple[Arrangement, float]:
     """Return the arrangement with a dark mark at its origin, and the mark's margin in grey levels.
 
@@ -121,16 +121,18 @@ def choose_marked(
     ``label``: the target and its mark, for messages. Raises MIRRORED; or AMBIGUOUS_ORIGIN: the
     darkest corner is not MIN_ORIGIN_CONTRAST darker than the next one.
     """
-    levels = {int(arrangement.order[0, 0]): level(arrangement.order) for arrangement in numberings}
+    levels = {
+        int(arrangement.order[0, 0]): level(arrangement.order) for arrangement in arrangements
+    }
     origin, second = sorted(levels, key=lambda corner: levels[corner])[:2]
     margin = levels[second] - levels[origin]
     if not margin >= MIN_ORIGIN_CONTRAST:
-        raise Code.AMBIGUOUS_ORIGIN.refusal(
+        raise Code.AMBIGUOUS_ORIGIN.error(
             f"{label}: expected the origin to be darker than the other corners by "
             f"{MIN_ORIGIN_CONTRAST:g} grey levels of 255, got {margin:.0f}",
             MIN_ORIGIN_CONTRAST,
             margin,
         )
     return choose_rightward(
-        [arrangement for arrangement in numberings if arrangement.order[0, 0] == origin], label
+        [arrangement for arrangement in arrangements if arrangement.order[0, 0] == origin], label
     ), margin

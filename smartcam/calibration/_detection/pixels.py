@@ -64,10 +64,10 @@ def cut_windows(
     """Return the pixels around points (N, 2).
 
     ``half_sides`` (N, 2, 2): half sides of the parallelogram around each point whose pixels count,
-    or the half axes of an ellipse (``round_``). A window reaches at most
-    ``max_reach`` pixels to each side. ``arm_widths`` (N, 2): half widths of the arms of a cross
-    along the half sides, as parts of the half sides; only pixels in the cross count. None: all
-    pixels count.
+    or the half axes of an ellipse (``round_``). A window reaches at most ``max_reach`` pixels to
+    each side. ``arm_widths`` (N, 2): of the parallelogram only a cross counts, whose pixels are
+    nearer to the point than this fraction of a half side; None: all of it counts. Pixels nearer
+    than MIN_REACH_PX count always.
     """
     reach = (
         np.hypot(half_sides[:, 0], half_sides[:, 1]) if round_ else np.abs(half_sides).sum(axis=1)

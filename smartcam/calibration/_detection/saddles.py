@@ -2,7 +2,7 @@
 
 Around a corner of a checkerboard two dark sectors lie opposite each other between two light ones.
 Its grey levels are a saddle there, and along a circle around it they go up
-and down twice, the same in both halves. The direction of the dark sectors shows which
+and down twice, the same in both halves. The direction of the light sectors shows which
 saddles are neighbours on a board: it is turned by 90 degrees from each corner to the next,
 in every view of the sheet.
 """
@@ -56,7 +56,7 @@ class Saddles(NamedTuple):
     """Saddles of the grey levels that may be corners."""
 
     points: Array  # (N, 2), pixels
-    # (N, 2), unit vectors, at twice the angle of the direction of the lighter sectors
+    # (N, 2), unit vectors, at twice the angle of the direction of the light sectors
     doubled_directions: Array
 
     def may_be_neighbours(
@@ -105,7 +105,7 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
 
 
 def _steps_to_saddles(smooth: Floats, pixels: NDArray[np.intp], second_derivatives: Array) -> Array:
-    """Return the steps (N, 2) from pixels to the saddles next to them, at most one pixel long.
+    """Return the steps (N, 2) from pixels to the next saddles, at most a pixel along u and v each.
 
     ``second_derivatives`` (N, 4): of the grey levels at the pixels.
     """

@@ -118,7 +118,7 @@ def _choose_drawing(
 
 
 def _argument_error(label: str, expected: str, actual: object) -> CalibrationError:
-    return Code.WRONG_KIND.unexpected(
+    return Code.WRONG_KIND.error_with_value(
         f"{label}: expected {expected}", expected, type(actual).__name__
     )
 

@@ -40,7 +40,7 @@ def draw_file(
     available = PICTURES.get(document.kind, ())
     if not available or picture not in {None, *available}:
         expected = picture or " or ".join(PICTURES)
-        raise Code.WRONG_KIND.refusal(
+        raise Code.WRONG_KIND.error(
             f"{path}: holds {document.kind!r}, of which there is "
             f"{' and '.join(available) or 'no picture'}; expected {expected}",
             expected,

@@ -121,7 +121,7 @@ class Folder:
             raise _bad_name_error(name_or_path, f"a name, or {EXPORTS}/NAME.json")
         if not path.is_file():
             known = ", ".join(self.names()[:20]) or "none: the folder is empty"
-            raise Code.NOT_FOUND.refusal(
+            raise Code.NOT_FOUND.error(
                 f"no calibration {name_or_path!r}; there are {known}", got=name_or_path
             )
         return path
@@ -151,6 +151,6 @@ def _check_name(name: str) -> str:
 
 def _bad_name_error(name: str, expected: str) -> CalibrationError:
     shown = repr(name) if len(name) <= MAX_NAME_LENGTH else f"{name[:MAX_NAME_LENGTH]!r}..."
-    return Code.BAD_NAME.refusal(
+    return Code.BAD_NAME.error(
         f"the name {shown} cannot be used: expected {expected}", expected, name
     )

@@ -47,6 +47,6 @@ def calibration_from_document(document: Document, name: str) -> AnyCalibration:
         warn_unless_good(calibration, name)
         return calibration
     expected = " or ".join(map(repr, KINDS))
-    raise Code.WRONG_KIND.refusal(
+    raise Code.WRONG_KIND.error(
         f"{name}: holds {document.kind!r}, expected {expected}", expected, document.kind
     )

@@ -102,11 +102,11 @@ def write(
         text = json.dumps(content, allow_nan=False, indent=1) + "\n"
         body = text.encode()
     except (TypeError, ValueError, RecursionError) as exc:
-        raise Code.NOT_STORABLE.refusal(
+        raise Code.NOT_STORABLE.error(
             f"{path}: cannot be stored: {exc}; expected finite numbers, texts, lists and mappings"
         ) from exc
     if len(body) > MAX_FILE_BYTES:
-        raise Code.NOT_STORABLE.refusal(
+        raise Code.NOT_STORABLE.error(
             f"{path}: {len(body)} bytes, expected {MAX_FILE_BYTES} at most",
             MAX_FILE_BYTES,
             len(body),
@@ -122,7 +122,7 @@ def read(path: StrPath, kind: str) -> dict[str, Any]:
     """
     document = read_document(path)
     if document.kind != kind:
-        raise Code.WRONG_KIND.refusal(
+        raise Code.WRONG_KIND.error(
             f"{path}: holds {document.kind!r}, expected {kind!r}", kind, document.kind
         )
     return document.data
@@ -168,7 +168,7 @@ def read_document(path: StrPath) -> Document:
 
 
 def _broken_file_error(path: StrPath, why: str) -> CalibrationError:
-    return Code.BROKEN_FILE.refusal(f"{path}: {why}; expected a calibration as smartcam writes it")
+    return Code.BROKEN_FILE.error(f"{path}: {why}; expected a calibration as smartcam writes it")
 
 
 def _version(path: StrPath, text: object) -> tuple[int, int]:
@@ -177,7 +177,7 @@ def _version(path: StrPath, text: object) -> tuple[int, int]:
         raise _broken_file_error(path, f"schema_version {text!r}")
     version = int(major), int(minor)
     if version[0] > SCHEMA_VERSION[0]:
-        raise Code.NEWER_VERSION.refusal(
+        raise Code.NEWER_VERSION.error(
             f"{path}: schema version {text}, expected {SCHEMA_VERSION[0]} at most: "
             "a newer smartcam wrote it",
             "{}.{}".format(*SCHEMA_VERSION),
@@ -229,8 +229,8 @@ def _calibration_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except _whole_files.FolderInUseError as exc:
-        raise Code.IN_USE.refusal(f"{path}: {exc}") from exc
+        raise Code.IN_USE.error(f"{path}: {exc}") from exc
     except OSError as exc:
-        raise Code.NOT_WRITTEN.refusal(
+        raise Code.NOT_WRITTEN.error(
             f"{path}: cannot be written: {exc.strerror or exc}", got=exc.errno
         ) from exc

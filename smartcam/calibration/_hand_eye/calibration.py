@@ -200,7 +200,7 @@ def calibrate_hand_eye(
     check_positive(most_scale, "most_scale", "parts of its size")
     transforms, order, robot = _check_robot_poses(robot_poses, len(views), "views", setup)
     if any(view.target != views[0].target for view in views):
-        raise Code.DIFFERENT_TARGETS.refusal(
+        raise Code.DIFFERENT_TARGETS.error(
             "hand-eye: expected views of one target, got views of several", views[0].target
         )
     ordered = [views[i] for i in order]
@@ -341,7 +341,7 @@ def _check_robot_poses(
     in_hand = is_in_hand(setup, "hand-eye")
     robot_poses = as_list(robot_poses, object, "pose of the robot")
     if len(robot_poses) != count:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"hand-eye: expected as many {label} as poses of the robot, got {count} and "
             f"{len(robot_poses)}",
             len(robot_poses),
@@ -350,7 +350,7 @@ def _check_robot_poses(
     transforms = [as_transform(pose, "flange").undated() for pose in robot_poses]
     for transform in transforms:
         if transform.label != transforms[0].label:
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"hand-eye: expected all poses of the robot to be {transforms[0].label}",
                 transforms[0].label,
                 transform.label,
@@ -370,7 +370,7 @@ def _check_sigmas(sigmas: RobotSigmas | None) -> RobotSigmas | None:
         return None
     values = as_vector(sigmas, 2, "robot_sigmas")
     if not (values > 0).all():
-        raise Code.NOT_FINITE.unexpected(
+        raise Code.NOT_FINITE.error_with_value(
             "robot_sigmas: expected two positive numbers, radians and metres",
             "two positive numbers",
             tuple(values.tolist()),
@@ -629,7 +629,7 @@ def _build_calibration(
 def _check_scale(scale: float, max_error: float) -> None:
     """Raise ``SCALE_MISMATCH`` if the target's size is off by more than is allowed."""
     if abs(scale - 1.0) > max_error:
-        raise Code.SCALE_MISMATCH.refusal(
+        raise Code.SCALE_MISMATCH.error(
             f"hand-eye: expected the target as large as it was said, to {100 * max_error:g} %, got "
             f"one {scale:.3f} times as large by the robot's motions: measure the print, and say "
             "how large it is; or allow more by most_scale",

@@ -84,7 +84,7 @@ def check_motion(robot: RobotPoses) -> None:
     """
     rotations = _sampled_rotations(robot)
     if len(rotations) < MIN_POSES:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             f"hand-eye: expected at least {MIN_POSES} poses with a view", MIN_POSES, len(rotations)
         )
     turns_between = log_rotation(np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None])
@@ -94,7 +94,7 @@ def check_motion(robot: RobotPoses) -> None:
         if is_apart[index, distinct].all():
             distinct.append(index)
     if len(distinct) < MIN_POSES:
-        raise Code.POSES_TOO_SIMILAR.refusal(
+        raise Code.POSES_TOO_SIMILAR.error(
             f"hand-eye: expected at least {MIN_POSES} orientations of the robot that are "
             f"{math.degrees(SAME_TURN_RADIANS):g} deg apart or more, got {len(distinct)}: pure "
             "shifts do not tell where the camera is",
@@ -103,7 +103,7 @@ def check_motion(robot: RobotPoses) -> None:
         )
     second = second_axis_turn(robot)
     if not second > MIN_TURN_RADIANS:
-        raise Code.INSUFFICIENT_ROTATION.refusal(
+        raise Code.INSUFFICIENT_ROTATION.error(
             "hand-eye: expected turns about two axes or more, "
             f"{math.degrees(MIN_TURN_RADIANS):g} deg rms about the second one, got "
             f"{math.degrees(second):.2g} deg: along a single axis the camera is not determined",

@@ -231,7 +231,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         if self.setup == "eye-to-hand":
             return self.camera_pose
         if robot_pose is None:
-            raise Code.WRONG_FRAME.refusal(
+            raise Code.WRONG_FRAME.error(
                 "eye-in-hand: expected the robot's pose when the image was taken, got none",
                 "a pose of the robot",
             )
@@ -296,7 +296,7 @@ class HandEyeCalibration(storage.SavedCalibration):
                 :func:`~smartcam.calibration._lens.poses.check_view`.
         """
         if len(robot_poses) != len(views):
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"point_errors: expected as many views as poses of the robot, got {len(views)} and "
                 f"{len(robot_poses)}",
                 len(robot_poses),
@@ -317,7 +317,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         lens = self._lens("point_errors")
         check_view(view, lens.size)
         if self.views and view.target != self.views[0].target:
-            raise Code.DIFFERENT_TARGETS.refusal(
+            raise Code.DIFFERENT_TARGETS.error(
                 f"point_errors: expected views of {self.views[0].target}, got one of {view.target}",
                 self.views[0].target,
                 view.target,
@@ -384,7 +384,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     def _lens(self, label: str) -> CameraModel:
         if self.camera is None:
-            raise Code.NO_CALIBRATION.refusal(
+            raise Code.NO_CALIBRATION.error(
                 f"{label}: expected a calibration with the camera's lens, got one from poses of "
                 "the target",
                 "camera",
@@ -403,7 +403,7 @@ def _intersect_rays(camera: CameraModel, pixels: Array, plane: Transform, height
     is_missed = ~np.isfinite(points).all(axis=1)
     if is_missed.any():
         row = int(np.argmax(is_missed))
-        raise Code.OUT_OF_FIELD.refusal(
+        raise Code.OUT_OF_FIELD.error(
             "to_plane: expected pixels whose rays meet the plane before the camera, got "
             f"{pixels[row].tolist()} in row {row}, whose ray does not",
             got=pixels[row].tolist(),

@@ -85,7 +85,7 @@ def estimate_time_offset(
     check_positive(most, "most", "seconds")
     views = as_target_poses(target_poses)
     if len(views) < MIN_VIEWS_FOR_OFFSET:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             f"time offset: expected {MIN_VIEWS_FOR_OFFSET} views or more",
             MIN_VIEWS_FOR_OFFSET,
             len(views),
@@ -101,7 +101,7 @@ def estimate_time_offset(
     scatter = math.sqrt(float(jackknife(np.array(left_out_offsets)[:, None])[0, 0]))
     sigma = max(scatter, fit.noise_sigma(offset, all_views))
     if abs(offset) > 0.99 * most or sigma > MAX_SIGMA_SHARE * most:
-        raise Code.BAD_TIME.refusal(
+        raise Code.BAD_TIME.error(
             f"time offset: expected views that tell one within {most:g} s, got {offset:.3g} s with "
             f"a sigma of {sigma:.2g} s: take pictures while the robot moves, or allow more",
             most,
@@ -121,7 +121,7 @@ class _OffsetFit:
         self._views = Rigid.stack(view.rigid for view in views)
         for number, view in enumerate(views):
             if view.at is None:
-                raise Code.BAD_TIME.refusal(
+                raise Code.BAD_TIME.error(
                     f"time offset: expected view {number} with a time, got none", got=None
                 )
         self._times = [view.at for view in views if view.at is not None]

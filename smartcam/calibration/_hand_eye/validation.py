@@ -95,7 +95,7 @@ def as_target_poses(target_poses: Sequence[Transform]) -> list[Transform]:
     for number, pose in enumerate(poses):
         if pose.label != poses[0].label or (pose.target, pose.source) == (TARGET, CAMERA):
             expected = f"T_{CAMERA}_{TARGET}" if number == 0 else poses[0].label
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"{label} {number}: expected {expected}", expected, pose.label
             )
     return poses
@@ -251,7 +251,7 @@ def check_poses(problem: Problem) -> AgreedMotion:
         other_error = _median_error(other_problem, other_agreement)
         if other_error < max_plausible_error(other_problem) and error > min_ratio * other_error:
             error_text = f"{1e3 * error:.3g} mm off" if math.isfinite(error) else "nowhere near"
-            raise code.refusal(
+            raise code.error(
                 "hand-eye: expected poses of the flange in the base, and the setup as it is, got "
                 f"poses that are {error_text} as given, but {1e3 * other_error:.3g} mm when "
                 f"read {reading}",
@@ -271,7 +271,7 @@ def poor_fit_error(actual: str, error: float | None) -> CalibrationError:
     ``actual``: description of the actual misfit. ``error``: error on the target, metres; None if it
     is not known.
     """
-    return Code.POOR_FIT.refusal(
+    return Code.POOR_FIT.error(
         f"hand-eye: expected a camera that sees the target where it is, got {actual}: are the "
         "poses those of the views, in their order and in metres, are their angles in the "
         "convention that was read, is the setup right, and is the target numbered from the same "

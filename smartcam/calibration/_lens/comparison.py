@@ -73,8 +73,8 @@ class Lens(NamedTuple):
             return cls(source.camera, source.covariance, source.target_points, views)
         if isinstance(source, CameraModel):
             return cls(source)
-        raise Code.SHAPE.unexpected(
-            "compare: expected calibrations of lenses, or camera models",
+        raise Code.SHAPE.error_with_value(
+            "compare_lenses: expected calibrations of lenses, or camera models",
             "IntrinsicCalibration or CameraModel",
             type(source).__name__,
         )
@@ -82,7 +82,7 @@ class Lens(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LensComparison:
-    """The result of :func:`compare`.
+    """The result of :func:`compare_lenses`.
 
     Attributes:
         distance: distance of the points from the camera, metres; None: infinity.
@@ -133,7 +133,7 @@ class LensComparison:
     def verdict(self) -> str:
         """Result of the comparison in words."""
         if self.chance is None or self.ratio is None:
-            return "no verdict: it takes the noise of both, as two calibrations with views have it"
+            return "no verdict: it needs the uncertainty of both, known to calibrations from views"
         chance = f"{self.chance:.2g}" if self.chance > MIN_CHANCE else f"below {MIN_CHANCE:g}"
         noise = f"{self.ratio:.2f} times what noise leads to, chance {chance}"
         if self.same:
@@ -142,7 +142,7 @@ class LensComparison:
 
 
 @check_arguments(distance=or_none(a_number), shape=each(an_integer, 2))
-def compare(
+def compare_lenses(
     a: IntrinsicCalibration | CameraModel,
     b: IntrinsicCalibration | CameraModel,
     *,
@@ -168,33 +168,33 @@ def compare(
             the lenses share too few places of the image; ``POOR_FIT``: no motion maps one
             lens to the other.
     """
-    return compare_lenses(Lens.of(a), Lens.of(b), distance=distance, shape=shape)
+    return compare_estimates(Lens.of(a), Lens.of(b), distance=distance, shape=shape)
 
 
-def compare_lenses(
+def compare_estimates(
     a: Lens, b: Lens, *, distance: float | None = None, shape: tuple[int, int] = DEFAULT_MAP_SHAPE
 ) -> LensComparison:
-    """Compare two lenses, as :func:`compare` does."""
+    """Compare two lenses, as :func:`compare_lenses` does."""
     check_distance(distance)
     camera_a, camera_b, at_infinity = a.camera, b.camera, distance is None
     if tuple(camera_a.size) != tuple(camera_b.size):
-        raise Code.WRONG_SIZE.refusal(
-            f"compare: expected lenses of images of one size, got {camera_a.size[0]} x "
+        raise Code.WRONG_SIZE.error(
+            f"compare_lenses: expected lenses of images of one size, got {camera_a.size[0]} x "
             f"{camera_a.size[1]} and {camera_b.size[0]} x {camera_b.size[1]} pixels",
             camera_a.size,
             camera_b.size,
         )
     pixels = map_pixels(camera_a.size, shape)
-    gauge, has_no_views = _gauge(a, b, distance)
-    motion = _align(camera_a, camera_b, gauge, at_infinity=at_infinity and has_no_views)
+    alignment_points, has_no_views = _alignment_points(a, b, distance)
+    motion = _align(camera_a, camera_b, alignment_points, at_infinity=at_infinity and has_no_views)
     points = points_of_pixels(camera_a, pixels.reshape(-1, 2), distance)
     moved = points @ motion.rotation.T + (0.0 if at_infinity else motion.translation)
     difference = _project(camera_b, moved) - pixels.reshape(-1, 2)
     expected, ratio, chance = None, None, None
     if a.covariance is not None and b.covariance is not None:
-        aligned = gauge @ motion.rotation.T + motion.translation
+        aligned = alignment_points @ motion.rotation.T + motion.translation
         by_lens_a = sensitivity(camera_a, points, at_infinity=at_infinity).without_motion(
-            sensitivity(camera_a, gauge)
+            sensitivity(camera_a, alignment_points)
         )
         by_lens_b = sensitivity(camera_b, moved, at_infinity=at_infinity).without_motion(
             sensitivity(camera_b, aligned)
@@ -237,7 +237,7 @@ def rig_difference(
     return float(moved.angle_to(b.rigid)), shift
 
 
-def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
+def _alignment_points(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
     """Return the points to which the motion is fitted, and whether neither lens has views.
 
     The points are those of the target in the cells of the image in which both lenses saw it, or in
@@ -266,14 +266,16 @@ def _cells(camera: CameraModel, points: Array) -> list[int]:
     return cells
 
 
-def _align(first: CameraModel, second: CameraModel, gauge: Array, *, at_infinity: bool) -> Rigid:
-    """Return the motion after which both lenses project the gauge's points to the same pixels.
+def _align(
+    first: CameraModel, second: CameraModel, alignment_points: Array, *, at_infinity: bool
+) -> Rigid:
+    """Return the motion after which both lenses project the same points to the same pixels.
 
     ``at_infinity``: the points are directions, so the motion is a turn. The method is Gauss-Newton.
     """
-    pixels, motion = first.project(gauge), IDENTITY
+    pixels, motion = first.project(alignment_points), IDENTITY
     for _ in range(MAX_STEPS):
-        moved = gauge @ motion.rotation.T + motion.translation
+        moved = alignment_points @ motion.rotation.T + motion.translation
         by_motion = sensitivity(second, moved, at_infinity=at_infinity).by_motion.reshape(-1, 6)
         residuals = (pixels - _project(second, moved)).reshape(-1)
         finite = np.isfinite(residuals)
@@ -285,9 +287,9 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, at_infinity
         motion = motion.turned_in_target(step)
         if np.abs(by_motion[finite] @ step).max() < MAX_FINAL_STEP_PX:
             return motion
-    raise Code.POOR_FIT.refusal(
-        "compare: expected two calibrations of one lens, got lenses of which no motion of the "
-        "camera brings the one near the other",
+    raise Code.POOR_FIT.error(
+        "compare_lenses: expected two calibrations of one lens, got two that no motion of the "
+        "camera makes agree",
         "two calibrations of one lens",
     )
 
@@ -319,8 +321,9 @@ def _test_differences(difference: Array, deviations: Array, views: int) -> tuple
     # F. Only half of the views are counted, since some tell far more than others.
     finite = np.isfinite(difference).all(axis=1)
     if not finite.any():
-        raise Code.OUT_OF_FIELD.refusal(
-            "compare: expected lenses that reach the same places of the image, got none", got=0
+        raise Code.OUT_OF_FIELD.error(
+            "compare_lenses: expected lenses that reach the same places of the image, got none",
+            got=0,
         )
     residuals, finite_deviations = difference[finite], deviations[finite]
     inverse = np.linalg.inv(

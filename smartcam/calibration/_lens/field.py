@@ -63,7 +63,7 @@ class Sensitivity(NamedTuple):
 def check_distance(distance: float | None) -> None:
     """Raise ``NOT_FINITE`` for a distance that is not valid; None means infinity."""
     if distance is not None and not (math.isfinite(distance) and distance > 0.0):
-        raise Code.NOT_FINITE.unexpected(
+        raise Code.NOT_FINITE.error_with_value(
             "distance: expected a positive number of metres, or None for infinity",
             "a positive number",
             distance,
@@ -76,7 +76,7 @@ def map_pixels(size: tuple[int, int], shape: tuple[int, int]) -> Array:
     Raises ``SHAPE`` if there are fewer than 2 rows or columns, or more than 500.
     """
     if len(shape) != 2 or not all(2 <= side <= MAX_MAP_SIDE for side in shape):
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"shape of a map: expected rows and columns, each from 2 to {MAX_MAP_SIDE}",
             (2, MAX_MAP_SIDE),
             shape,
@@ -124,7 +124,7 @@ def finite_points(points: Array) -> Array:
     """Return the points (N, 3) that are not NaN; raise ``OUT_OF_FIELD`` if there are too few."""
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) < MIN_MOTION_PLACES:
-        raise Code.OUT_OF_FIELD.refusal(
+        raise Code.OUT_OF_FIELD.error(
             f"field of the lens: expected {MIN_MOTION_PLACES} places or more that its model "
             f"reaches, got {len(finite)} of {len(points)}",
             MIN_MOTION_PLACES,

@@ -220,7 +220,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def _view_errors(self, view: TargetView) -> Array:
         target = self.views[0].view.target
         if self.sheet is not None and view.target != target:
-            raise Code.DIFFERENT_TARGETS.refusal(
+            raise Code.DIFFERENT_TARGETS.error(
                 f"point_errors: expected views of {target}, whose points were adjusted, got one of "
                 f"{view.target}",
                 target,
@@ -381,12 +381,12 @@ def check_views(
     ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
     """
     if len(views) < minimum:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             f"{label}: expected {minimum} views or more", minimum, len(views)
         )
     for number, view in enumerate(views):
         if view.target != views[0].target:
-            raise Code.DIFFERENT_TARGETS.refusal(
+            raise Code.DIFFERENT_TARGETS.error(
                 f"{label}: expected views of one target, {views[0].target}, got {view.target} in "
                 f"{view_name(view, number)}",
                 views[0].target,
@@ -405,7 +405,7 @@ def _check_motion(views: Sequence[TargetView]) -> None:
         moves = views[0].points[first] - view.points[second]
         largest_move = max(largest_move, float(np.linalg.norm(moves, axis=1).max()))
     if largest_move < min_move:
-        raise Code.POSES_TOO_SIMILAR.refusal(
+        raise Code.POSES_TOO_SIMILAR.error(
             f"intrinsics: expected views in which the target moves by {min_move:.3g} pixels or "
             f"more, got {len(views)} that differ by {largest_move:.3g}",
             min_move,
@@ -422,7 +422,7 @@ def check_tilts(adjusted: AdjustedBundle, label: str) -> None:
     sines = np.linalg.norm(np.cross(normals[:, None], normals), axis=2)
     tilt = math.asin(min(1.0, float(sines.max())))
     if tilt < MIN_TILT_RADIANS:
-        raise Code.INSUFFICIENT_ROTATION.refusal(
+        raise Code.INSUFFICIENT_ROTATION.error(
             f"{label}: expected the target tilted by {math.degrees(MIN_TILT_RADIANS):.0f} degrees "
             f"or more between two views, got {math.degrees(tilt):.2g}: parallel planes leave the "
             "focal length open",
@@ -434,7 +434,7 @@ def check_tilts(adjusted: AdjustedBundle, label: str) -> None:
     length = float(adjusted.bundle.cameras[0].matrix[0, 0])
     sigma_ratio = math.sqrt(max(float(covariance[0, 0]), 0.0)) / length
     if sigma_ratio > MAX_FOCAL_SIGMA_RATIO:
-        raise Code.INSUFFICIENT_ROTATION.refusal(
+        raise Code.INSUFFICIENT_ROTATION.error(
             f"{label}: expected views that tell the focal length to "
             f"{MAX_FOCAL_SIGMA_RATIO:.0%}, got {length:.5g} pixels with a standard deviation of "
             f"{sigma_ratio:.2g} of it: tilt the "

@@ -111,7 +111,7 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
         key=lambda fit: fit.weighted_squares,
     )
     if not fits:
-        raise Code.POOR_FIT.refusal(
+        raise Code.POOR_FIT.error(
             f"pose of the target{_in_view(view)}: expected one in front of the camera that shows "
             f"its {len(view.ids)} points where they are, got none",
             "a pose in front of the camera",
@@ -153,11 +153,11 @@ def check_view(view: TargetView, size: tuple[int, int]) -> None:
     label = f"pose of the target{_in_view(check_type(view, TargetView, 'pose of the target'))}"
     count = len(view.ids)
     if count < MIN_POINTS:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             f"{label}: expected {MIN_POINTS} points or more", MIN_POINTS, count
         )
     if tuple(view.size) != tuple(size):
-        raise Code.WRONG_SIZE.refusal(
+        raise Code.WRONG_SIZE.error(
             f"{label}: expected an image of {size[0]} x {size[1]} pixels, got {view.size[0]} x "
             f"{view.size[1]}",
             size,
@@ -167,7 +167,7 @@ def check_view(view: TargetView, size: tuple[int, int]) -> None:
     plane = view.object_points[:, :2]
     spread = np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)
     if spread[1] < MIN_SPREAD_RATIO * spread[0]:
-        raise Code.COLLINEAR.refusal(
+        raise Code.COLLINEAR.error(
             f"{label}: expected points that are not on one line, got {count} on one",
             got=view.ids.tolist(),
         )
@@ -181,7 +181,7 @@ def _check_inside(view: TargetView, label: str) -> None:
     row = int(np.argmax(excess))
     if excess[row] > MAX_OUTSIDE_RATIO:
         point = view.points[row].tolist()
-        raise Code.WRONG_SIZE.refusal(
+        raise Code.WRONG_SIZE.error(
             f"{label}: expected points in the image of {sides[0]} x {sides[1]} pixels, "
             f"got {point} in row {row}",
             view.size,
@@ -193,14 +193,14 @@ def _check_numbering(view: TargetView, label: str) -> None:
     """Raise ``MIRRORED`` for a mirrored sheet, and ``POOR_FIT`` for points with wrong numbers."""
     agreement = view.agreement
     if agreement > MIN_AGREEMENT:
-        raise Code.MIRRORED.refusal(
+        raise Code.MIRRORED.error(
             f"{label}: expected its x to turn left to its y as one reads the sheet, got a view as "
             "in a mirror: was the picture flipped, or are u and v exchanged?",
             "y to the left of x",
             agreement,
         )
     if agreement > -MIN_AGREEMENT:
-        raise Code.POOR_FIT.refusal(
+        raise Code.POOR_FIT.error(
             f"{label}: expected points with the numbers that they have on {view.target}, got an "
             f"order that agrees with it by {-agreement:.2g} of 1 only",
             MIN_AGREEMENT,

@@ -57,7 +57,7 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
     """
     count = len(sights[0].view.target.points)
     if sheet == "free" and count > MAX_FREE_POINTS:
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"sheet: expected a target of {MAX_FREE_POINTS} points at most that are free",
             MAX_FREE_POINTS,
             count,

@@ -54,7 +54,7 @@ def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
     names, coefficients, fixed_names = parameter_names(model), coefficient_names(model), set(fixed)
     unknown = sorted(fixed_names.difference(coefficients, {"aspect"}))
     if unknown:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"fixed: expected coefficients of {model} ({', '.join(coefficients)}) or aspect, got "
             f"{', '.join(unknown)}",
             [*coefficients, "aspect"],
@@ -87,7 +87,7 @@ def fit_lens(
         if fits[-1].rms <= MAX_GOOD_RMS_PX:
             break
     if not fits:
-        raise Code.POOR_FIT.refusal(
+        raise Code.POOR_FIT.error(
             f"intrinsics: expected a lens that shows the {len(views)} views as they are, got none "
             f"from focal lengths of {min(FOCAL_LENGTHS[1:])} to {max(FOCAL_LENGTHS[1:])} image "
             "widths"
@@ -104,7 +104,7 @@ def _fit_from_length(
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), sights)
     if not np.isfinite(adjusted.weighted_squares):
-        raise Code.POOR_FIT.refusal("points behind the camera")
+        raise Code.POOR_FIT.error("points behind the camera")
     return adjusted
 
 

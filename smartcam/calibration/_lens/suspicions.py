@@ -324,7 +324,7 @@ def check_rms(label: str, rms: float, views: Sequence[TargetView]) -> None:
     """Raise ``POOR_FIT`` if the residuals are so large that the points cannot be the target's."""
     max_rms = max_plausible_rms(views)
     if rms > max_rms:
-        raise Code.POOR_FIT.refusal(
+        raise Code.POOR_FIT.error(
             f"{label}: expected views of {views[0].target}, got residuals of {rms:.3g} pixels rms, "
             f"{max_rms:.3g} at most expected: are columns and rows those of the sheet, and are the "
             "points those that their numbers say?",

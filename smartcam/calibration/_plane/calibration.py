@@ -397,7 +397,7 @@ class PlaneCalibration(storage.SavedCalibration):
     @property
     def _touch_variance(self) -> float:
         if self.touch_sigma is None:
-            raise Code.UNVERIFIED.refusal(
+            raise Code.UNVERIFIED.error(
                 "predicted error: expected touch_sigma, or more points than the "
                 f"{np.count_nonzero(self.weights)} that {self.model} needs",
                 "touch_sigma",
@@ -439,13 +439,13 @@ class PlaneCalibration(storage.SavedCalibration):
             CalibrationError: as :meth:`covariance_at`; NOT_FINITE: the level is not valid.
         """
         if not 0.0 < level < 1.0:
-            raise Code.NOT_FINITE.unexpected(
+            raise Code.NOT_FINITE.error_with_value(
                 "level: expected a number between 0 and 1", "a number between 0 and 1", level
             )
         camera_array = as_points(np.atleast_2d(camera_points), 2, "camera points")
         robot_array = as_points(np.atleast_2d(robot_points), 3, "robot points")
         if len(camera_array) != len(robot_array) or not len(camera_array):
-            raise Code.SHAPE.unexpected(
+            raise Code.SHAPE.error_with_value(
                 f"expected as many robot points as camera points ({len(camera_array)}), "
                 "one at least",
                 len(camera_array),
@@ -489,7 +489,7 @@ class PlaneCalibration(storage.SavedCalibration):
         camera_centre = as_vector(camera_position, 3, "camera position")
         distance = abs(float((camera_centre - self._map.origin) @ self.normal))
         if not (math.isfinite(height) and distance > max(height, 0.0)):
-            raise Code.OUT_OF_FIELD.refusal(
+            raise Code.OUT_OF_FIELD.error(
                 f"expected a height below the camera's ({distance:.6g} m), got {height:.6g} m",
                 distance,
                 height,
@@ -743,7 +743,7 @@ def mean_axis(tool_z: ArrayLike, count: int) -> Array:
     axis = as_vector(values, 3, "tool axis")
     length = float(np.linalg.norm(axis))
     if not length > MIN_DIRECTION_LENGTH:
-        raise Code.COINCIDENT.unexpected(
+        raise Code.COINCIDENT.error_with_value(
             "tool axis: expected a direction", "a direction", axis.tolist()
         )
     return axis / length

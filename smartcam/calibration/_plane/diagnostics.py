@@ -121,7 +121,7 @@ def check_side(normal: Array, tool_z: Array) -> float:
     """Return the cosine between tool and normal; raise MIRRORED if they point to the same side."""
     cosine = float(normal @ tool_z) / float(np.linalg.norm(tool_z))
     if cosine > MIN_TOOL_COSINE:
-        raise Code.MIRRORED.refusal(
+        raise Code.MIRRORED.error(
             "expected the plane's normal to point against the tool, got one along it (cosine "
             f"{cosine:.2f}): the camera's y axis points the wrong way, or points are swapped",
             -1.0,
@@ -144,7 +144,7 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
     text += f" ({percent} %): the print, the units or the height are other than thought"
     if exact or abs(deviation) > MAX_SCALE_ERROR:
-        raise Code.SCALE_MISMATCH.refusal(text, nominal, measured)
+        raise Code.SCALE_MISMATCH.error(text, nominal, measured)
     return text
 
 

@@ -147,7 +147,7 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
     left, singular, right = np.linalg.svd(scaled_jacobian, full_matrices=False)
     condition = float(singular[-1] / singular[0]) if singular[0] > 0.0 else 0.0
     if condition < MIN_CONDITION:
-        raise Code.COLLINEAR.refusal(
+        raise Code.COLLINEAR.error(
             f"{name}: expected points that determine all {model.parameters} parameters "
             f"(condition at least {MIN_CONDITION:g}), got {condition:.2g}: too many in a line",
             MIN_CONDITION,

@@ -259,7 +259,7 @@ def _check_mapped(points: Array, result: Array) -> None:
 def _check_out(out: Array, count: int) -> Array:
     has_layout = out.shape == (count, 3) and out.dtype == np.float64 and out.flags.c_contiguous
     if not (has_layout and out.flags.writeable):
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"out: expected a contiguous float64 array of shape ({count}, 3), "
             f"got {out.dtype} of shape {out.shape}",
             (count, 3),
@@ -270,7 +270,7 @@ def _check_out(out: Array, count: int) -> Array:
 
 def _robot_header(camera_header: Header, robot_frame: str, camera_frame: str | None) -> Header:
     if camera_frame is not None and camera_header.frame_id != camera_frame:
-        raise Code.WRONG_FRAME.refusal(
+        raise Code.WRONG_FRAME.error(
             f"expected poses in the frame {camera_frame!r}, got one in {camera_header.frame_id!r}",
             camera_frame,
             camera_header.frame_id,
@@ -280,7 +280,7 @@ def _robot_header(camera_header: Header, robot_frame: str, camera_frame: str | N
 
 
 def _out_of_plane_error(pose: Pose) -> CalibrationError:
-    return Code.OUT_OF_PLANE.refusal(
+    return Code.OUT_OF_PLANE.error(
         "expected a pose in the camera's plane (z = 0, turned about z only), "
         f"got {tuple(pose.position)} turned by {tuple(pose.orientation)}",
         0.0,
@@ -289,7 +289,7 @@ def _out_of_plane_error(pose: Pose) -> CalibrationError:
 
 
 def _behind_horizon_error(point: list[float]) -> CalibrationError:
-    return Code.OUT_OF_FIELD.refusal(
+    return Code.OUT_OF_FIELD.error(
         f"expected points that the camera can see of the plane, got {point}: behind its horizon",
         "a point before the horizon",
         point,

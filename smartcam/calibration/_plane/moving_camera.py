@@ -73,7 +73,7 @@ class MovingCamera:
     ) -> None:
         points = as_points(field, 3, "moving camera: points of the field")
         if len(points) < 3:
-            raise Code.TOO_FEW.unexpected(
+            raise Code.TOO_FEW.error_with_value(
                 "moving camera: expected 3 points of the field or more", 3, len(points)
             )
         self._static = static
@@ -83,7 +83,7 @@ class MovingCamera:
         self._centre: Array = points.mean(axis=0)
         _, spread, axes = np.linalg.svd(points - self._centre)
         if not spread[1] > 1e-6 * spread[0]:
-            raise Code.COLLINEAR.refusal(
+            raise Code.COLLINEAR.error(
                 "moving camera: expected points of the field that are not on one line, got "
                 f"{spread[1]:.3g} m across it",
                 got=float(spread[1]),
@@ -125,7 +125,7 @@ class MovingCamera:
     def _check_frames(self, pose: Transform) -> None:
         expected = self._calibrated_at
         if (pose.target, pose.source) != (expected.target, expected.source):
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"moving camera: expected {expected.label}, as it was calibrated",
                 expected.label,
                 pose.label,
@@ -133,20 +133,20 @@ class MovingCamera:
 
     def _check_time(self, pose: Transform, image_at: datetime) -> None:
         if pose.at is None:
-            raise Code.NOT_SIMULTANEOUS.refusal(
+            raise Code.NOT_SIMULTANEOUS.error(
                 f"moving camera: expected the time of {pose.label}, to compare it with the "
                 "image's, got none",
                 image_at,
             )
         if image_at.tzinfo is None:
-            raise Code.BAD_TIME.unexpected(
+            raise Code.BAD_TIME.error_with_value(
                 "moving camera: expected an image's time with its time zone",
                 "a time with its time zone",
                 image_at,
             )
         lag = abs(pose.at - image_at)
         if lag > self._max_lag:
-            raise Code.NOT_SIMULTANEOUS.refusal(
+            raise Code.NOT_SIMULTANEOUS.error(
                 f"moving camera: expected a pose within {1e3 * self._max_lag.total_seconds():g} ms "
                 f"of the image, got one {1e3 * lag.total_seconds():g} ms from it",
                 self._max_lag,
@@ -162,7 +162,7 @@ class MovingCamera:
         rise = abs(float((motion.apply(self._centre) - self._centre) @ self._normal))
         sine = float(np.linalg.norm(np.cross(motion.rotation @ self._normal, self._normal)))
         tilt = math.degrees(math.atan2(sine, cosine))
-        raise Code.PLANE_MOVED.refusal(
+        raise Code.PLANE_MOVED.error(
             f"moving camera: expected a motion that keeps the plane of the parts within "
             f"{1e3 * self._tolerance:g} mm, got one that shifts it by {1e3 * rise:.2f} mm along "
             f"its normal and tilts it by {tilt:.2f} deg: {1e3 * distance:.2f} mm at the worst "

@@ -116,7 +116,7 @@ def find_agreeing(
     """
     count = len(camera)
     if count < MIN_POINTS:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             f"robust: expected at least {MIN_POINTS} points", MIN_POINTS, count
         )
     order = np.lexsort((weights, *robot.T, *camera.T))
@@ -127,7 +127,7 @@ def find_agreeing(
         return np.ones(count, dtype=np.bool_)
     min_count, agreeing_count = agreement.min_count, int(agreement.mask.sum())
     if agreeing_count < min_count:
-        raise Code.OUTLIER.unexpected(
+        raise Code.OUTLIER.error_with_value(
             f"expected at least {min_count} of {count} points that agree with one map",
             min_count,
             agreeing_count,

@@ -62,11 +62,13 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
         for number, pose in enumerate(as_list(flanges, object, "tool tip: pose"))
     ]
     if len(flanges) < 2:
-        raise Code.TOO_FEW.unexpected("tool tip: expected two touches or more", 2, len(flanges))
+        raise Code.TOO_FEW.error_with_value(
+            "tool tip: expected two touches or more", 2, len(flanges)
+        )
     label = flanges[0].label
     for flange in flanges:
         if flange.label != label:
-            raise Code.WRONG_FRAME.refusal(
+            raise Code.WRONG_FRAME.error(
                 f"tool tip: expected poses of one and the same frame, got {label} and "
                 f"{flange.label}",
                 label,
@@ -79,7 +81,7 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
     _, values, axes = np.linalg.svd(matrix / np.sqrt(len(flanges)), full_matrices=False)
     rank = int((values > MIN_ORIENTATION_SPREAD).sum())
     if rank < 2:  # turns about one axis have two equal eigenvalues
-        raise Code.INSUFFICIENT_ROTATION.refusal(
+        raise Code.INSUFFICIENT_ROTATION.error(
             f"tool tip: expected the flange at orientations that differ, got a spread of "
             f"{values[1]:.3g}, which must be above {MIN_ORIENTATION_SPREAD:g}",
             MIN_ORIENTATION_SPREAD,

@@ -109,7 +109,7 @@ def fit_touches(
     check_positive(touch_sigma, "touch_sigma", "metres")
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
     if not (math.isfinite(theta_sigma) and theta_sigma >= 0.0):
-        raise Code.NOT_FINITE.unexpected(
+        raise Code.NOT_FINITE.error_with_value(
             "theta_sigma: expected a number of radians that is not negative",
             "a number that is not negative",
             theta_sigma,
@@ -170,7 +170,7 @@ def fit_touches(
 def _as_touches(values: ArrayLike, name: str) -> Array:
     touches = as_points(np.atleast_2d(np.asarray(values)), 3, f"touches of {name}")
     if not len(touches):
-        raise Code.TOO_FEW.refusal(f"touches of {name}: expected one or more, got none", 1, 0)
+        raise Code.TOO_FEW.error(f"touches of {name}: expected one or more, got none", 1, 0)
     return touches
 
 

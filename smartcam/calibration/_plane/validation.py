@@ -52,7 +52,7 @@ def read_pairs(
     camera = as_points(camera_points, 2, "camera points").copy()
     robot = as_points(robot_points, 3, "robot points").copy()
     if len(camera) != len(robot):
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"expected as many robot points as camera points ({len(camera)})",
             len(camera),
             len(robot),
@@ -61,7 +61,7 @@ def read_pairs(
         return camera, robot, np.ones(len(camera))
     values = as_points(np.reshape(weights, (-1, 1)), 1, "weights")[:, 0].copy()
     if values.shape != (len(camera),) or (values <= 0).any():
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"weights: expected {len(camera)} positive numbers, got {values.tolist()[:8]}",
             len(camera),
             values.tolist(),
@@ -120,7 +120,7 @@ def check_positive(value: float | None, name: str, unit: str) -> None:
     number: object = as_plain_value(value)
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
     if not (is_number and 0 < value <= sys.float_info.max):
-        raise Code.NOT_FINITE.refusal(
+        raise Code.NOT_FINITE.error(
             f"{name}: expected a positive number of {unit}, got {excerpt(value)}",
             "a positive number",
             value,
@@ -144,7 +144,7 @@ def check_samples(
     wrong.
     """
     if len(camera) < min_count:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             f"expected at least {min_count} points", min_count, len(camera)
         )
     if not allow_strays:
@@ -154,7 +154,7 @@ def check_samples(
         _check_width(points, label)
     extents = _extents(robot)
     if extents[2] > MAX_THICKNESS_RATIO * extents[1]:
-        raise Code.NOT_PLANAR.refusal(
+        raise Code.NOT_PLANAR.error(
             f"robot points: expected a plane, got {1e3 * extents[2]:.3g} mm rms out of it and "
             f"{1e3 * extents[1]:.3g} mm rms across",
             float(MAX_THICKNESS_RATIO * extents[1]),
@@ -167,7 +167,7 @@ def check_samples(
 def check_field(robot: Array) -> None:
     """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than a robot's cell allows."""
     if (size := extent(robot)) > MAX_UNASKED_M:
-        raise Code.UNIT_UNKNOWN.refusal(
+        raise Code.UNIT_UNKNOWN.error(
             f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "
             f"of {size:.4g} m: are they millimetres? Multiply them by 0.001",
             MAX_UNASKED_M,
@@ -191,7 +191,7 @@ def check_lever(size: float, touch_sigma: float) -> None:
     ``size``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
     """
     if size < MIN_EXTENT_IN_SIGMAS * touch_sigma:
-        raise Code.SHORT_LEVER.refusal(
+        raise Code.SHORT_LEVER.error(
             f"robot points: expected at least {MIN_EXTENT_IN_SIGMAS:g} sigmas of a touch "
             f"({1e3 * MIN_EXTENT_IN_SIGMAS * touch_sigma:.3g} mm) in each direction, "
             f"got {1e3 * size:.3g} mm: they lie too close together, or are in another unit",
@@ -230,7 +230,7 @@ def _check_distinct(points: Array, label: str, min_count: int) -> None:
     tolerance = max(SAME_POINT_RATIO * extent, 4.0 * rounding, MIN_DIFFERENCE)
     distinct_count = len(np.unique(np.round((points - points[0]) / tolerance), axis=0))
     if distinct_count < min_count:
-        raise Code.COINCIDENT.unexpected(
+        raise Code.COINCIDENT.error_with_value(
             f"{label}: expected at least {min_count} different ones", min_count, distinct_count
         )
 
@@ -238,7 +238,7 @@ def _check_distinct(points: Array, label: str, min_count: int) -> None:
 def _check_width(points: Array, label: str) -> None:
     along, across = _extents(points)[:2]
     if across < MIN_WIDTH_RATIO * along:
-        raise Code.COLLINEAR.refusal(
+        raise Code.COLLINEAR.error(
             f"{label}: expected an extent across of at least {MIN_WIDTH_RATIO:g} of that along, "
             f"got {across / along:.2g}: they lie nearly in a line",
             MIN_WIDTH_RATIO,

@@ -6,7 +6,7 @@
     Path("sheet.svg").write_text(sheet.svg())
     Path("sheet.pdf").write_bytes(sheet.pdf())
     ...
-    target = scaled(sheet.target, (99.2, 99.3))  # measured lengths of the rulers, mm
+    target = scale_target(sheet.target, (99.2, 99.3))  # measured lengths of the rulers, mm
 
 A description is printed on each sheet; both files carry the target's description, as
 :func:`~smartcam.calibration.target_from_data` reads it.
@@ -104,7 +104,7 @@ class Rays:
     def __post_init__(self) -> None:
         is_number = isinstance(self.diameter, int | float) and not isinstance(self.diameter, bool)
         if not (is_number and math.isfinite(self.diameter) and self.diameter > 0):
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"rays: expected diameter to be a length in metres, got {self.diameter!r}",
                 "metres",
                 self.diameter,
@@ -215,7 +215,7 @@ def _page_too_small_error(target: Target | Rays, page: str, layout: PageLayout) 
     ]
     size_text = f"{size[0]:g} x {size[1]:g} mm"
     page_text = f"{page} ({size_text})" if page in PAGES_MM else size_text
-    return Code.PAGE_TOO_SMALL.refusal(
+    return Code.PAGE_TOO_SMALL.error(
         f"{_title(target).partition(': ')[2]}: does not fit on {page_text}: with rays, rulers and "
         f"a border of {BORDER_MM:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
         f"{' and '.join(excesses)}",
@@ -238,7 +238,7 @@ def page_size(page: str) -> tuple[float, float]:
     sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
     size = (float(sides[1]), float(sides[2])) if sides else (0.0, 0.0)
     if not 0 < min(size) <= max(size) <= MAX_PAGE_MM:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"page: expected one of {', '.join(PAGES_MM)}, or width and height in mm up to "
             f"{MAX_PAGE_MM:g}, such as 300x200, got {page[:64]!r}",
             list(PAGES_MM),
@@ -248,7 +248,7 @@ def page_size(page: str) -> tuple[float, float]:
 
 
 @check_arguments(measured_ruler=each(a_number, 2))
-def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
+def scale_target(target: T, measured_ruler: tuple[float, float]) -> T:
     """Return a target with its lengths as they are on paper.
 
     Args:
@@ -264,14 +264,14 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     factors = [length / RULER_MM for length in measured_ruler]
     for axis, factor in zip("xy", factors, strict=True):
         if not abs(factor - 1) <= MAX_SCALE_CHANGE:
-            raise Code.SCALE_MISMATCH.refusal(
+            raise Code.SCALE_MISMATCH.error(
                 f"ruler along {axis}: expected {RULER_MM:g} mm within {MAX_SCALE_CHANGE:.0%}, "
                 f"got {RULER_MM * factor:g} mm; print at 100 %, not fitted to the page",
                 RULER_MM,
                 RULER_MM * factor,
             )
     if abs(factors[0] - factors[1]) > MAX_SCALE_DIFFERENCE:
-        raise Code.SCALE_MISMATCH.refusal(
+        raise Code.SCALE_MISMATCH.error(
             f"rulers: expected the same length along x and y within {MAX_SCALE_DIFFERENCE:.1%}, "
             f"got {measured_ruler[0]:g} and {measured_ruler[1]:g} mm; measure again, or print "
             "with another printer",

@@ -426,7 +426,7 @@ def fit_corners(
     target_points = target.points[:, :2]
     unknown_ids = [point_id for point_id in ids if not 0 <= point_id < len(target_points)]
     if unknown_ids:
-        raise Code.SHAPE.unexpected(
+        raise Code.SHAPE.error_with_value(
             f"touched points: expected numbers from 0 to {len(target_points) - 1}",
             len(target_points) - 1,
             unknown_ids[0],

@@ -138,7 +138,7 @@ class SheetPlane:
         """
         x, y, z, w = poses.quaternions.T
         if poses.points[:, 2].any() or x.any() or y.any():
-            raise Code.OUT_OF_PLANE.refusal(
+            raise Code.OUT_OF_PLANE.error(
                 "sheet: expected poses in the image, turned about its z only, got some with a "
                 "height or a tilt"
             )
@@ -167,7 +167,7 @@ class SheetPlane:
         ).any(axis=1)
         if is_outside.any():
             pixel = pixel_array[int(np.argmax(is_outside))].tolist()
-            raise Code.OUT_OF_FIELD.unexpected(
+            raise Code.OUT_OF_FIELD.error_with_value(
                 f"sheet: expected pixels of an image of {width} x {height}, v down",
                 self.size,
                 pixel,
@@ -181,7 +181,7 @@ class SheetPlane:
         homogeneous = undistorted @ self._inverse_matrix[:, :2].T + self._inverse_matrix[:, 2]
         if not (homogeneous[:, 2] > 0).all():
             pixel = pixels[int(np.argmin(homogeneous[:, 2]))].tolist()
-            raise Code.OUT_OF_FIELD.refusal(
+            raise Code.OUT_OF_FIELD.error(
                 f"sheet: expected pixels that show its plane, got {pixel}: behind its horizon",
                 got=pixel,
             )
@@ -247,7 +247,7 @@ def _fit_without_lens(view: TargetView, start: Array) -> PlaneView:
     sheet_points, pixels = view.object_points[:, :2], view.points
     freedom = 2 * len(sheet_points) - 8
     if freedom <= 0:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             "sheet: expected 5 points or more without a lens", 5, len(sheet_points)
         )
     normalizing = _normalizing_matrix(sheet_points)
@@ -300,7 +300,7 @@ def _normalizing_matrix(points: Array) -> Array:
 
 
 def _no_fit_error(view: TargetView) -> CalibrationError:
-    return Code.POOR_FIT.refusal(
+    return Code.POOR_FIT.error(
         f"sheet: expected a plane that shows its {len(view.ids)} points where they are, got none",
         "a plane in front of the camera",
     )

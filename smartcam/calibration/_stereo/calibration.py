@@ -280,7 +280,7 @@ class StereoCalibration(storage.SavedCalibration):
     def _as_pixels(self, left: ArrayLike, right: ArrayLike) -> tuple[Array, Array]:
         first, second = as_points(left, 2, "left pixels"), as_points(right, 2, "right pixels")
         if len(first) != len(second):
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 f"pixels: expected as many on both sides, got {len(first)} and {len(second)}",
                 len(first),
                 len(second),
@@ -355,7 +355,7 @@ def calibrate_stereo(
     min_pairs = MIN_PAIRS if left and right else MIN_VIEWS
     complete = [number for number, moment in enumerate(moments) if None not in moment]
     if len(complete) < min_pairs:
-        raise Code.TOO_FEW.unexpected(
+        raise Code.TOO_FEW.error_with_value(
             f"stereo: expected {min_pairs} pairs or more in which both cameras see the target",
             min_pairs,
             len(complete),
@@ -380,7 +380,7 @@ def calibrate_stereo(
     while True:
         adjusted = adjust_weighted(bundle, sights)
         if not math.isfinite(adjusted.weighted_squares):
-            raise Code.POOR_FIT.refusal(
+            raise Code.POOR_FIT.error(
                 "stereo: expected cameras that show the pairs as they are, got points behind one"
             )
         worst, ratio = worst_view([sight.view for sight in sights], adjusted)

@@ -77,7 +77,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
     ]
     for number, left, right in pairs:
         if np.array_equal(left.ids, right.ids) and np.array_equal(left.points, right.points):
-            raise Code.COINCIDENT.refusal(
+            raise Code.COINCIDENT.error(
                 "stereo: expected images of two cameras, got the same image on both sides in "
                 f"{view_name(left, number)}",
                 "two cameras",
@@ -105,7 +105,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         ratio > EXCHANGED_RESIDUAL_RATIO
         and (exchanged_squares < squares).mean() >= MIN_SWAPPED_SHARE
     ):
-        raise Code.SWAPPED_LENSES.refusal(
+        raise Code.SWAPPED_LENSES.error(
             "stereo: expected the left camera's lens as left and the right one's as right, got "
             f"residuals {ratio:.3g} times as large as with the two exchanged",
             1.0,
@@ -126,7 +126,7 @@ def check_cameras_apart(transform: Transform, covariance: Array) -> None:
     # whole covariance
     shift, shift_covariance = transform.translation, covariance[3:, 3:]
     if float(shift @ shift) ** 2 <= MIN_APART_CHI2 * float(shift @ shift_covariance @ shift):
-        raise Code.COINCIDENT.refusal(
+        raise Code.COINCIDENT.error(
             "stereo: expected two cameras that stand apart, got one "
             f"{1e3 * float(np.linalg.norm(shift)):.2g} mm from the other, which may be nothing: "
             "are the images of both sides those of one camera?",
@@ -238,7 +238,7 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
     names = ", ".join(
         f"{view_name(sight.view, sight.pose)} ({SIDES[sight.camera]})" for sight in bad
     )
-    raise Code.POOR_FIT.refusal(
+    raise Code.POOR_FIT.error(
         "stereo: expected cameras that show the pairs as they are, got residuals of "
         f"{rms:.3g} pixels rms, {max_rms:.3g} at most expected: were the views of each pair taken "
         f"at the same moment, and are they in the same order? Those that fit worst: "

@@ -109,7 +109,7 @@ def rectify(
     cosine = min(float(turn[2, 2]) for turn in turns)
     is_upright = min(float(projection[0, 0]) for projection in projections) > 0
     if not (is_upright and cosine > MIN_TURN_COSINE and all(mask.any() for mask in masks)):
-        raise Code.OUT_OF_FIELD.refusal(
+        raise Code.OUT_OF_FIELD.error(
             f"rectify with alpha {alpha:g}: expected two cameras beside each other that see the "
             "same place the same way up, got parallel images with nothing in them, or upside down "
             f"(cosine between old and new viewing direction: {cosine:.2f})",
@@ -142,7 +142,7 @@ def _check_arguments(
     if left.distortion_model != right.distortion_model:
         raise _shape_error("lenses", f"two of {left.distortion_model}", right.distortion_model)
     if tuple(left.size) != tuple(right.size):
-        raise Code.WRONG_SIZE.refusal(
+        raise Code.WRONG_SIZE.error(
             f"rectify: expected images of one size, {left.size[0]} x {left.size[1]}, got "
             f"{right.size[0]} x {right.size[1]} on the right",
             left.size,
@@ -155,7 +155,7 @@ def _check_arguments(
 
 
 def _shape_error(label: str, expected: str, actual: object) -> CalibrationError:
-    return Code.SHAPE.unexpected(f"rectify: {label}: expected {expected}", expected, actual)
+    return Code.SHAPE.error_with_value(f"rectify: {label}: expected {expected}", expected, actual)
 
 
 def _parallel_cameras(

@@ -74,7 +74,7 @@ def as_moments(
         for side, views in zip(SIDES, (left_views, right_views), strict=True)
     )
     if len(left_views) != len(right_views):
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"stereo: expected as many left views as right ones, got {len(left_views)} and "
             f"{len(right_views)}",
             len(left_views),
@@ -85,7 +85,7 @@ def as_moments(
     moments = list(zip(left_views, right_views, strict=True))
     for left, right in moments:
         if left is not None and right is not None and left.target != right.target:
-            raise Code.DIFFERENT_TARGETS.refusal(
+            raise Code.DIFFERENT_TARGETS.error(
                 f"stereo: expected views of one target, {left.target}, got {right.target} on the "
                 "right",
                 left.target,
@@ -190,7 +190,7 @@ def _guess_rig(
         if median < least_median:
             best_guess, least_median, distances = guess, median, candidate_distances
     if not math.isfinite(least_median):
-        raise Code.POOR_FIT.refusal(
+        raise Code.POOR_FIT.error(
             f"stereo: expected one transform from left to right that fits most of the "
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )

@@ -311,7 +311,7 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
     """
     file_format = look_up(TRANSFORMS, form)
     if suffix not in {None, file_format.suffix}:
-        raise Code.BAD_NAME.unexpected(
+        raise Code.BAD_NAME.error_with_value(
             f"format {form}: expected a name that ends in {file_format.suffix}",
             file_format.suffix,
             suffix,

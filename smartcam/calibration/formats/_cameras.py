@@ -86,7 +86,7 @@ class CameraChain:
 
     def __post_init__(self) -> None:
         if not 0 < len(self.cameras) == len(self.transforms) + 1 == len(self.names):
-            raise Code.SHAPE.refusal(
+            raise Code.SHAPE.error(
                 "chain of cameras: expected a name for each of them and a transform between each "
                 f"two, got {len(self.cameras)} cameras, {len(self.names)} names and "
                 f"{len(self.transforms)} transforms"
@@ -513,7 +513,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
 
 
 def _unsupported_error(form: str, expected: str, actual: str) -> CalibrationError:
-    return Code.SHAPE.unexpected(
+    return Code.SHAPE.error_with_value(
         f"{form}: expected {expected}, which is all it can hold", expected, actual
     )
 
@@ -522,7 +522,7 @@ def _choose_size(stated: Sequence[Plain], given_size: tuple[int, int] | None) ->
     """Return width and height, pixels: the file's, or those that the user gives."""
     if not stated:
         if given_size is None:
-            raise Code.WRONG_SIZE.refusal(
+            raise Code.WRONG_SIZE.error(
                 "file: expected width and height of the images, which the file lacks; give them "
                 "as size=(width, height), pixels",
                 "size=(width, height)",
@@ -532,7 +532,7 @@ def _choose_size(stated: Sequence[Plain], given_size: tuple[int, int] | None) ->
         as_whole_number(length, "size of the images") for length in as_list([*stated], "size", 2)
     )
     if given_size is not None and (width, height) != tuple(given_size):
-        raise Code.WRONG_SIZE.refusal(
+        raise Code.WRONG_SIZE.error(
             f"size: the file says {width} x {height}, got {given_size[0]} x {given_size[1]}",
             (width, height),
             tuple(given_size),

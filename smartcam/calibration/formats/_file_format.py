@@ -106,7 +106,7 @@ class Format(Generic[T]):
     def to_text(self, value: T) -> str:
         """Return a value as text, without ``head``; raise UNKNOWN_FORMAT if it can only be read."""
         if self.compose is None:
-            raise Code.UNKNOWN_FORMAT.refusal(
+            raise Code.UNKNOWN_FORMAT.error(
                 f"{self.title}: expected a format that can be written, got one that is only read",
                 got=self.title,
             )

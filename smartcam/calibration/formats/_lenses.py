@@ -82,7 +82,7 @@ def read_lenses(
             return StoredLenses(cameras.names, lenses, cameras.transforms)
     if beginning.lstrip().startswith(b"{"):
         return _read_own_file(path)
-    raise Code.UNKNOWN_FORMAT.refusal(
+    raise Code.UNKNOWN_FORMAT.error(
         f"{path}: expected a calibration of smartcam, or one of {', '.join(FORMAT_PATTERNS)}; got "
         "none of them",
         list(FORMAT_PATTERNS),
@@ -131,7 +131,7 @@ def _read_own_file(path: str | os.PathLike[str]) -> StoredLenses:
         lenses = _lens_on_robot(HandEyeCalibration.from_data(document.data))
         if lenses is not None:
             return lenses
-    raise Code.WRONG_KIND.refusal(
+    raise Code.WRONG_KIND.error(
         f"{path}: holds {document.kind!r}, expected a calibration that has a lens",
         "a calibration that has a lens",
         document.kind,

@@ -101,7 +101,7 @@ def parse_matrix(text: str) -> PlaneMatrix:
             raise malformed_error(name, "a text", data[name])
     matrix = stored_matrix(data, "matrix", (4, 3))
     if np.linalg.matrix_rank(matrix) < 3:
-        raise Code.COLLINEAR.unexpected("matrix: expected one of rank 3", got=matrix.tolist())
+        raise Code.COLLINEAR.error_with_value("matrix: expected one of rank 3", got=matrix.tolist())
     return PlaneMatrix(matrix, *(data[name] for name in names))
 
 

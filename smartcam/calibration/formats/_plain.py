@@ -60,7 +60,7 @@ def malformed_error(label: str, expected: str, actual: object = None) -> Calibra
     """Return the error for a text that does not have its format; ``actual`` is shortened."""
     shown = None if actual is None else _shorten(actual)
     text = f"{label}: expected {expected}" + ("" if shown is None else f", got {shown}")
-    return Code.MALFORMED.refusal(text, expected, shown)
+    return Code.MALFORMED.error(text, expected, shown)
 
 
 def add_place(where: str, error: CalibrationError) -> CalibrationError:
@@ -73,7 +73,7 @@ def add_place(where: str, error: CalibrationError) -> CalibrationError:
 def look_up(table: Mapping[str, T], name: str, label: str = "format") -> T:
     """Return a table's value for a name; raise ``UNKNOWN_FORMAT`` if there is none."""
     if not isinstance(name, str) or name not in table:
-        raise Code.UNKNOWN_FORMAT.refusal(
+        raise Code.UNKNOWN_FORMAT.error(
             f"no {label} is called {name!r}; expected one of {', '.join(table)}", list(table), name
         )
     return table[name]
@@ -163,7 +163,7 @@ def as_number(value: Plain, where: str) -> float:
     if parsed is None:
         raise malformed_error(where, "a number", value)
     if not abs(parsed) <= MAX_NUMBER:
-        raise Code.NOT_FINITE.refusal(
+        raise Code.NOT_FINITE.error(
             f"{where}: expected a number of at most {MAX_NUMBER:g}, got {_shorten(text)}",
             MAX_NUMBER,
             text,
@@ -231,7 +231,7 @@ def frame_name(value: Plain, where: str) -> str:
     or on a command line.
     """
     if not (isinstance(value, str) and len(value) <= _MAX_NAME and _NAME.fullmatch(value)):
-        raise Code.BAD_NAME.unexpected(
+        raise Code.BAD_NAME.error_with_value(
             f"{where}: expected a frame's name of letters, digits and _ . / + -",
             _NAME.pattern,
             _shorten(value),

@@ -48,7 +48,7 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
     shear = float(np.abs(inner - square * np.eye(2)).max()) / square
     bend = float(np.abs(matrix[3, :2]).max()) * calibration.place.camera_size
     if max(shear, bend) > _MAX_SIMILAR_DEVIATION:
-        raise Code.NOT_SIMILAR.refusal(
+        raise Code.NOT_SIMILAR.error(
             f"{calibration.model}: expected one scale for the whole plane, got axes that differ by "
             f"{shear:.2g} and a scale that changes by {bend:.2g} over the points: no rigid frame "
             "says this; export the matrix, or fit a similarity",

@@ -80,7 +80,7 @@ def _vector_from_pose(pose: Transform) -> list[float]:
 def _matrix_from_xyzw(quaternion: Array) -> Array:
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) < _MAX_UNIT_DEVIATION:
-        raise Code.NOT_RIGID.refusal(
+        raise Code.NOT_RIGID.error(
             f"expected a quaternion of length 1, got {quaternion.tolist()} of length {length:.6g}",
             1.0,
             length,
@@ -200,7 +200,7 @@ def pose_from(
     label = f"pose of {robot} ({', '.join(convention.numbers)})"
     given = as_vector(values, len(convention.numbers), label)
     if not np.abs(given).max() <= MAX_NUMBER:
-        raise Code.NOT_FINITE.unexpected(
+        raise Code.NOT_FINITE.error_with_value(
             f"{label}: expected numbers of at most {MAX_NUMBER:g}", MAX_NUMBER, given.tolist()
         )
     if unit is None:

@@ -105,7 +105,7 @@ def check_same_frames(transforms: Sequence[Transform], label: str) -> None:
     """
     for index, transform in enumerate(transforms):
         if (transform.target, transform.source) != (transforms[0].target, transforms[0].source):
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"{label.format(index)}: expected {transforms[0].label}, like {label.format(0)}",
                 transforms[0].label,
                 transform.label,

@@ -137,7 +137,7 @@ def _parse_pose(line: str, header: _Columns, where: str, target: str, source: st
 def _microseconds(text: str, unit: Decimal, where: str) -> int:
     seconds = Decimal(text) * unit if _TIME.fullmatch(text) else None
     if seconds is None or not seconds <= _MAX_TIME:
-        raise Code.BAD_TIME.refusal(
+        raise Code.BAD_TIME.error(
             f"{where}: expected a time since 1970, before the year 10000, got {text[:64]!r}",
             got=text,
         )
@@ -171,7 +171,7 @@ def _with_times(transforms: Sequence[Transform]) -> list[tuple[int, Transform]]:
     timed: list[tuple[int, Transform]] = []
     for index, transform in enumerate(transforms):
         if transform.at is None or transform.at < _EPOCH:
-            raise Code.BAD_TIME.unexpected(
+            raise Code.BAD_TIME.error_with_value(
                 f"pose {index}: expected a time since 1970", got=transform.at
             )
         timed.append(((transform.at - _EPOCH) // timedelta(microseconds=1), transform))

@@ -120,7 +120,7 @@ def _paper_box(
 ) -> tuple[int, ...]:
     """Return the box of pixels that shows the paper and a margin: left, top, right, bottom."""
     if float(pose.rotation[:, 2] @ pose.translation) >= 0:
-        raise Code.MIRRORED.refusal(
+        raise Code.MIRRORED.error(
             f"{pose.label}: expected the sheet's front towards the camera, got its back",
             "the target's z towards the camera",
             "its z away from the camera",
@@ -133,7 +133,7 @@ def _paper_box(
     ].T + pose.translation
     nearest = float(rim_points[:, 2].min())
     if not nearest > 0:
-        raise Code.OUT_OF_FIELD.refusal(
+        raise Code.OUT_OF_FIELD.error(
             f"{pose.label}: expected the sheet in front of the camera, got a corner at z = "
             f"{nearest:.3g} m",
             "z > 0",

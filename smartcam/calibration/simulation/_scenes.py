@@ -71,7 +71,7 @@ def view(
     is_inside = ((pixels >= -0.5) & (pixels < np.array(camera.size) - 0.5)).all(axis=1)
     ids = np.flatnonzero(is_inside)
     if len(ids) < MIN_VISIBLE_POINTS:
-        raise Code.OUT_OF_FIELD.refusal(
+        raise Code.OUT_OF_FIELD.error(
             f"view: expected at least {MIN_VISIBLE_POINTS} points of the target in the image, got "
             f"{len(ids)} of {len(pixels)}",
             MIN_VISIBLE_POINTS,

@@ -441,7 +441,7 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
         if value is None
     }
     if missing:
-        raise Code.WRONG_ANSWERS.refusal(f"pose: no answer for {', '.join(missing)}", got=missing)
+        raise Code.WRONG_ANSWERS.error(f"pose: no answer for {', '.join(missing)}", got=missing)
     return pose_from(robot, values, source="flange")
 
 

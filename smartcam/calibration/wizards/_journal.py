@@ -84,7 +84,7 @@ class Journal:
         is full; OSError if the entry cannot be written, which leaves the file as it was.
         """
         if len(self.entries) >= MAX_ENTRIES:
-            raise Code.NOT_STORABLE.refusal(
+            raise Code.NOT_STORABLE.error(
                 f"{self.path}: entry {MAX_ENTRIES + 1}, expected {MAX_ENTRIES} at most"
             )
         stored = self._write(entry)
@@ -97,7 +97,7 @@ class Journal:
 
     def _lock(self) -> None:
         if try_lock(self._stream.fileno()) is False:
-            raise Code.IN_USE.refusal(
+            raise Code.IN_USE.error(
                 f"{self.path}: another sequence writes it; expected one at a time"
             )
 
@@ -124,9 +124,9 @@ class Journal:
         try:
             line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         except (TypeError, ValueError, RecursionError) as exc:
-            raise Code.NOT_STORABLE.refusal(f"{self.path}: cannot be stored: {exc}") from exc
+            raise Code.NOT_STORABLE.error(f"{self.path}: cannot be stored: {exc}") from exc
         if len(line) > MAX_LINE_BYTES:
-            raise Code.NOT_STORABLE.refusal(
+            raise Code.NOT_STORABLE.error(
                 f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE_BYTES} at most"
             )
         try:
@@ -150,4 +150,4 @@ class Journal:
         self._stream.seek(self._size)
 
     def _broken_journal_error(self, why: str) -> CalibrationError:
-        return Code.BROKEN_FILE.refusal(f"{self.path}: {why}; expected the journal of a sequence")
+        return Code.BROKEN_FILE.error(f"{self.path}: {why}; expected the journal of a sequence")

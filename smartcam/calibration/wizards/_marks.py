@@ -96,7 +96,7 @@ class MarkCamera:
         ]
         if not 0 < len(rows) <= MAX_MARKS:
             name_text = f"{self.feature!r} " if self.feature else ""
-            raise (Code.SHAPE if rows else Code.TOO_FEW).refusal(
+            raise (Code.SHAPE if rows else Code.TOO_FEW).error(
                 f"the camera found {len(rows)} marks {name_text}among {len(localizations)} "
                 f"localizations; expected 1 to {MAX_MARKS}",
                 got=len(rows),
@@ -109,7 +109,7 @@ class MarkCamera:
         ``label``: name, for people, of the earlier picture or calibration.
         """
         if None not in {earlier, self.y_down} and earlier != self.y_down:
-            raise Code.MIRRORED.refusal(
+            raise Code.MIRRORED.error(
                 f"{label} with y_down={earlier}, now it is {self.y_down}, and everything would be "
                 f"mirrored; expected y_down={earlier}",
                 earlier,

@@ -171,7 +171,7 @@ class PictureFolder:
                         return await asyncio.to_thread(self._read, newest)
                     last = now
         except TimeoutError as exc:
-            raise Code.NO_PICTURE.refusal(
+            raise Code.NO_PICTURE.error(
                 f"no picture came into {self.path} within {self.deadline:g} s"
                 f"{self._describe_other_files(before, other_names)}; expected a file that ends in "
                 f"one of {', '.join(sorted(SUFFIXES))}, written after the button was pressed",
@@ -202,7 +202,7 @@ class PictureFolder:
         try:
             for count, file in enumerate(self.path.iterdir()):
                 if count >= MAX_FILES:
-                    raise Code.NO_PICTURE.refusal(
+                    raise Code.NO_PICTURE.error(
                         f"{self.path}: expected {MAX_FILES} files at most, got more", MAX_FILES
                     )
                 if file.suffix.lower() not in SUFFIXES:
@@ -213,7 +213,7 @@ class PictureFolder:
                     continue
                 files[file.name] = (status.st_mtime_ns, status.st_size)
         except OSError as exc:
-            raise Code.NO_PICTURE.unexpected(
+            raise Code.NO_PICTURE.error_with_value(
                 f"{self.path}: expected a folder that pictures come into", got=exc.strerror
             ) from exc
         return files
@@ -228,4 +228,4 @@ class PictureFolder:
 
 
 def _picture_error(name: str, expected: str, actual: str) -> CalibrationError:
-    return Code.BAD_PICTURE.unexpected(f"{name}: expected {expected}", expected, actual)
+    return Code.BAD_PICTURE.error_with_value(f"{name}: expected {expected}", expected, actual)

@@ -130,7 +130,7 @@ class _ScriptRun:
             if self.pending is None or self.pending.step.id != entry["step"]:
                 place = "the end" if self.pending is None else f"step {self.pending.step.id!r}"
                 self.close()
-                raise Code.WRONG_JOURNAL.refusal(
+                raise Code.WRONG_JOURNAL.error(
                     f"entry {number} is of step {entry['step']!r}, expected {place}: another "
                     f"version of {wizard.name!r} wrote it"
                 )
@@ -228,7 +228,7 @@ class WizardSession:
             self.parameters: dict[str, Any] = dict(header["parameters"])
             self._log = functools.reduce(_SequenceLog.with_entry, self._all_entries, _SequenceLog())
         except (KeyError, IndexError, TypeError, ValueError) as exc:
-            raise Code.BROKEN_FILE.refusal(
+            raise Code.BROKEN_FILE.error(
                 f"the journal is incomplete: {exc!r}; expected a journal as a sequence writes it"
             ) from exc
         self._script_run = self._replay_entries()
@@ -259,7 +259,7 @@ class WizardSession:
         except (AttributeError, LookupError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError) or not self._log.entries:
                 raise
-            raise Code.BROKEN_FILE.refusal(
+            raise Code.BROKEN_FILE.error(
                 f"the journal's answers do not lead through {self.wizard.name!r}: {exc!r}; "
                 "expected answers that its steps accept"
             ) from exc
@@ -270,7 +270,7 @@ class WizardSession:
         if journal is not None and journal.header is not None:
             actual = {name: journal.header.get(name) for name in expected}
             if actual != expected:
-                raise Code.WRONG_JOURNAL.refusal(
+                raise Code.WRONG_JOURNAL.error(
                     f"{journal.path}: written by {_describe_wizard(actual)}, expected "
                     f"{_describe_wizard(expected)}",
                     expected,
@@ -498,11 +498,11 @@ class WizardSession:
     def _require_token(self, token: str) -> PendingStep:
         pending = self._script_run.pending
         if self.state != "asking" or pending is None:
-            raise Code.NOT_POSSIBLE.refusal(
+            raise Code.NOT_POSSIBLE.error(
                 f"the sequence is over ({self.state}); expected one that asks", got=self.state
             )
         if token != self.token:
-            raise Code.STALE_STEP.refusal(
+            raise Code.STALE_STEP.error(
                 "the step has changed meanwhile: look at the current one", self.token, token
             )
         return pending
@@ -515,7 +515,7 @@ class WizardSession:
         return _ScriptRun(self.wizard, self.parameters, self._log.entries[:-1])
 
     def _impossible_error(self, label: str) -> CalibrationError:
-        return Code.NOT_POSSIBLE.refusal(
+        return Code.NOT_POSSIBLE.error(
             f"{label}: not possible here; expected one of {', '.join(self._possible_calls())}",
             got=label,
         )
@@ -601,7 +601,7 @@ def _as_stored(value: dict[str, Any], label: str) -> dict[str, Any]:
     try:
         stored: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as exc:
-        raise Code.NOT_STORABLE.refusal(f"{label} cannot be stored: {exc}") from exc
+        raise Code.NOT_STORABLE.error(f"{label} cannot be stored: {exc}") from exc
     return stored
 
 

@@ -99,9 +99,7 @@ class CalibrationService:
             CalibrationError: ``NO_SEQUENCE``.
         """
         if self._session is None:
-            raise Code.NO_SEQUENCE.refusal(
-                "no calibration is under way; expected one to be started"
-            )
+            raise Code.NO_SEQUENCE.error("no calibration is under way; expected one to be started")
         return self._session
 
     def start(
@@ -132,12 +130,12 @@ class CalibrationService:
         """
         path = self.folder.journal(name, "" if wizard == KIND else wizard)
         if wizard not in self._wizards:
-            raise Code.NOT_FOUND.refusal(
+            raise Code.NOT_FOUND.error(
                 f"no wizard is called {wizard!r}; expected one of {', '.join(self._wizards)}",
                 got=wizard,
             )
         if self._session is not None and self._session.busy:
-            raise Code.NOT_POSSIBLE.refusal(
+            raise Code.NOT_POSSIBLE.error(
                 "an action is under way; expected it to end or to be aborted"
             )
         self.close()
@@ -191,7 +189,7 @@ class CalibrationService:
         if form is None and path.suffix == ".json":
             body = source.read_bytes()
         elif form is None and path.suffix != MATRIX_SUFFIX:
-            raise Code.UNKNOWN_FORMAT.refusal(
+            raise Code.UNKNOWN_FORMAT.error(
                 f"{path.name}: expected the format to be named, or a file that ends in .json or "
                 f"{MATRIX_SUFFIX}",
                 [".json", MATRIX_SUFFIX],
@@ -236,11 +234,11 @@ class CalibrationService:
         """
         calibration = self._calibration
         if calibration is None:
-            raise Code.NO_CALIBRATION.refusal(
+            raise Code.NO_CALIBRATION.error(
                 "no calibration is loaded; expected one to be loaded first"
             )
         if frame not in {None, calibration.robot_frame}:
-            raise Code.WRONG_FRAME.refusal(
+            raise Code.WRONG_FRAME.error(
                 f"frame {frame!r}: expected {calibration.robot_frame!r}",
                 calibration.robot_frame,
                 frame,
@@ -270,7 +268,7 @@ def _move_aside(path: Path) -> None:
 
 def _data_of_kind(document: Document, kind: str, name: str) -> dict[str, Any]:
     if document.kind != kind:
-        raise Code.WRONG_KIND.refusal(
+        raise Code.WRONG_KIND.error(
             f"{name}: holds {document.kind!r}, expected {kind!r}", kind, document.kind
         )
     return document.data

@@ -292,14 +292,14 @@ def _with_default(input_field: Input, parameters: Mapping[str, Any]) -> Input:
     try:
         return replace(input_field, default=input_field.checked(value))
     except ValueError as exc:
-        raise Code.WRONG_ANSWERS.refusal(
+        raise Code.WRONG_ANSWERS.error(
             f"parameter {input_field.name}: {exc}", got={input_field.name: str(exc)}
         ) from exc
 
 
 def _wrong_answers_error(errors: dict[str, str]) -> CalibrationError:
     text = "; ".join(text if name == "base" else f"{name}: {text}" for name, text in errors.items())
-    return Code.WRONG_ANSWERS.refusal(text, got=errors)
+    return Code.WRONG_ANSWERS.error(text, got=errors)
 
 
 # ---------------------------------------------------------------------- the thesis' lists

@@ -92,7 +92,7 @@ def draw_preview(
     """
     grey = grey_image(image)
     if view is not None and view.size != grey.size:
-        raise Code.SHAPE.refusal(
+        raise Code.SHAPE.error(
             f"preview: expected a view of an image of {grey.size[0]} x {grey.size[1]} pixels, "
             f"got one of {view.size[0]} x {view.size[1]}",
             grey.size,
@@ -174,7 +174,7 @@ def _coverage_text(
 def _check_points(given: ArrayLike, count: int) -> Array:
     points = as_points(given, 2, "preview")
     if len(points) != count:
-        raise Code.SHAPE.unexpected(f"preview: expected {count} points", count, len(points))
+        raise Code.SHAPE.error_with_value(f"preview: expected {count} points", count, len(points))
     return points
 
 

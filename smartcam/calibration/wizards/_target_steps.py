@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.calibration._printing.page_layout import RULER_MM
-from smartcam.calibration._printing.sheets import scaled
+from smartcam.calibration._printing.sheets import scale_target
 from smartcam.calibration._targets import target_from_data, target_to_data
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Flag, Number, Option, Step, Text
@@ -76,7 +76,7 @@ async def ask_target(
 
     ``suggested``: default of the question. ``known``: a description of the target; the question is
     then skipped. ``square``: default of a square's side, mm. Raises CalibrationError for a wrong
-    description of a target, and for rulers that :func:`~smartcam.calibration.scaled` refuses.
+    description of a target, and for rulers that :func:`~smartcam.calibration.scale_target` refuses.
     """
     if known is None:
         target = await _which_target(suggested, square)
@@ -90,7 +90,7 @@ async def ask_target(
         inputs=tuple(ruler_input(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
     )
     measured = await ask(step)
-    return scaled(target, (measured["ruler_x"], measured["ruler_y"]))
+    return scale_target(target, (measured["ruler_x"], measured["ruler_y"]))
 
 
 async def _which_target(suggested: Target | None, square: float | None) -> Target:
@@ -134,6 +134,6 @@ def _require_mapping(data: object) -> dict[str, Any]:
     if not isinstance(data, dict):
         message = "expected the description of a target, such as "
         message += '{"kind": "checkerboard", "columns": 9, "rows": 6, "square": 0.025}'
-        raise Code.WRONG_ANSWERS.refusal(message, got={"description": message})
+        raise Code.WRONG_ANSWERS.error(message, got={"description": message})
     target: dict[str, Any] = data
     return target

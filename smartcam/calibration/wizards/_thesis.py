@@ -268,7 +268,7 @@ class ThesisCalibration:
     def _check_free(self) -> None:
         if self._sequence is not None:
             since = asyncio.get_running_loop().time() - self._last_call_at
-            raise Code.IN_USE.refusal(
+            raise Code.IN_USE.error(
                 f"{self._name}: a calibration is under way, whose last call came {since:.0f} s ago;"
                 " expected PerformCurrentAndGetNextStep to go on with it or, with abort, to end "
                 f"it. It is given up after {self._abandon_timeout:g} s without a call"
@@ -278,7 +278,7 @@ class ThesisCalibration:
         """Refuse topics and frames if there is no ROS, and names that no topic can have."""
         named = [*topics, *((frame,) if frame else ())]
         if named and self.graph is None:
-            raise Code.NOT_POSSIBLE.refusal(
+            raise Code.NOT_POSSIBLE.error(
                 f"{self._name}: {', '.join(named)}: this camera is not seen in ROS; expected "
                 f"{SMARTCAMERA} or no topic, and no frames, or ros2: in the fleet file",
                 got=named,
@@ -303,7 +303,7 @@ class ThesisCalibration:
         """
         sequence = self._sequence
         if sequence is None:
-            raise Code.NO_SEQUENCE.refusal(
+            raise Code.NO_SEQUENCE.error(
                 f"{self._name}: no calibration is under way ({self._last_end}); expected "
                 "StartCalibration first"
             )
@@ -322,7 +322,7 @@ class ThesisCalibration:
     def _refuse_concurrent(self, label: str) -> Iterator[None]:
         """Refuse a call while another call is running."""
         if self._busy:
-            raise Code.NOT_POSSIBLE.refusal(
+            raise Code.NOT_POSSIBLE.error(
                 f"{self._name}: another call is under way; {label} was not done. Expected its "
                 "answer to come first, or abort"
             )
@@ -541,12 +541,12 @@ class ThesisCalibration:
         """
         calibration = self._loaded
         if calibration is None:
-            raise Code.NO_CALIBRATION.refusal(
+            raise Code.NO_CALIBRATION.error(
                 f"{self._name}: no calibration is loaded; expected LoadCalibration first"
             )
         pose = self._files.transform(request.x, request.y, request.theta)
         if request.frame and calibration.camera_frame not in {None, request.frame}:
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"frame_id: expected {calibration.camera_frame!r}, the camera's frame",
                 calibration.camera_frame,
                 request.frame,
@@ -564,7 +564,7 @@ class ThesisCalibration:
     async def _frame_pose(self, robot: str, reference: str, utc: float | None) -> Transform:
         """Return the pose of the robot's frame in the reference frame."""
         if self.graph is None:
-            raise Code.WRONG_FRAME.unexpected(
+            raise Code.WRONG_FRAME.error_with_value(
                 f"tf_frame_reference: expected {robot!r}, since this camera is not seen in ROS, "
                 "whose TF would lead elsewhere",
                 robot,
@@ -573,7 +573,7 @@ class ThesisCalibration:
         return await self.graph.pose(robot, reference, utc)
 
 
-class CalibrationDesks:
+class CalibrationsByCamera:
     """The calibrations of an agent's cameras, in one folder.
 
     Args:
@@ -585,25 +585,25 @@ class CalibrationDesks:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self._folder = Folder(folder).path
-        self._desks: dict[str, ThesisCalibration] = {}
+        self._calibrations: dict[str, ThesisCalibration] = {}
 
     def of(self, camera: str) -> ThesisCalibration:
         """Return the calibrations of a camera."""
-        desk = self._desks.get(camera)
-        if desk is None:
-            desk = self._desks[camera] = ThesisCalibration(self._folder, camera)
-        return desk
+        calibration = self._calibrations.get(camera)
+        if calibration is None:
+            calibration = self._calibrations[camera] = ThesisCalibration(self._folder, camera)
+        return calibration
 
     def close(self) -> None:
         """End running calibrations, which can be resumed."""
-        for desk in self._desks.values():
-            desk.close()
+        for calibration in self._calibrations.values():
+            calibration.close()
 
 
 def _require(value: T | None) -> T:
     """Return a value; raise NOT_POSSIBLE if it became None since it was checked."""
     if value is None:
-        raise Code.NOT_POSSIBLE.refusal(
+        raise Code.NOT_POSSIBLE.error(
             "the camera is not seen in ROS any more; expected it to come back, or abort"
         )
     return value

@@ -119,7 +119,7 @@ class Touches:
         """Raise SHAPE if ``more`` touches would be too many."""
         count = len(self.touches) + more
         if count > most:
-            raise Code.SHAPE.refusal(f"{count} {noun}, expected {most} at most", most, count)
+            raise Code.SHAPE.error(f"{count} {noun}, expected {most} at most", most, count)
 
     async def add_marks(self, rows: Sequence[Mapping[str, Any]], most: int, noun: str) -> None:
         """Ask which marks of a picture will be touched, then for their touches.

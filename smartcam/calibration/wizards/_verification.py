@@ -162,7 +162,7 @@ async def _load_calibration(
     calibration = PlaneCalibration.load(file)
     camera.check_y_down(calibration.y_down, f"{name} was made")
     if calibration.touch_sigma is None and answers["touch_sigma"] is None:
-        raise Code.WRONG_ANSWERS.refusal(
+        raise Code.WRONG_ANSWERS.error(
             f"{name} has no standard deviation of its touches: expected the touches' sigma",
             got={"touch_sigma": "no answer, and the calibration has none: expected one"},
         )
@@ -218,7 +218,7 @@ class _DriftCheck(Touches):
         wanted = self.calibration.camera_frame
         frames = {row["frame_id"] for row in rows} - {wanted}
         if wanted is not None and frames:
-            raise Code.WRONG_FRAME.refusal(
+            raise Code.WRONG_FRAME.error(
                 f"the camera's localizations are in frame {min(frames)!r}, the calibration "
                 f"expected {wanted!r}",
                 wanted,
@@ -306,7 +306,7 @@ class _DriftCheck(Touches):
             if checks.header is None:
                 checks.start({"schema": CHECKS_FORMAT, "name": self.name})
             elif checks.header.get("schema") != CHECKS_FORMAT:
-                raise Code.BROKEN_FILE.refusal(
+                raise Code.BROKEN_FILE.error(
                     f"{file.name}: schema {checks.header.get('schema')!r}, expected "
                     f"{CHECKS_FORMAT!r}",
                     CHECKS_FORMAT,

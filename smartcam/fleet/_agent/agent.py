@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from typing import Self
 
-    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.calibration._inside import CalibrationsByCamera
     from smartcam.fleet._bus.bus import Bus, Handle
     from smartcam.fleet._bus.keys import Keys
     from smartcam.fleet._file.standby import Standby
@@ -214,7 +214,7 @@ class Agent:
         observers: Iterable[Observer] = (),
         standby: Standby | None = None,
         on_retired: Callable[[ConfigurationError], None] = lambda _: None,
-        calibrations: CalibrationDesks | None = None,
+        calibrations: CalibrationsByCamera | None = None,
     ) -> None:
         self.name = name
         self.retired_by: ConfigurationError | None = None

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
     from typing import Literal
 
-    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.calibration._inside import CalibrationsByCamera
     from smartcam.emulator import WireCamera
     from smartcam.fleet._agent.host import Host
     from smartcam.fleet._agent.outlet_service import StoredRequest
@@ -121,7 +121,7 @@ class FleetServer(Server):
         self._ros: RosFleet | None = None
         section = self.file.ros2
         self._restores = (section is not None and section.autostart) if restore is None else restore
-        self.calibrations: CalibrationDesks | None = None
+        self.calibrations: CalibrationsByCamera | None = None
         # settings of all cameras for ROS; a reload adds those of new cameras
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
@@ -193,7 +193,7 @@ class FleetServer(Server):
                 stack.push_async_callback(_cancel_and_wait, watching)
             self._agent, self._stack = agent, stack.pop_all()
 
-    def _open_calibrations(self, stack: contextlib.AsyncExitStack) -> CalibrationDesks | None:
+    def _open_calibrations(self, stack: contextlib.AsyncExitStack) -> CalibrationsByCamera | None:
         """Return the calibrations of the cameras, in the folder of the file.
 
         Raises:
@@ -202,10 +202,10 @@ class FleetServer(Server):
         if self.file.calibrations is None:
             return None
         with from_part("calibration", '"calibrations:" in a fleet file needs'):
-            from smartcam.calibration._inside import CalibrationDesks
+            from smartcam.calibration._inside import CalibrationsByCamera
         folder = self.folder / self.file.calibrations
         try:
-            calibrations = CalibrationDesks(folder)
+            calibrations = CalibrationsByCamera(folder)
         except OSError as exc:
             raise ConfigurationError(
                 f"calibrations: {folder}: expected a folder, or a place for one: {exc.strerror}"
@@ -316,7 +316,7 @@ class FleetServer(Server):
                 name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
             },
             wanted=lambda agent, _camera: agent == own_name,
-            desks=self.calibrations,
+            calibrations_by_camera=self.calibrations,
         )
 
     async def stop(self) -> None:

@@ -115,8 +115,8 @@ class JsonCalibrationHost:
     @property
     def calibrations(self) -> ThesisCalibration | None:
         """The calibrations of the camera; None if there is no folder for them."""
-        desks = self._work.calibrations
-        return None if desks is None else desks.of(self.name)
+        calibrations = self._work.calibrations
+        return None if calibrations is None else calibrations.of(self.name)
 
     def camera(self, timeout: float) -> JsonCalibrationCamera:
         """Return the camera, for one call."""

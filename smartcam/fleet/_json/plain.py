@@ -39,7 +39,7 @@ from smartcam.fleet._program.reading import error_fields
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
-    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.calibration._inside import CalibrationsByCamera
     from smartcam.fleet._agent.agent import Agent
     from smartcam.fleet._agent.host import Host
     from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
@@ -182,7 +182,7 @@ class PlainServices:
     """
 
     def __init__(
-        self, agent: Agent, keys: Keys, bus: Bus, calibrations: CalibrationDesks | None = None
+        self, agent: Agent, keys: Keys, bus: Bus, calibrations: CalibrationsByCamera | None = None
     ) -> None:
         self._agent, self._keys, self._bus = agent, keys, bus
         self._calibrations = calibrations

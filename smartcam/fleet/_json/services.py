@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from smartcam._client._inside import Interpretation
-    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.calibration._inside import CalibrationsByCamera
     from smartcam.fleet._agent.host import Host
     from smartcam.fleet._agent.shared import Owner
     from smartcam.fleet._bus.wire import ResultRun
@@ -167,7 +167,7 @@ class Work(NamedTuple):
     request: Any
     timeout: float
     owner: Owner
-    calibrations: CalibrationDesks | None = None
+    calibrations: CalibrationsByCamera | None = None
 
 
 class Service(NamedTuple):

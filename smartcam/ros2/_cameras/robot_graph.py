@@ -141,7 +141,7 @@ class CameraGraph:
 
     def _missing_error(self, topic: str, type_name: str, times: list[float]) -> Exception:
         earlier = f"; {len(times)} came that were taken before" if times else ""
-        return Code.NO_PICTURE.refusal(
+        return Code.NO_PICTURE.error(
             f"{topic}: no picture came within {PICTURE_TIMEOUT:g} s{earlier}; expected {type_name} "
             "with the time of its exposure, from a camera that is running",
             type_name,

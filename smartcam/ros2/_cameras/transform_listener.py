@@ -101,7 +101,7 @@ class _FrameLink:
         silence, lag = time.monotonic() - self.arrived_at, time.time() - self.times[-1]
         if silence > MAX_AGE or abs(lag) > MAX_AGE:
             direction = "behind" if lag > 0 else "ahead of"
-            raise Code.BAD_TIME.refusal(
+            raise Code.BAD_TIME.error(
                 f"TF: {self.parent} -> {self.child}: the newest transform came {silence:.1f} s "
                 f"ago, and its stamp is {abs(lag):.1f} s {direction} this computer's clock; "
                 f"expected {MAX_AGE:g} s at most, from a robot that is running and clocks that "
@@ -126,7 +126,7 @@ class _FrameLink:
             return _transform(self, self.messages[0], utc)
         if after in {0, len(self.times)} or self.times[after] - self.times[after - 1] > MAX_GAP:
             first, last = _time_text(self.times[0]), _time_text(self.times[-1])
-            raise Code.BAD_TIME.refusal(
+            raise Code.BAD_TIME.error(
                 f"TF: {self.parent} -> {self.child}: nothing is known of {_time_text(utc)}; "
                 f"expected a time from {first} to {last}, with transforms "
                 f"{MAX_GAP:g} s apart at most",
@@ -273,7 +273,7 @@ class TransformListener:
             links.append(link)
             frame = link.parent
             if frame in visited:
-                raise Code.WRONG_FRAME.refusal(f"TF: {frame} is above itself; expected a tree")
+                raise Code.WRONG_FRAME.error(f"TF: {frame} is above itself; expected a tree")
             visited.add(frame)
         return links
 
@@ -304,7 +304,7 @@ class TransformListener:
         known_frames = sorted({*self._links, *(link.parent for link in self._links.values())})
         known_text = ", ".join(known_frames[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
         to = f" to {base!r}" if base and base != frame else ""
-        return Code.WRONG_FRAME.refusal(
+        return Code.WRONG_FRAME.error(
             f"TF: no way leads from {frame!r}{to}; expected frames of one tree on /tf and "
             f"/tf_static, which have {known_text}",
             known_frames[:MAX_FRAMES_IN_ERROR],

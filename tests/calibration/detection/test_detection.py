@@ -175,7 +175,7 @@ def test_find_charuco_in_mirror_image_is_refused(dictionary: str) -> None:
 
 def test_find_charuco_of_empty_image_is_not_found() -> None:
     with refused(
-        Code.TARGET_NOT_FOUND, "8 x 6 squares, found 0 beside 0 markers of its dictionary"
+        Code.TARGET_NOT_FOUND, "8 x 6 squares, found 0 corners and 0 markers of its dictionary"
     ):
         find_target(np.full((480, 640), 128, dtype=np.uint8), CHARUCO)
 
@@ -273,7 +273,7 @@ def test_find_target_of_two_equal_boards_is_refused(count: int) -> None:
 def test_find_target_without_its_origin_area_in_the_image_is_refused() -> None:
     picture = drawn(DARK)
     left = round(picture.pixels[0, 0] - 1.1 * np.ptp(picture.pixels[:2, 0]))
-    text = "at the origin (2 of the 4 such areas outside of the image): expected the origin"
+    text = "at the origin (2 of its 4 possible places outside of the image): expected the origin"
     with refused(Code.AMBIGUOUS_ORIGIN, text):
         find_target(np.ascontiguousarray(picture.image[:, left:]), DARK)
 

@@ -115,7 +115,7 @@ def test_find_charuco_of_the_other_pattern_names_both(
 
 def test_find_charuco_of_other_counts_is_another_board() -> None:
     said = dataclasses.replace(NEW, columns=8)
-    with refused(Code.WRONG_TARGET, "charuco of 8 x 6 squares", "columns and rows are others"):
+    with refused(Code.WRONG_TARGET, "charuco of 8 x 6 squares", "other numbers of columns"):
         find_target(drawn(NEW, tilt=20).image, said)
 
 
@@ -161,7 +161,7 @@ def test_find_charuco_leaves_misplaced_markers_out_with_a_remark() -> None:
 def test_find_charuco_of_one_marker_is_not_found() -> None:
     picture = covered(drawn(NEW, tilt=20), range(1, 9), NEW)
     cv2.rectangle(picture.image, (0, 0), (639, 250), 235, -1)
-    with refused(Code.TARGET_NOT_FOUND, "found 0 beside"):
+    with refused(Code.TARGET_NOT_FOUND, "found 0 corners and"):
         find_target(picture.image, NEW)
 
 

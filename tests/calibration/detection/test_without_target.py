@@ -19,8 +19,8 @@ from smartcam.calibration._detection.saddles import (
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
 from tests.calibration.inside import (
+    MAX_MEAN_OUTLINES,
     MAX_OUTLINES,
-    MAX_OUTLINES_OF_ALL_WINDOWS,
     MAX_SEEDS_TRIED,
     WINDOWS_PX,
     _GridGrower,
@@ -295,7 +295,7 @@ def test_many_squares_are_few_outlines_to_opencv(step: int, side: int) -> None:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     without = cv2.aruco.DetectorParameters()
     windows = {window: len(_outlines(image, window, without)) for window in WINDOWS_PX}
-    assert sum(windows.values()) > len(windows) * MAX_OUTLINES_OF_ALL_WINDOWS
+    assert sum(windows.values()) > len(windows) * MAX_MEAN_OUTLINES
     given = marker_finder(image, dictionary).getDetectorParameters()
     window = given.adaptiveThreshWinSizeMin
     assert window == given.adaptiveThreshWinSizeMax

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from smartcam.calibration import CameraModel, Transform, compare
-from smartcam.calibration._inside import Lens, compare_lenses, rig_difference
+from smartcam.calibration import CameraModel, Transform, compare_lenses
+from smartcam.calibration._inside import Lens, compare_estimates, rig_difference
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import IDENTITY, Code, exp_rotation
 from tests.calibration import lenskit
@@ -27,7 +27,7 @@ def longer(camera: CameraModel, pixels: float) -> CameraModel:
 
 @pytest.mark.parametrize("distance", [None, 0.4])
 def test_calibrations_of_one_lens_are_the_same_within_their_noise(distance: float | None) -> None:
-    found = compare(FIRST.calibration(1), SECOND.calibration(2), distance=distance)
+    found = compare_lenses(FIRST.calibration(1), SECOND.calibration(2), distance=distance)
     assert found.same
     assert found.ratio is not None
     assert 0.4 < found.ratio < 1.6
@@ -38,7 +38,7 @@ def test_calibrations_of_one_lens_are_the_same_within_their_noise(distance: floa
 
 def test_another_lens_differs_by_more_than_noise() -> None:
     moved = Bench(longer(LENS, 3.0), SECOND.poses).calibration(2)
-    found = compare(FIRST.calibration(1), moved)
+    found = compare_lenses(FIRST.calibration(1), moved)
     assert found.same is False
     assert found.chance is not None
     assert found.chance < 1e-5
@@ -49,11 +49,11 @@ def test_lens_of_another_model_differs_by_a_part_that_no_values_explain() -> Non
     bent = dataclasses.replace(LENS, distortion=LENS.distortion + np.array([0, 0, 0.002, 0, 0]))
     exact = dataclasses.replace(FIRST.calibration(1), covariance=1e-8 * FIRST.covariance)
     other = dataclasses.replace(exact, camera=bent)
-    assert compare(exact, other).same is False
+    assert compare_lenses(exact, other).same is False
 
 
 def test_bare_lenses_are_compared_without_a_verdict() -> None:
-    found = compare(FIRST.calibration(1), SECOND.lens(2))
+    found = compare_lenses(FIRST.calibration(1), SECOND.lens(2))
     assert (found.same, found.ratio, found.chance, found.expected) == (None, None, None, None)
     assert found.predicted is None
     assert found.verdict.startswith("no verdict: ")
@@ -66,7 +66,7 @@ def test_turned_camera_is_no_difference() -> None:
     matrix[0, 2] += 5.0
     straight = CameraModel(size=(640, 480), matrix=LENS.matrix)
     other = CameraModel(size=(640, 480), matrix=matrix)
-    found = compare(straight, other)
+    found = compare_lenses(straight, other)
     turn = float(found.motion.rigid.angle_to(IDENTITY))
     assert turn == pytest.approx(5.0 / 530.0, rel=0.15)
     assert found.observed.centre < 0.5
@@ -74,7 +74,7 @@ def test_turned_camera_is_no_difference() -> None:
 
 
 def test_difference_of_a_lens_and_itself_is_none() -> None:
-    found = compare(FIRST.calibration(), FIRST.calibration(), distance=1.0)
+    found = compare_lenses(FIRST.calibration(), FIRST.calibration(), distance=1.0)
     assert found.observed.worst < 1e-9
     assert found.same
     assert found.chance == 1.0
@@ -83,7 +83,7 @@ def test_difference_of_a_lens_and_itself_is_none() -> None:
 def test_corners_that_no_view_saw_do_not_move_the_camera() -> None:
     middle = Bench(LENS, lenskit.poses(10))
     bent = dataclasses.replace(LENS, distortion=LENS.distortion + np.array([0, 0, 0, 0, 0.05]))
-    found = compare_lenses(
+    found = compare_estimates(
         Lens(LENS, points=middle.gauge), Lens(bent, points=middle.gauge), distance=0.4
     )
     assert np.linalg.norm(found.motion.translation) < 0.0005
@@ -92,7 +92,7 @@ def test_corners_that_no_view_saw_do_not_move_the_camera() -> None:
 
 def test_places_beyond_a_model_have_no_difference() -> None:
     folding = dataclasses.replace(LENS, distortion=np.array([-0.5, 0, 0, 0, 0]))
-    found = compare(folding, folding)
+    found = compare_lenses(folding, folding)
     assert np.isnan(found.difference[0, 0]).all()
     assert found.observed.rms < 1e-4
 
@@ -100,18 +100,18 @@ def test_places_beyond_a_model_have_no_difference() -> None:
 def test_images_of_two_sizes_are_refused() -> None:
     other = dataclasses.replace(LENS, size=(1280, 960))
     with pytest.raises(CalibrationError, match="got 640 x 480 and 1280 x 960 pixels") as caught:
-        compare(LENS, other)
+        compare_lenses(LENS, other)
     assert caught.value.code == Code.WRONG_SIZE
 
 
 def test_calibration_without_a_lens_is_refused() -> None:
     with pytest.raises(CalibrationError, match="expected calibrations of lenses") as caught:
-        compare(LENS, LENS.matrix)  # type: ignore[arg-type]
+        compare_lenses(LENS, LENS.matrix)  # type: ignore[arg-type]
     assert caught.value.code == Code.SHAPE
 
 
 def test_pair_is_compared_by_the_places_of_its_cameras() -> None:
-    same = compare(LENS, LENS)
+    same = compare_lenses(LENS, LENS)
     turned = Transform(
         "right",
         "left",
@@ -125,7 +125,7 @@ def test_pair_is_compared_by_the_places_of_its_cameras() -> None:
 @pytest.mark.long
 def test_chance_is_one() -> None:
     found = [
-        compare(
+        compare_lenses(
             FIRST.calibration(seed),
             SECOND.calibration(1000 + seed),
             shape=(7, 9),

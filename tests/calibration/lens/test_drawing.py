@@ -16,7 +16,7 @@ from smartcam.calibration import (
     HandEyeCalibration,
     IntrinsicCalibration,
     StereoCalibration,
-    compare,
+    compare_lenses,
     draw_scene,
     draw_uncertainty,
     draw_views,
@@ -120,7 +120,9 @@ PICTURES = {
     "scene, many": lambda: draw_scene(many(40)),
     "map": lambda: draw_uncertainty(LENS, distance=0.5, title="Map"),
     "map, of a map": lambda: draw_uncertainty(LENS.uncertainty(shape=(4, 6))),
-    "comparison": lambda: draw_uncertainty(compare(BENCH.calibration(1), BENCH.calibration(2))),
+    "comparison": lambda: draw_uncertainty(
+        compare_lenses(BENCH.calibration(1), BENCH.calibration(2))
+    ),
     "pair": lambda: draw_scene(pair()),
     "pair's views": lambda: draw_views(pair()),
     "eye in hand": lambda: draw_scene(hand("eye-in-hand")),

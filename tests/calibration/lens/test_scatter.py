@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration import Checkerboard, calibrate_intrinsics, compare
-from smartcam.calibration._inside import Lens, compare_lenses
+from smartcam.calibration import Checkerboard, calibrate_intrinsics, compare_lenses
+from smartcam.calibration._inside import Lens, compare_estimates
 from smartcam.geometry._inside import Code
 from tests.calibration.inside import half_turned, lens_values, with_lens
 from tests.calibration.lens.estimates import spread_poses
@@ -52,7 +52,7 @@ def test_predicted_uncertainty_is_right_for_views_with_common_errors(
     found = [calibrate_intrinsics(views_of(around, seed), sheet="exact") for seed in range(30)]
     lenses = np.array([lens_values(one.camera) for one in found])
     middle = Lens(with_lens(LEFT, lenses.mean(axis=0)), np.zeros((9, 9)), found[0].target_points)
-    compared = [compare_lenses(Lens.of(one), middle, distance=0.5) for one in found]
+    compared = [compare_estimates(Lens.of(one), middle, distance=0.5) for one in found]
     observed = np.mean([one.difference**2 for one in compared], axis=0).sum(axis=2)
     predicted = np.mean([one.predicted.rms**2 for one in compared if one.predicted])
     assert np.sqrt(2 * predicted / observed.mean()) == pytest.approx(1.0, abs=0.15)
@@ -100,7 +100,7 @@ def test_held_out_error_near_a_singular_lens_is_that_of_refits() -> None:
 
 def test_halves_of_views_with_common_errors_give_the_same_lens() -> None:
     found = [calibrate_intrinsics(rolled(spread_poses(LEFT, 10), seed)) for seed in (1, 2)]
-    compared = compare(*found)
+    compared = compare_lenses(*found)
     assert compared.same
     assert compared.ratio is not None
     assert compared.ratio < 2.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, calibrate_intrinsics
-from smartcam.calibration._inside import Lens, compare_lenses
+from smartcam.calibration._inside import Lens, compare_estimates
 from smartcam.calibration._lens.uncertainty import figures, uncertainty
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
@@ -103,7 +103,8 @@ def test_map_of_a_calibration_is_that_of_its_bound() -> None:
 def test_predicted_uncertainty_is_observed(distance: float | None) -> None:
     truth = Lens(lenskit.LEFT, points=BENCH.gauge)
     squares = [
-        compare_lenses(truth, Lens(BENCH.lens(seed)), distance=distance, shape=(7, 9)).lengths ** 2
+        compare_estimates(truth, Lens(BENCH.lens(seed)), distance=distance, shape=(7, 9)).lengths
+        ** 2
         for seed in range(300)
     ]
     observed = np.sqrt(np.mean(squares, axis=0))

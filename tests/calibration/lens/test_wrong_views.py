@@ -83,13 +83,13 @@ def doubled(values: Any) -> Any:
         ({"points": VIEW.points + 1j}, Code.SHAPE, "complex"),
         ({"points": np.full((54, 2), np.inf)}, Code.NOT_FINITE, "finite numbers"),
         ({"covariance": np.ones(54)}, Code.SHAPE, r"expected shape \(54, 2, 2\)"),
-        ({"covariance": -VIEW.covariance}, Code.NO_COVARIANCE, "no negative variance"),
+        ({"covariance": -VIEW.covariance}, Code.NOT_A_COVARIANCE, "no negative variance"),
         (
             {"covariance": VIEW.covariance + np.triu(np.ones((2, 2)), 1)},
-            Code.NO_COVARIANCE,
+            Code.NOT_A_COVARIANCE,
             "symmetric",
         ),
-        ({"covariance": np.tile([[1.0, 2], [2, 1]], (54, 1, 1))}, Code.NO_COVARIANCE, "row 0"),
+        ({"covariance": np.tile([[1.0, 2], [2, 1]], (54, 1, 1))}, Code.NOT_A_COVARIANCE, "row 0"),
         ({"covariance": np.nan * VIEW.covariance}, Code.NOT_FINITE, "finite numbers"),
     ],
 )

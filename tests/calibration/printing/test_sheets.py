@@ -18,7 +18,7 @@ from smartcam.calibration import (
     CircleGrid,
     MarkerGrid,
     make_sheet,
-    scaled,
+    scale_target,
     target_from_data,
 )
 from smartcam.calibration._inside import Target, target_from_description
@@ -234,22 +234,24 @@ def test_rays_without_a_diameter_are_refused(diameter: float) -> None:
 
 
 def test_scaled_takes_the_mean_of_both_rulers() -> None:
-    board = scaled(BOARD, (99.0, 99.4))
+    board = scale_target(BOARD, (99.0, 99.4))
     assert board == Checkerboard(columns=9, rows=6, square=0.0248, origin_mark=True)
 
 
 def test_scaled_changes_every_length_and_no_count() -> None:
     charuco = Charuco(columns=7, rows=5, square=0.03, marker=0.02)
-    assert scaled(charuco, (101, 101)) == Charuco(columns=7, rows=5, square=0.0303, marker=0.0202)
+    assert scale_target(charuco, (101, 101)) == Charuco(
+        columns=7, rows=5, square=0.0303, marker=0.0202
+    )
     grid = CircleGrid(columns=4, rows=3, spacing=1, diameter=0.5, origin_diameter=0.6)
-    real = scaled(grid, (98, 98))
+    real = scale_target(grid, (98, 98))
     assert (real.spacing, real.diameter, real.origin_diameter) == (0.98, 0.49, 0.588)
     assert (real.columns, real.rows, real.asymmetric) == (4, 3, False)
     plain = CircleGrid(columns=4, rows=3, spacing=1, diameter=0.5)
-    assert scaled(plain, (98, 98)).origin_diameter is None
+    assert scale_target(plain, (98, 98)).origin_diameter is None
     markers = MarkerGrid(columns=3, rows=2, marker=0.02, gap=0.01, border=2, first_id=5)
-    assert scaled(markers, (101, 101)) == replace(markers, marker=0.0202, gap=0.0101)
-    assert scaled(Rays(), (99, 99)) == Rays(diameter=0.0198)
+    assert scale_target(markers, (101, 101)) == replace(markers, marker=0.0202, gap=0.0101)
+    assert scale_target(Rays(), (99, 99)) == Rays(diameter=0.0198)
 
 
 @pytest.mark.parametrize(
@@ -262,12 +264,12 @@ def test_scaled_refuses_lengths_more_than_a_twentieth_off(
     with pytest.raises(
         CalibrationError, match=f"ruler along {axis}: expected 100 mm within 5%"
     ) as (caught):
-        scaled(BOARD, rulers)
+        scale_target(BOARD, rulers)
     assert caught.value.code == Code.SCALE_MISMATCH
 
 
 def test_scaled_refuses_rulers_that_differ() -> None:
     with pytest.raises(CalibrationError, match=r"within 0\.5%, got 99 and 100 mm") as caught:
-        scaled(BOARD, (99, 100))
+        scale_target(BOARD, (99, 100))
     assert caught.value.code == Code.SCALE_MISMATCH
-    assert scaled(BOARD, (99.6, 100)).square == 0.02495
+    assert scale_target(BOARD, (99.6, 100)).square == 0.02495

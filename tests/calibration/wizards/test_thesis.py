@@ -76,11 +76,11 @@ class Client:
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.camera = Camera()
-        self.desk = ThesisCalibration(folder, "line1/cam3", **options)
+        self.calibration = ThesisCalibration(folder, "line1/cam3", **options)
 
     async def step(self, *values: float, **more: Any) -> dict[str, Any]:
         asked = StepRequest(value_inputs=values, **more)
-        return await self.desk.perform(asked, self.camera)
+        return await self.calibration.perform(asked, self.camera)
 
     async def accept(self, answer: dict[str, Any], *texts: str) -> dict[str, Any]:
         """Answer a step by its fields."""
@@ -94,7 +94,7 @@ class Client:
 
     async def to_picture(self, start: CalibrationStart = FIXED) -> dict[str, Any]:
         """Start, and go on to the step that takes a picture."""
-        await self.desk.start(start)
+        await self.calibration.start(start)
         answer = await self.accept(await self.step(), "table")
         answer = await self.accept(answer)
         assert answer["button_text"] == "Take a picture"
@@ -115,11 +115,11 @@ async def test_a_call_beside_another_one_is_refused_and_changes_nothing(tmp_path
             await call
         assert caught.value.code == "NOT_POSSIBLE"
     with pytest.raises(CalibrationError, match="a calibration is under way") as caught:
-        await client.desk.start(FIXED)
+        await client.calibration.start(FIXED)
     assert caught.value.code == "IN_USE"
     client.camera.hold.set()
     assert (await first)["header_text"] == "Which ones will be touched?"
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_abort_cancels_a_picture_and_its_caller_gets_an_error(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ async def test_abort_cancels_a_picture_and_its_caller_gets_an_error(tmp_path: Pa
     assert caught.value.code == "NO_SEQUENCE"
     client.camera.hold = None
     await client.to_picture()  # can restart at once
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_abort_while_a_wizard_begins_leaves_its_journal_free(tmp_path: Path) -> None:
@@ -148,8 +148,8 @@ async def test_abort_while_a_wizard_begins_leaves_its_journal_free(tmp_path: Pat
 
     begun, go_on = asyncio.Event(), asyncio.Event()
     client = Client(tmp_path)
-    client.desk.graph = Slow()
-    await client.desk.start(CalibrationStart("/i", fixed_camera="True"))
+    client.calibration.graph = Slow()
+    await client.calibration.start(CalibrationStart("/i", fixed_camera="True"))
     await client.step()
     first = asyncio.create_task(client.step(text_inputs=["table"]))
     await begun.wait()
@@ -157,7 +157,7 @@ async def test_abort_while_a_wizard_begins_leaves_its_journal_free(tmp_path: Pat
     go_on.set()
     assert "another call has aborted" in (await first)["error"]
     await client.to_picture()  # under the same name
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_a_caller_that_goes_away_leaves_the_step(tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ async def test_a_caller_that_goes_away_leaves_the_step(tmp_path: Path) -> None:
     client.camera.hold = None
     answer = await client.step(repeat_last_step=True)
     assert answer["header_text"] == "Camera, robot and tool"
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_error_of_a_camera_is_shown_and_keeps_the_step(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ async def test_error_of_a_camera_is_shown_and_keeps_the_step(tmp_path: Path) -> 
     answer = await client.step()
     assert answer["error"] == "it is not running"
     assert answer["button_text"] == "Take a picture"
-    client.desk.close()
+    client.calibration.close()
 
 
 # ---------------------------------------------------------------------- what is left
@@ -203,24 +203,24 @@ async def test_a_calibration_that_is_left_alone_is_given_up_and_goes_on_later(
     await asyncio.sleep(0.3)
     with pytest.raises(CalibrationError, match=r"was left for 0\.2 s"):
         await client.step()
-    await client.desk.start(FIXED)
+    await client.calibration.start(FIXED)
     answer = await client.accept(await client.step(), "table")
     assert answer["header_text"] == "Touch mark 2 of 9"
     assert client.camera.bench.pictures == 1
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_a_run_that_was_started_in_another_way_begins_anew(tmp_path: Path) -> None:
     client = Client(tmp_path)
     await client.to_picture()
-    client.desk.close()
-    client.desk.graph = Graph()
-    await client.desk.start(FIXED._replace(tf_frame_robot_tcp="tip"))
+    client.calibration.close()
+    client.calibration.graph = Graph()
+    await client.calibration.start(FIXED._replace(tf_frame_robot_tcp="tip"))
     answer = await client.accept(await client.step(), "table")
     assert answer["header_text"] == "Camera, robot and tool"
     assert "base_link" in answer["default_needed_strings"]
     assert (tmp_path / "table.journal.1").exists()
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_end_of_a_calibration_stops_its_timer(tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ async def test_end_of_a_calibration_stops_its_timer(tmp_path: Path) -> None:
 
 async def test_the_first_call_answers_nothing(tmp_path: Path) -> None:
     client = Client(tmp_path)
-    await client.desk.start(CalibrationStart())
+    await client.calibration.start(CalibrationStart())
     answer = await client.step(1.0)
     assert "expected no inputs in the first call" in answer["error"]
     asked = [*answer["descriptions_for_needed_strings"], *answer["descriptions_for_needed_options"]]
@@ -245,7 +245,7 @@ async def test_the_first_call_answers_nothing(tmp_path: Path) -> None:
     assert answer["default_needed_strings"] == ["line1-cam3", SMARTCAMERA]
     assert answer["default_needed_options"] == ["True True False"]
     assert "False: on the flange" in answer["description_text"]
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_undo_goes_back_to_before_the_wizard(tmp_path: Path) -> None:
@@ -258,7 +258,7 @@ async def test_undo_goes_back_to_before_the_wizard(tmp_path: Path) -> None:
     assert answer["error"] == "repeat_last_step: there is no step before this one"
     answer = await client.accept(answer)
     assert answer["header_text"] == "Camera, robot and tool"
-    client.desk.close()
+    client.calibration.close()
 
 
 @pytest.mark.parametrize(
@@ -277,42 +277,42 @@ async def test_a_request_chooses_the_wizard(
     tmp_path: Path, start: CalibrationStart, fixed: str, title: str, asked: str
 ) -> None:
     client = Client(tmp_path)
-    client.desk.graph = Graph()
-    await client.desk.start(start)
+    client.calibration.graph = Graph()
+    await client.calibration.start(start)
     await client.step()
     options = [fixed] if fixed else []
     answer = await client.step(text_inputs=["table"], option_inputs=options)
     assert (answer["error"], answer["header_text"]) == ("", title)
     named = [one for one in answer["descriptions_for_needed_options"] if one.startswith(asked)]
     assert named
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_zero_is_no_answer_if_it_is_out_of_range(tmp_path: Path) -> None:
     client = Client(tmp_path)
-    await client.desk.start(FIXED)
+    await client.calibration.start(FIXED)
     answer = await client.accept(await client.step(), "table")
     assert answer["default_needed_values"] == [0.0, 0.0]
     assert "0 stands for no answer" in answer["description_text"]
     await client.accept(answer)
-    sequence = client.desk._sequence
+    sequence = client.calibration._sequence
     assert sequence is not None
     assert sequence.session is not None
     assert sequence.session.samples[0]["answers"]["touch_sigma"] is None
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_side_of_a_square_is_the_default(tmp_path: Path) -> None:
     client = Client(tmp_path)
-    client.desk.graph = Graph()
-    await client.desk.start(CalibrationStart("/i", "", 0.025, "", "base", "True"))
+    client.calibration.graph = Graph()
+    await client.calibration.start(CalibrationStart("/i", "", 0.025, "", "base", "True"))
     answer = await client.accept(await client.step(), "table")
     assert answer["default_needed_strings"] == ["", "base", ""]
     answer = await client.accept(answer)
     answer = await client.accept(answer)
     assert answer["descriptions_for_needed_values"][2] == "Side of a square [mm]"
     assert answer["default_needed_values"][2] == 25.0
-    client.desk.close()
+    client.calibration.close()
 
 
 # ---------------------------------------------------------------------- files and poses
@@ -325,32 +325,32 @@ async def test_a_symbolic_link_is_refused_before_anything_is_measured(tmp_path: 
     (tmp_path / "folder/table.json").symlink_to(secret)
     (tmp_path / "folder/other.journal").symlink_to(tmp_path / "made")
     client = Client(tmp_path / "folder")
-    await client.desk.start(FIXED)
+    await client.calibration.start(FIXED)
     await client.step()
     for name in ("table", "other"):
         answer = await client.step(text_inputs=[name])
         assert "expected no symbolic link" in answer["error"]
     assert secret.read_text() == "{}"
     assert not (tmp_path / "made").exists()
-    client.desk.close()
+    client.calibration.close()
 
 
 async def test_a_pose_comes_in_the_frame_that_is_wanted(tmp_path: Path) -> None:
     saved(served(tmp_path), "table")
     client = Client(tmp_path / "folder")
     with pytest.raises(CalibrationError) as caught:
-        await client.desk.transform(PixelPoseRequest(0.1, 0.2))
+        await client.calibration.transform(PixelPoseRequest(0.1, 0.2))
     assert caught.value.code == "NO_CALIBRATION"
-    client.desk.load("table")
-    pose = await client.desk.transform(PixelPoseRequest(0.1, 0.2, 0.5, seq=7, utc=1e9))
+    client.calibration.load("table")
+    pose = await client.calibration.transform(PixelPoseRequest(0.1, 0.2, 0.5, seq=7, utc=1e9))
     assert np.allclose(pose.position, where(0.1, 0.2))
     assert (pose.header.seq, pose.header.frame_id) == (7, "base")
     assert pose.header.stamp.timestamp() == 1e9
     with pytest.raises(CalibrationError, match="not seen in ROS") as caught:
-        await client.desk.transform(PixelPoseRequest(0.1, 0.2, reference="hall"))
+        await client.calibration.transform(PixelPoseRequest(0.1, 0.2, reference="hall"))
     assert caught.value.code == "WRONG_FRAME"
-    client.desk.graph = Graph()
-    pose = await client.desk.transform(PixelPoseRequest(0.1, 0.2, reference="hall"))
+    client.calibration.graph = Graph()
+    pose = await client.calibration.transform(PixelPoseRequest(0.1, 0.2, reference="hall"))
     assert np.allclose(pose.position, np.add(where(0.1, 0.2), [1.0, 2.0, 3.0]))
     assert pose.header.frame_id == "hall"
 
@@ -363,5 +363,5 @@ async def test_finished_calibration_maps_pixels_at_once(tmp_path: Path) -> None:
     answer = await client.step(9.0, option_inputs=["accept"])
     answer = await client.step()
     assert (answer["button_text"], answer["error"]) == ("", "")
-    pose = await client.desk.transform(PixelPoseRequest(*GRID[4]))
+    pose = await client.calibration.transform(PixelPoseRequest(*GRID[4]))
     assert np.allclose(pose.position, where(*GRID[4]), atol=1e-9)
