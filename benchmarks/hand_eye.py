@@ -34,7 +34,7 @@ from benchmarks.recorded_robots import CHARUCO, DOTS, SETS, RecordedSet, read_se
 from benchmarks.robots import KINDS, Kind
 from benchmarks.robots_judge import OURS, folds, judged, rms
 from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
-from smartcam.calibration._hand_eye.closed_forms import LINEAR, solve_linear
+from smartcam.calibration._hand_eye.closed_forms import OPENCV_METHODS, solve_closed_form
 from smartcam.calibration._hand_eye.equations import RobotPoses, RobotSigmas
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.poses import locate
@@ -186,7 +186,7 @@ class _Errors:
 
 def _simulated(plan: Plan, mix: Mix) -> Iterator[Comparison]:
     """Compare with the bound: smartcam, then the best closed form."""
-    names = ("smartcam", "bound", "predicted", *LINEAR)
+    names = ("smartcam", "bound", "predicted", *OPENCV_METHODS)
     found = {name: _Errors() for name in names}
     runs, seconds = plan.operations(RUNS), []
     for number in range(plan.rounds):
@@ -232,7 +232,7 @@ def _simulated(plan: Plan, mix: Mix) -> Iterator[Comparison]:
         f"{1e3 * float(np.median(seconds)):.0f} ms a calibration; predicted error over the bound "
         f"{math.sqrt(found['predicted'].mean / found['bound'].mean):.2f}",
     )
-    best = min(LINEAR, key=lambda name: found[name].mean)
+    best = min(OPENCV_METHODS, key=lambda name: found[name].mean)
     case = f"{mix}: the same of OpenCV's best, {best}"
     yield Comparison("hand_eye", case, found[best].shifts("OpenCV"), limit, "ratio")
     case = f"{mix}: rms error of the camera's orientation over the bound"
@@ -249,8 +249,8 @@ def _closed_forms(
     robot = RobotPoses(Rigid.stack(one.rigid for one in poses), scene.setup == "eye-in-hand")
     seen = Rigid.stack(locate(view, CAMERA).transform.rigid for view in views)
     result = {}
-    for name in LINEAR:
-        found = solve_linear(name, robot, seen, use_all_views=True)
+    for name in OPENCV_METHODS:
+        found = solve_closed_form(name, robot, seen, use_all_views=True)
         result[name] = (math.inf, math.inf)
         if found is not None:
             pose = Transform(scene.camera_pose.target, "camera", *found[0])

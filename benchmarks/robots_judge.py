@@ -16,7 +16,7 @@ from smartcam.calibration._hand_eye.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration._hand_eye.closed_forms import LINEAR, solve_linear
+from smartcam.calibration._hand_eye.closed_forms import OPENCV_METHODS, solve_closed_form
 from smartcam.calibration._hand_eye.equations import RobotPoses, Solution
 from smartcam.calibration._views import TargetView
 from smartcam.geometry._inside import Rigid
@@ -75,8 +75,8 @@ def judged(
     found = {OURS: _squares(ours, other, shown)}
     robot = RobotPoses(Rigid.stack(one.rigid for one in some), setup == "eye-in-hand")
     placed = Rigid.stack(one.rigid for one in ours.target_poses)
-    for name in LINEAR:
-        pair = solve_linear(name, robot, placed, use_all_views=True)
+    for name in OPENCV_METHODS:
+        pair = solve_closed_form(name, robot, placed, use_all_views=True)
         found[name] = np.full(1, math.inf)
         if pair is not None:
             found[name] = _squares(_replaced(ours, Solution(*pair)), other, shown)

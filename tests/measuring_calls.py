@@ -74,7 +74,7 @@ def measuring_calls() -> dict[str, Call]:
         "robot_sigmas": None,
         "drop_bad": True,
         "allowed_error": None,
-        "most_scale": 0.2,
+        "max_scale_error": 0.2,
     }
     lenses = {"distortion_model": "plumb_bob", "fixed": (), "sheet": "auto", "drop_bad": True}
     grid = {"columns": 5, "rows": 4}

@@ -95,8 +95,8 @@ class TargetView(storage.Stored):
         return points
 
     @property
-    def agreement(self) -> float:
-        """Agreement, -1 to 1, of the points' places on the target and in the image; NaN on a line.
+    def handedness(self) -> float:
+        """Handedness, -1 to 1, of the points in the image, compared with the target; NaN on a line.
 
         It is near -1 for the front of a sheet (y points up on the sheet, v down in the image), near
         1 for a mirrored sheet, near 0 if points have wrong numbers.

@@ -31,11 +31,11 @@ from smartcam.calibration._files.store import (
     write,
 )
 from smartcam.calibration._hand_eye.closed_forms import (
-    LINEAR,
+    OPENCV_METHODS,
     check_motion,
     left_out_second_axis_turns,
     second_axis_turn,
-    solve_linear,
+    solve_closed_form,
 )
 from smartcam.calibration._hand_eye.equations import (
     Observations,
@@ -54,7 +54,7 @@ from smartcam.calibration._hand_eye.equations import (
 from smartcam.calibration._homography import apply_homography, element_derivatives, fit_homography
 from smartcam.calibration._lens.bundle import (
     Bundle,
-    Sight,
+    Observation,
     adjust_weighted,
     leave_out,
     lens_values,
@@ -68,7 +68,7 @@ from smartcam.calibration._lens.poses import half_turned
 from smartcam.calibration._lens.projection import (
     excess_variance,
     linearize,
-    pose_changes,
+    pixels_by_pose,
     whitening,
 )
 from smartcam.calibration._lens.sheet_shape import adjust_shape, choose_shape, moved_to_nominal

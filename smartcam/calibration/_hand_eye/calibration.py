@@ -22,8 +22,8 @@ import numpy as np
 from smartcam._argument_checks import a_list, a_number, check_arguments, each, of_class, or_none
 from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._hand_eye.closed_forms import (
-    LINEAR,
     MIN_POSES,
+    OPENCV_METHODS,
     check_motion,
     estimate_scale,
     left_out_second_axis_turns,
@@ -90,18 +90,18 @@ MIN_ADVISED_POSES = 8
 """With fewer poses than this, a remark says that the residuals tell little about the error."""
 
 MIN_ADVISED_TURN_RADIANS = math.radians(8.0)
-"""A remark says if the RMS turn of the poses about their second axis is smaller. Leaving out some
-of eight poses changes this turn by two or three degrees."""
+"""If the RMS turn of the poses about their second axis is smaller, the result has a remark. Leaving
+out some of eight poses changes this turn by two or three degrees."""
 
 MAX_SCALE_ERROR = 0.2
-"""Default of ``most_scale``: part by which a target's size may differ from the nominal size."""
+"""Default of ``max_scale_error``: fraction by which a target's size may differ from the nominal."""
 
 REMARKED_SCALE_ERROR = 0.005
-"""A remark says if a target's size differs from the nominal size by more than this part."""
+"""A size of the target that differs from the nominal one by more than this fraction is remarked."""
 
 REMARKED_SCALE_SIGMAS = 5.0
-"""If the target's size is not adjusted, a remark says if it differs by more than this many standard
-deviations."""
+"""If the target's size is not adjusted, there is a remark if it differs by more than this many
+standard deviations."""
 
 BAD_POSE_RATIO = 4.0
 """A pose is bad if its held-out error is more than this many times the median. Of normal errors
@@ -114,7 +114,8 @@ MAX_BAD_POSE_SHARE = 1 / 3
 """At most this part of the poses may be left out."""
 
 MIN_GOOD_POSES = 5
-"""At least this many poses must remain after those that belong to other views are left out."""
+"""At least this many poses must remain after those that were paired with a wrong view are left
+out."""
 
 MIN_POSES_FOR_ERROR = 5
 """The covariance is estimated from the scatter of at least this many poses."""
@@ -123,8 +124,8 @@ WEIGHT_POWER = 1 / 2
 """Power of a pose's weight in the covariance: errors of poses are independent of each other."""
 
 POOR_ROBOT = RobotSigmas(math.radians(0.25), 2e-3)
-"""Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm. A remark says if
-the held-out error is larger than such a robot causes."""
+"""Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm. If the held-out
+error is larger than such a robot causes, the result has a remark."""
 
 ASSUMED_POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
 """Standard deviations (rad, m) that are assumed for target poses without a covariance; only their
@@ -139,7 +140,7 @@ ratio matters."""
     method=check_text,
     adjust=check_text,
     drop_bad=check_flag,
-    most_scale=a_number,
+    max_scale_error=a_number,
 )
 @one_blas_thread
 def calibrate_hand_eye(
@@ -153,21 +154,21 @@ def calibrate_hand_eye(
     robot_sigmas: RobotSigmas | None = None,
     drop_bad: bool = True,
     allowed_error: float | None = None,
-    most_scale: float = MAX_SCALE_ERROR,
+    max_scale_error: float = MAX_SCALE_ERROR,
 ) -> HandEyeCalibration:
     """Calibrate the pose of a camera on a robot, or beside it, from views of a target.
 
     Args:
         robot_poses: ``T_base_flange`` at each view: the flange's pose in the robot's base.
-        views: views of one target, as many. A target that looks the same after half a turn is
-            numbered from the same end in all of them, as the robot's motions tell.
+        views: one view of the target for each robot pose. A target that looks the same after half a
+            turn is numbered from the same end in all of them, as the robot's motions tell.
         setup: place of the camera: on the hand (``eye-in-hand``, with a fixed target), or fixed
             beside the robot (``eye-to-hand``, with the target on the hand).
-        camera: the camera's lens, which the expected errors assume to be exact; None: it is
-            calibrated from the same views, which should then show the target tilted, and from the
-            robot's motions, together with bends of the target, and the expected errors include
-            those of the lens. Where ``adjust`` keeps the lens, the views alone tell it, with the
-            target's points adjusted.
+        camera: the camera's lens, which the expected errors assume to be exact. None: the lens is
+            calibrated, too, from the same views and the robot's motions, together with bends of the
+            target. The views should then show the target tilted, and the expected errors include
+            those of the lens. If ``adjust`` keeps the lens, it is calibrated from the views alone,
+            with the target's points adjusted.
         method: ``auto`` chooses the one of ``robot`` and ``reprojection`` that predicts left-out
             poses better; or one of these two, or one of OpenCV's closed forms, see
             :data:`~smartcam.calibration._hand_eye.model_selection.METHODS`.
@@ -176,11 +177,11 @@ def calibrate_hand_eye(
         robot_sigmas: standard deviations of each axis of the robot's poses; None: estimated.
         drop_bad: whether poses that are far from the others' prediction are left out and named, at
             most a third of them, and only while 8 are left; else they are only named. Poses that
-            belong to other views are left out as long as 5 poses remain.
+            were paired with a wrong view are left out as long as 5 poses remain.
         allowed_error: largest error, metres, that 95 of 100 points on the target may have; None: a
             hundredth of the target's distance. See :attr:`HandEyeCalibration.verdict`.
-        most_scale: part by which the target's size may be off. The robot's motions show how large
-            the target is, and a larger difference is refused.
+        max_scale_error: fraction by which the target's size may be off. The robot's motions show
+            how large the target is, and a larger difference is refused.
 
     The order of the poses does not matter.
 
@@ -190,14 +191,14 @@ def calibrate_hand_eye(
             ``WRONG_FRAME``: poses are in several frames, or fit only when inverted or transposed;
             ``MIRRORED``: the robot's base is left-handed, or pictures are flipped;
             ``DIFFERENT_TARGETS``; ``SCALE_MISMATCH``: the size of the print is off by more than
-            ``most_scale``; ``POOR_FIT``: nothing fits, as when poses and views are mixed up or
+            ``max_scale_error``; ``POOR_FIT``: nothing fits, as when poses and views are mixed up or
             lengths are in millimetres; and those of
             :func:`~smartcam.calibration.calibrate_intrinsics`.
         MissingExtraError: SciPy or OpenCV is not installed, or OpenCV is 5.0.0.
     """
     views = as_views(views, "hand-eye")
     check_positive(allowed_error, "allowed_error", "metres")
-    check_positive(most_scale, "most_scale", "parts of its size")
+    check_positive(max_scale_error, "max_scale_error", "parts of its size")
     transforms, order, robot = _check_robot_poses(robot_poses, len(views), "views", setup)
     if any(view.target != views[0].target for view in views):
         raise Code.DIFFERENT_TARGETS.error(
@@ -235,20 +236,20 @@ def calibrate_hand_eye(
         lens_covariance=None if lens_calibration is None else lens_calibration.covariance,
     )
     names = [view.name or f"pose {i}" for i, view in zip(order, ordered, strict=True)]
-    distortion_numbers = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
+    distortion_indices = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
     if lens_calibration is not None:
         # a sheet bent by 0.15 mm would bend a lens that takes it as flat
-        distortion_numbers += [
+        distortion_indices += [
             5 + len(lens.distortion) + i for i in range(observations.heights.shape[2])
         ]
-    parameter_choices = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *distortion_numbers)}
+    parameter_choices = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *distortion_indices)}
     parameter_choices["scale and camera"] = (0, *parameter_choices["camera"])
     if lens_calibration is not None and adjust == "auto":
         # The robot's motions determine a lens better than views of a bent sheet: if the sheet bends
         # anew by 0.5 mm, cameras are 0.9 mm off instead of 1.8 mm (simulated).
         del parameter_choices[NOTHING], parameter_choices["scale"]
     options = _HandEyeOptions(
-        _choices_of(parameter_choices, adjust), method, drop_bad, order, most_scale
+        _choices_of(parameter_choices, adjust), method, drop_bad, order, max_scale_error
     )
     result = _calibrate_without_bad(problem, options, names, transforms, ordered)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
@@ -270,7 +271,7 @@ def calibrate_hand_eye(
     method=check_text,
     adjust=check_text,
     drop_bad=check_flag,
-    most_scale=a_number,
+    max_scale_error=a_number,
 )
 @one_blas_thread
 def calibrate_hand_eye_from_poses(
@@ -283,7 +284,7 @@ def calibrate_hand_eye_from_poses(
     robot_sigmas: RobotSigmas | None = None,
     drop_bad: bool = True,
     allowed_error: float | None = None,
-    most_scale: float = MAX_SCALE_ERROR,
+    max_scale_error: float = MAX_SCALE_ERROR,
 ) -> HandEyeCalibration:
     """Calibrate the pose of a camera on a robot, or beside it, from poses of the target.
 
@@ -292,7 +293,7 @@ def calibrate_hand_eye_from_poses(
 
     Args:
         robot_poses: ``T_base_flange``.
-        target_poses: ``T_camera_target``, as many.
+        target_poses: ``T_camera_target``, one for each robot pose.
         setup: as for :func:`calibrate_hand_eye`.
         method: as for :func:`calibrate_hand_eye`; ``reprojection`` gives a milliradian the weight
             of a millimetre.
@@ -300,14 +301,14 @@ def calibrate_hand_eye_from_poses(
         robot_sigmas: as for :func:`calibrate_hand_eye`.
         drop_bad: as for :func:`calibrate_hand_eye`.
         allowed_error: as for :func:`calibrate_hand_eye`.
-        most_scale: as for :func:`calibrate_hand_eye`.
+        max_scale_error: as for :func:`calibrate_hand_eye`.
 
     Raises:
         CalibrationError: as for :func:`calibrate_hand_eye`.
     """
     target_poses = as_target_poses(target_poses)
     check_positive(allowed_error, "allowed_error", "metres")
-    check_positive(most_scale, "most_scale", "parts of its size")
+    check_positive(max_scale_error, "max_scale_error", "parts of its size")
     transforms, order, robot = _check_robot_poses(
         robot_poses, len(target_poses), "poses of the target", setup
     )
@@ -323,7 +324,7 @@ def calibrate_hand_eye_from_poses(
     )
     names = [f"pose {i}" for i in order]
     parameter_choices = _choices_of({NOTHING: (), "scale": (0,)}, adjust)
-    options = _HandEyeOptions(parameter_choices, method, drop_bad, order, most_scale)
+    options = _HandEyeOptions(parameter_choices, method, drop_bad, order, max_scale_error)
     return dataclasses.replace(
         _calibrate_without_bad(problem, options, names, transforms, ordered),
         target_poses=tuple(Transform(CAMERA, TARGET, *pose.rigid) for pose in target_poses),
@@ -427,12 +428,12 @@ def _choices_of(
 class _HandEyeOptions(NamedTuple):
     """The options that the user gave."""
 
-    # values that may be adjusted, such as ``scale``, with the numbers of their parameters
+    # values that may be adjusted, such as ``scale``, with the indices of their parameters
     parameter_choices: Mapping[str, tuple[int, ...]]
     method: str  # name of the method, or ``auto``
     drop_bad: bool  # whether bad poses are left out
     order: list[int]  # indices of the given poses, sorted by the values of the poses
-    most_scale: float  # part by which the target's size may be off
+    max_scale_error: float  # fraction by which the target's size may be off
 
 
 def _calibrate_without_bad(
@@ -479,7 +480,7 @@ def _calibrate_without_bad(
     errors[used], held_out_errors[used] = result.errors, result.leave_one_out
     used_problem, given_order = problem.subset(used), np.argsort(options.order)
     _check_fit(used_problem, result)
-    _check_scale(result.target_scale, options.most_scale)
+    _check_scale(result.target_scale, options.max_scale_error)
     return dataclasses.replace(
         result,
         errors=errors[given_order],
@@ -513,8 +514,8 @@ def _move_remarks(
         if (shift := common_move(steps * np.repeat([lever, 1.0], 3))) is not None:
             yield Code.POOR_FIT.remark(
                 f"the {name} seems to have moved by {1e3 * np.linalg.norm(shift[3:]):.3g} mm: "
-                f"{', '.join(names)} were left out, and agree on another place of it than all "
-                "others; which of both holds now, they cannot tell"
+                f"{', '.join(names)} were left out, and agree with each other on another place of "
+                "it; find out which of the two places is the current one"
             )
             return
 
@@ -542,9 +543,9 @@ def _start_poses(
     outcome = "was not used" if can_drop else "is used all the same"
     return used, {
         index: Code.BAD_VIEW.remark(
-            f"{names[index]} is {1e3 * agreement.errors[index]:.3g} mm off what most poses agree "
-            f"with to {1e3 * agreement.median:.3g} mm: it belongs to another view, or numbers the "
-            f"target from its other end; it {outcome}"
+            f"{names[index]} is {1e3 * agreement.errors[index]:.3g} mm away from what most poses "
+            f"agree on within {1e3 * agreement.median:.3g} mm: it was paired with a wrong view, "
+            f"or its view is numbered from the target's other end; it {outcome}"
         )
         for index in gross_indices.tolist()
     }
@@ -564,9 +565,9 @@ def _bad_indices(result: HandEyeCalibration) -> list[int]:
 def _bad_pose_remark(result: HandEyeCalibration, index: int, name: str, outcome: str) -> Remark:
     errors = 1e3 * result.leave_one_out
     return Code.BAD_VIEW.remark(
-        f"{name} is {errors[index]:.3g} mm off what the others say of it, half of them are "
-        f"{np.median(errors):.3g} mm or less: its pose of the robot or its image is wrong; it "
-        f"{outcome}"
+        f"{name} is {errors[index]:.3g} mm away from where the other poses predict it; the median "
+        f"of all poses is {np.median(errors):.3g} mm: its pose of the robot or its image is wrong; "
+        f"it {outcome}"
     )
 
 
@@ -574,7 +575,7 @@ def _solve(problem: Problem, options: _HandEyeOptions, pose: Transform) -> HandE
     check_choice(options.method, ["auto", *METHODS], "method")
     best, all_candidates = fit_candidates(problem, options.parameter_choices, options.method)
     if best is None:
-        raise poor_fit_error(f"none at all {problem.count} poses", None)
+        raise poor_fit_error(f"no solution for all {problem.count} poses", None)
     return _build_calibration(problem, best, all_candidates, pose)
 
 
@@ -598,7 +599,7 @@ def _build_calibration(
     hand, base = pose.source, pose.target
     observations = best.problem.observations
     errors = best.problem.errors(solution)
-    held_out = np.where(np.isfinite(best.errors), best.errors, np.nan)
+    held_out = np.where(np.isfinite(best.held_out_errors), best.held_out_errors, np.nan)
     camera = (
         observations.camera(solution.change)
         if isinstance(observations, PixelObservations)
@@ -630,9 +631,9 @@ def _check_scale(scale: float, max_error: float) -> None:
     """Raise ``SCALE_MISMATCH`` if the target's size is off by more than is allowed."""
     if abs(scale - 1.0) > max_error:
         raise Code.SCALE_MISMATCH.error(
-            f"hand-eye: expected the target as large as it was said, to {100 * max_error:g} %, got "
-            f"one {scale:.3f} times as large by the robot's motions: measure the print, and say "
-            "how large it is; or allow more by most_scale",
+            "hand-eye: expected a target of the given size, with a difference of "
+            f"{100 * max_error:g} % at most, got one {scale:.3f} times as large by the robot's "
+            "motions: measure the print, and give its size; or allow more by max_scale_error",
             max_error,
             scale,
         )
@@ -693,7 +694,7 @@ def _covariance(candidate: Candidate) -> Array:
 
 def _size_remarks(problem: Problem, options: _HandEyeOptions) -> Iterator[Remark]:
     """Yield a remark if the target has another size, but the size was not to be adjusted."""
-    if options.method not in LINEAR and any(
+    if options.method not in OPENCV_METHODS and any(
         0 in numbers for numbers in options.parameter_choices.values()
     ):
         return
@@ -706,7 +707,7 @@ def _size_remarks(problem: Problem, options: _HandEyeOptions) -> Iterator[Remark
     sigma = math.sqrt(float(jackknife(np.array(left_out_scales, dtype=np.float64)[:, None])[0, 0]))
     if abs(scale - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
         yield Code.SCALE_MISMATCH.remark(
-            f"expected the target as large as it was said, got {scale:.4f} times that by the "
+            f"expected a target of the given size, got one {scale:.4f} times as large by the "
             "robot's motions, and the size was not to be adjusted: measure the print; or the "
             "lens' focal length is off by as much"
         )
@@ -715,8 +716,8 @@ def _size_remarks(problem: Problem, options: _HandEyeOptions) -> Iterator[Remark
 def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
     if abs(result.target_scale - 1.0) > REMARKED_SCALE_ERROR:
         yield Code.SCALE_MISMATCH.remark(
-            f"expected the target as large as it was said, got {result.target_scale:.4f} times "
-            "that by the robot's motions: measure the print; poses and errors are those of a "
+            f"expected a target of the given size, got one {result.target_scale:.4f} times as "
+            "large by the robot's motions: measure the print; poses and errors are those of a "
             "target of that size"
         )
     place_count = len(np.unique(same_place_indices(problem.robot.poses)))

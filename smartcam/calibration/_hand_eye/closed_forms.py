@@ -106,7 +106,8 @@ def check_motion(robot: RobotPoses) -> None:
         raise Code.INSUFFICIENT_ROTATION.error(
             "hand-eye: expected turns about two axes or more, "
             f"{math.degrees(MIN_TURN_RADIANS):g} deg rms about the second one, got "
-            f"{math.degrees(second):.2g} deg: along a single axis the camera is not determined",
+            f"{math.degrees(second):.2g} deg: turns about a single axis do not determine the "
+            "camera's position along this axis",
             MIN_TURN_RADIANS,
             second,
         )
@@ -147,7 +148,7 @@ def second_axis_turn(robot: RobotPoses) -> float:
 
 
 def left_out_second_axis_turns(robot: RobotPoses) -> Array:
-    """Return :func:`second_axis_turn` without each pose (V,), or of all poses if there are few."""
+    """Return :func:`second_axis_turn` without each compared pose, or of all poses if few."""
     products = _turn_products(robot)
     total, count = products.sum(axis=(0, 1)), len(products)
     if count <= MIN_POSES:
@@ -170,10 +171,10 @@ def _second_axis_rms(products: Array, count: int) -> Array:
     return roots / math.sqrt(count * (count - 1))
 
 
-def solve_linear(
+def solve_closed_form(
     name: str, robot: RobotPoses, target_poses: Rigid, *, use_all_views: bool = False
 ) -> tuple[Rigid, Rigid] | None:
-    """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`LINEAR`); None if it fails.
+    """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`OPENCV_METHODS`); None if it fails.
 
     ``target_poses``: ``T_camera_target`` of each view. ``use_all_views``: False gives methods that
     use pairs of views only a part of many views, which is enough for a start.
@@ -182,7 +183,7 @@ def solve_linear(
         sampled = np.linspace(0, target_poses.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
         robot, target_poses = robot.subset(sampled), target_poses.subset(sampled)
     try:
-        solution = LINEAR[name](name, robot, target_poses)
+        solution = OPENCV_METHODS[name](name, robot, target_poses)
     except (load("cv2").error, np.linalg.LinAlgError):
         return None
     return solution if _is_valid(solution) else None
@@ -215,11 +216,11 @@ def _as_rigid(turn: Any, shift: Any) -> Rigid:
     return motion
 
 
-LINEAR: dict[str, Callable[[str, RobotPoses, Rigid], tuple[Rigid, Rigid]]] = {
+OPENCV_METHODS: dict[str, Callable[[str, RobotPoses, Rigid], tuple[Rigid, Rigid]]] = {
     **dict.fromkeys(HAND_EYE, _hand_eye),
     **dict.fromkeys(ROBOT_WORLD, _robot_world),
 }
-"""Functions for OpenCV's methods, by their authors."""
+"""Functions for OpenCV's methods, which need no start value, by their authors."""
 
 
 def mean_target(camera: Rigid, robot: RobotPoses, target_poses: Rigid) -> Rigid:
@@ -237,18 +238,18 @@ def mean_target(camera: Rigid, robot: RobotPoses, target_poses: Rigid) -> Rigid:
 
 def estimate_scale(robot: RobotPoses, target_poses: Rigid) -> float | None:
     """Return the target's size that the robot's motions show, relative to the nominal size."""
-    solution = solve_linear(
+    solution = solve_closed_form(
         "park", robot, target_poses
     )  # the camera's rotation does not depend on lengths
     if solution is None:
         return None
     # S = X^-1 A Z with all of the camera's lengths times s: R_A t_Z - t_X - s R_X t_S = -t_A.
-    between, count = robot.carrier_motion, target_poses.size
+    carrier_motion, count = robot.carrier_motion, target_poses.size
     rows = np.zeros((count, 3, 7))
-    rows[:, :, :3], rows[:, :, 3:6] = between.rotation, -np.eye(3)
+    rows[:, :, :3], rows[:, :, 3:6] = carrier_motion.rotation, -np.eye(3)
     rows[:, :, 6] = -target_poses.translation @ solution[0].rotation.T
-    right = -between.translation.reshape(-1)
-    return float(np.linalg.lstsq(rows.reshape(-1, 7), right, rcond=None)[0][6])
+    right_side = -carrier_motion.translation.reshape(-1)
+    return float(np.linalg.lstsq(rows.reshape(-1, 7), right_side, rcond=None)[0][6])
 
 
 def _as_lists(motions: Rigid) -> tuple[list[Array], list[Array]]:

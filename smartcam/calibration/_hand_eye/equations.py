@@ -23,7 +23,7 @@ import numpy as np
 
 from smartcam.calibration._least_squares import NormalEquations, minimize, solve_scaled
 from smartcam.calibration._lens.bundle import lens_values, with_lens
-from smartcam.calibration._lens.projection import linearize, pose_changes
+from smartcam.calibration._lens.projection import linearize, pixels_by_pose
 from smartcam.geometry._inside import Rigid, check_choice, cross_matrix, right_jacobian
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class RobotNoise(NamedTuple):
     robot: RobotSigmas  # standard deviations of the robot's poses
     # factor by which the errors of the views' poses exceed those that the noise of the points
     # causes: errors that all points of a view share, such as errors of the lens, do not average out
-    shared: float = 1.0
+    view_error_factor: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +231,7 @@ class PixelObservations(Observations):
         if not any(self.free_parameters):
             return self.model
         return with_lens(
-            self.model, lens_values(self.model) + self._full_change(change)[1 : self._lens_end]
+            self.model, lens_values(self.model) + self._full_change(change)[1 : self._bends_start]
         )
 
     def evaluate(self, target_poses: Rigid, change: Array) -> tuple[Array, Array]:
@@ -244,15 +244,15 @@ class PixelObservations(Observations):
         if min(1.0 + full_change[0], *(np.diag(self.model.matrix)[:2] + full_change[1:3])) <= 0:
             undefined = np.full((views, 2 * count), np.nan)
             return undefined, np.full((*undefined.shape, 6 + self.extra_count), np.nan)
-        # A point of a target of size s is at p = s R m + t: dp/ds = R m. Poses move p as
-        # pose_changes has it, lenses move the pixel as the projection says, and a bend b moves m by
-        # b h along the target's normal n: dp/db = s h R n.
+        # A point of a target of size s is at p = s R m + t: dp/ds = R m. Poses move p as in
+        # pixels_by_pose, lenses move the pixel as the projection says, and a bend b moves m by b h
+        # along the target's normal n: dp/db = s h R n.
         nominal = self._bend_points(full_change) @ np.swapaxes(target_poses.rotation, 1, 2)
         scaled_points = self.scale(change) * nominal
         projection = linearize(
             (scaled_points + target_poses.translation[:, None]).reshape(-1, 3), self.camera(change)
         )
-        by_pose = pose_changes(projection.by_point, scaled_points.reshape(-1, 3))
+        by_pose = pixels_by_pose(projection.by_point, scaled_points.reshape(-1, 3))
         by_scale = projection.by_point @ nominal.reshape(-1, 3, 1)
         bend_shifts = (
             self.scale(change) * target_poses.rotation[:, None, :, 2:] * self.heights[:, :, None]
@@ -269,20 +269,20 @@ class PixelObservations(Observations):
         return residuals.reshape(views, -1), slopes.reshape(views, 2 * count, -1)
 
     @property
-    def _lens_end(self) -> int:
-        """Number of the target's scale and the lens' parameters; bends follow."""
+    def _bends_start(self) -> int:
+        """Index of the first bend; the target's scale and the lens' parameters come before."""
         return 5 + len(self.model.distortion)
 
     def _full_change(self, change: Array) -> Array:
         """Return the change of all parameters, 0 for those that are not adjusted."""
-        full_change = np.zeros(self._lens_end + self.heights.shape[2])
+        full_change = np.zeros(self._bends_start + self.heights.shape[2])
         full_change[list(self.free_parameters)] = change
         return full_change
 
     def _bend_points(self, full_change: Array) -> Array:
         """Return the target's points (V, N, 3) after the bends in ``full_change``."""
         points = self.points.copy()
-        points[..., 2] += self.heights @ full_change[self._lens_end :]
+        points[..., 2] += self.heights @ full_change[self._bends_start :]
         return points
 
 
@@ -356,7 +356,7 @@ class Solution:
 
     camera: Rigid  # ``X``
     target: Rigid  # ``Z``
-    # (extra,), change of the parameters
+    # (extra,), by how much the target's scale and the lens differ from their nominal values
     change: Array = field(default_factory=lambda: np.zeros(0))
     # (V, 6), corrections of the robot's poses; empty if they were not adjusted
     corrections: Array = field(default_factory=lambda: np.zeros((0, 6)))
@@ -364,7 +364,7 @@ class Solution:
     # points lie behind the camera
     cost: float = math.inf
     # (12 + extra, 12 + extra), information of ``X``, ``Z`` and the other parameters after
-    # eliminating the robot's corrections, one for each solution; None for closed forms
+    # eliminating the robot's corrections, stacked if the solutions are; None for closed forms
     information: Array | None = None
     # noise of the adjustment; None if the robot's poses were taken as exact
     noise: RobotNoise | None = None
@@ -457,7 +457,7 @@ def adjust(
     exact samples leave only rounding errors to gain.
     """
     scaled_observations = (
-        observations if noise is None else observations.with_scaled_sigmas(noise.shared)
+        observations if noise is None else observations.with_scaled_sigmas(noise.view_error_factor)
     )
     change = start.change if start.change.size else np.zeros(observations.extra_count)
     no_corrections = np.zeros((robot.poses.size, 6))
@@ -501,7 +501,7 @@ def leave_each_out(robot: RobotPoses, observations: Observations, solution: Solu
     scaled_observations = (
         observations
         if solution.noise is None
-        else observations.with_scaled_sigmas(solution.noise.shared)
+        else observations.with_scaled_sigmas(solution.noise.view_error_factor)
     )
     _, matrix, right = _view_equations(robot, scaled_observations, solution)
     correction, shared = slice(0, 6 if solution.noise else 0), slice(6, None)
@@ -541,15 +541,17 @@ def derivatives_by_parameters(
     scaled_observations = (
         freed_observations
         if solution.noise is None
-        else freed_observations.with_scaled_sigmas(solution.noise.shared)
+        else freed_observations.with_scaled_sigmas(solution.noise.view_error_factor)
     )
     corrections = solution.corrections if solution.corrections.size else no_corrections
     start = dataclasses.replace(solution, change=change, corrections=corrections)
-    matrix, fitted = (
+    matrix, fitted_count = (
         _normal_equations(robot, scaled_observations, start).eliminate_poses()[0],
         12 + observations.extra_count,
     )
-    slopes: Array = -solve_scaled(matrix[:fitted, :fitted], matrix[:fitted, fitted:])[:12]
+    slopes: Array = -solve_scaled(
+        matrix[:fitted_count, :fitted_count], matrix[:fitted_count, fitted_count:]
+    )[:12]
     return slopes
 
 

@@ -27,10 +27,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smartcam.calibration._hand_eye.closed_forms import (
-    LINEAR,
     MIN_POSES,
+    OPENCV_METHODS,
     estimate_scale,
-    solve_linear,
+    solve_closed_form,
 )
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
@@ -72,7 +72,7 @@ MAX_SIZE_ERROR_RATIO = 0.05
 
 ROBOT, REPROJECTION = "robot", "reprojection"
 
-METHODS = (ROBOT, REPROJECTION, *LINEAR)
+METHODS = (ROBOT, REPROJECTION, *OPENCV_METHODS)
 """Methods that may be chosen instead of ``auto``; the last are OpenCV's closed forms."""
 
 MAX_FOLDS = 20
@@ -165,7 +165,7 @@ class Problem:
         return residuals
 
 
-def point_errors(camera: CameraModel, target_pose: Rigid, pixels: Array, points: Array) -> Array:
+def errors_in_plane(camera: CameraModel, target_pose: Rigid, pixels: Array, points: Array) -> Array:
     """Return the distances (N,), metres, in a target's plane between rays and its points.
 
     They are infinite for a ray that does not meet the plane in front of the camera.
@@ -219,7 +219,7 @@ class Candidate:
         )
 
     @property
-    def errors(self) -> Array:
+    def held_out_errors(self) -> Array:
         """RMS held-out error of each pose, (V,), metres; infinite for a pose without one."""
         if self.left_out_solutions is None:
             return np.full(self.problem.count, np.inf)
@@ -231,7 +231,7 @@ class Candidate:
     def held_out(self) -> float:
         """RMS held-out error of all points, metres; infinite if a pose has no held-out error."""
         points = self.problem.mask.sum(axis=1)
-        return math.sqrt(float((points * self.errors**2).sum() / points.sum()))
+        return math.sqrt(float((points * self.held_out_errors**2).sum() / points.sum()))
 
     def chance_of_change(self, always_free_count: int) -> float:
         """Return the probability that noise alone changes the additional parameters by as much.
@@ -245,9 +245,9 @@ class Candidate:
             return 1.0
         # Wald's test: if all errors are noise, x^T C^-1 x of the K parameters x is chi-square
         # with K degrees of freedom; C^-1 is Schur's complement of the part of X and Z in the
-        # information. If noise was estimated from few equations, it follows an F distribution (over
-        # K). Source: Wald, Tests of Statistical Hypotheses Concerning Several Parameters When the
-        # Number of Observations is Large (1943).
+        # information. If noise was estimated from few equations, the value over K follows an F
+        # distribution. Source: Wald, Tests of Statistical Hypotheses Concerning Several Parameters
+        # When the Number of Observations is Large (1943).
         coupling_to_poses = information[:12, 12:]
         reduced = information[12:, 12:] - coupling_to_poses.T @ solve_scaled(
             information[:12, :12], coupling_to_poses
@@ -270,19 +270,19 @@ def fit_candidates(
 ) -> tuple[Candidate | None, list[Candidate]]:
     """Return the best candidate, or None if nothing fits, and all candidates.
 
-    ``parameter_choices``: numbers of the parameters of each of :data:`ADJUSTABLE` that may be
-    adjusted. ``method``: ``auto``, or one of :data:`METHODS`.
+    ``parameter_choices``: the entries of :data:`ADJUSTABLE` to try, each with the indices of its
+    parameters. ``method``: ``auto``, or one of :data:`METHODS`.
     """
-    start = _closed_form(problem, method) if method in LINEAR else _best_start(problem)
+    start = _closed_form(problem, method) if method in OPENCV_METHODS else _best_start(problem)
     if start is None:
         return None, []
-    if method in LINEAR:
+    if method in OPENCV_METHODS:
         candidate = _closed_form_candidate(problem, method, start)
         return candidate, [candidate]
     if method == REPROJECTION and len(parameter_choices) == 1:
-        ((adjusted_values, numbers),) = parameter_choices.items()
+        ((adjusted_values, parameter_indices),) = parameter_choices.items()
         reprojection = _reprojection_candidate(
-            adjusted_values, _with_free_parameters(problem, numbers), start
+            adjusted_values, _with_free_parameters(problem, parameter_indices), start
         )
         return reprojection, [reprojection] if reprojection else []
     robot_candidates = _robot_candidates(problem, parameter_choices, start)
@@ -349,18 +349,18 @@ def _robot_candidates(
 ) -> list[Candidate]:
     """Return candidates that correct the robot's poses, one for each choice of parameters."""
     candidates: list[Candidate] = []
-    is_scale_free = any(0 in numbers for numbers in parameter_choices.values())
-    other_size_start = _start_of_other_size(problem) if is_scale_free else None
-    for adjusted_values, numbers in parameter_choices.items():
-        freed_problem = _with_free_parameters(problem, numbers)
+    is_scale_free = any(0 in indices for indices in parameter_choices.values())
+    rescaled_start = _start_for_rescaled_target(problem) if is_scale_free else None
+    for adjusted_values, parameter_indices in parameter_choices.items():
+        freed_problem = _with_free_parameters(problem, parameter_indices)
         start = (
             candidates[0].solution
             if candidates and candidates[0].adjusted_values == NOTHING
             else start_solution
         )
-        if other_size_start is not None and 0 in numbers:
-            change = np.concatenate([other_size_start.change, np.zeros(len(numbers) - 1)])
-            start = dataclasses.replace(other_size_start, change=change)
+        if rescaled_start is not None and 0 in parameter_indices:
+            changes = np.concatenate([rescaled_start.change, np.zeros(len(parameter_indices) - 1)])
+            start = dataclasses.replace(rescaled_start, change=changes)
         if problem.robot_sigmas is None:
             solution = adjust_with_noise(freed_problem.robot, freed_problem.observations, start)
         else:
@@ -419,23 +419,25 @@ def _gain_in_sigmas(candidate: Candidate, other: Candidate) -> float:
 
     Poses are independent of each other, unlike their points.
     """
-    errors, other_errors = candidate.errors, other.errors
+    errors, other_errors = candidate.held_out_errors, other.held_out_errors
     if not (np.isfinite(other_errors).all() and np.isfinite(errors).all()):
         return math.inf if candidate.held_out < other.held_out else -math.inf
     gain = candidate.problem.mask.sum(axis=1) * (other_errors**2 - errors**2)
     return float(gain.sum()) / max(math.sqrt(float((gain**2).sum())), 1e-300)
 
 
-def _with_free_parameters(problem: Problem, numbers: tuple[int, ...]) -> Problem:
-    if not numbers:
+def _with_free_parameters(problem: Problem, indices: tuple[int, ...]) -> Problem:
+    if not indices:
         return problem
     return dataclasses.replace(
-        problem, observations=dataclasses.replace(problem.observations, free_parameters=numbers)
+        problem, observations=dataclasses.replace(problem.observations, free_parameters=indices)
     )
 
 
 def _closed_form(problem: Problem, name: str, *, use_all_views: bool = True) -> Solution | None:
-    solution = solve_linear(name, problem.robot, problem.target_poses, use_all_views=use_all_views)
+    solution = solve_closed_form(
+        name, problem.robot, problem.target_poses, use_all_views=use_all_views
+    )
     return (
         None
         if solution is None
@@ -446,7 +448,7 @@ def _closed_form(problem: Problem, name: str, *, use_all_views: bool = True) -> 
 def _best_start(problem: Problem) -> Solution | None:
     """Return the solution of the closed form that fits best; None if none fits."""
     ranked = []
-    for number, name in enumerate(LINEAR):
+    for number, name in enumerate(OPENCV_METHODS):
         solution = _closed_form(problem, name, use_all_views=False)
         if solution is not None:
             errors = np.concatenate(problem.errors(solution))
@@ -455,7 +457,7 @@ def _best_start(problem: Problem) -> Solution | None:
     return min(ranked)[2] if ranked else None
 
 
-def _start_of_other_size(problem: Problem) -> Solution | None:
+def _start_for_rescaled_target(problem: Problem) -> Solution | None:
     """Return the best closed form for a target of the size that the robot's motions show.
 
     None if that size is near the nominal one, or not known.

@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam.calibration._files import storage
 from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
-from smartcam.calibration._hand_eye.model_selection import intersect_plane, point_errors
+from smartcam.calibration._hand_eye.model_selection import errors_in_plane, intersect_plane
 from smartcam.calibration._lens.poses import CAMERA, TARGET, PoseInCamera, check_view, half_turned
 from smartcam.calibration._targets import resized
 from smartcam.calibration._verdict import (
@@ -84,8 +84,8 @@ class HandEyeCalibration(storage.SavedCalibration):
         held_out_error: RMS of the left-out errors over all points of the used poses, metres; None
             if there is none. It is the error to expect in picking.
         covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
-            along those of its target, m) and of ``target_pose``, from the scatter of the solutions
-            without each pose; where another candidate is as likely, its difference is included. A
+            along the axes of flange or base, m) and of ``target_pose``, from the scatter of the
+            solutions without each pose; if another candidate is as likely, it is included. A
             given lens is taken as exact unless it was adjusted; the error of a lens calibrated from
             the same views is included. NaN with fewer than 5 poses.
         robot_sigmas: standard deviations of each axis of the robot's poses, as given or estimated;
@@ -170,20 +170,20 @@ class HandEyeCalibration(storage.SavedCalibration):
     def judged(self) -> Judgement:
         """Return the verdict and the advice; unknown with few poses, whose error says nothing."""
         held_out, codes = self.held_out_error, {warning.code for warning in self.warnings}
-        left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
-        plural = "s" * (len(left_out) > 1)
+        unused = [str(number) for number, used in enumerate(self.used, 1) if not used]
+        plural = "s" * (len(unused) > 1)
         judgement = judge(
             None if held_out is None or Code.TOO_FEW in codes else 1e3 * held_out,
             [
                 warning
                 for warning in self.warnings
-                if not (left_out and warning.code == Code.BAD_VIEW)
+                if not (unused and warning.code == Code.BAD_VIEW)
             ],
             worst=1 + self.worst,
             allowed=self.allowed,
             cures=VIEW_CURES,
             advice="take more views",
-            where=f" without view{plural} {', '.join(left_out)}" if left_out else "",
+            where=f" without view{plural} {', '.join(unused)}" if unused else "",
         )
         if judgement.verdict.level != "good":
             return judgement
@@ -215,7 +215,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     @property
     def worst(self) -> int:
-        """Index of the pose with the largest held-out error, or error if one has none."""
+        """Index of the pose with the largest held-out error; if one has none, the largest error."""
         errors = self.errors if np.isnan(self.leave_one_out).any() else self.leave_one_out
         return int(np.argmax(errors))
 
@@ -264,7 +264,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         """
         lens, pixel_array = self._lens("to_plane"), as_points(pixels, 2, "pixels")
         mapped = _intersect_rays(
-            lens, pixel_array, self.camera_at(robot_pose).inverse() @ plane, height
+            lens, pixel_array, self.camera_at(robot_pose).inverse() @ plane, height, "to_plane"
         )
         places = plane.apply(mapped)
         check_finite(places, "to_plane: points")
@@ -324,7 +324,7 @@ class HandEyeCalibration(storage.SavedCalibration):
             )
         numberings = (view, half_turned(view)) if view.target.half_turn_symmetric else (view,)
         errors_of_numberings = [
-            point_errors(
+            errors_in_plane(
                 lens,
                 target_pose.rigid,
                 numbered_view.points,
@@ -374,11 +374,13 @@ class HandEyeCalibration(storage.SavedCalibration):
                     self.camera_pose.target, self.camera_pose.source, *moved_pose
                 )
                 shifted_points.append(
-                    _intersect_rays(lens, pixel_array, camera_pose.inverse() @ plane, 0.0)
+                    _intersect_rays(
+                        lens, pixel_array, camera_pose.inverse() @ plane, 0.0, "predicted_error"
+                    )
                 )
             slopes.append((shifted_points[1] - shifted_points[0]) / (2 * step))
-        by_step = np.stack(slopes, axis=-1)
-        joint = by_step @ self.covariance[:6, :6] @ np.swapaxes(by_step, 1, 2)
+        jacobian = np.stack(slopes, axis=-1)
+        joint = jacobian @ self.covariance[:6, :6] @ np.swapaxes(jacobian, 1, 2)
         error: Array = np.sqrt(np.trace(joint, axis1=1, axis2=2))
         return error
 
@@ -392,10 +394,13 @@ class HandEyeCalibration(storage.SavedCalibration):
         return self.camera
 
 
-def _intersect_rays(camera: CameraModel, pixels: Array, plane: Transform, height: float) -> Array:
+def _intersect_rays(
+    camera: CameraModel, pixels: Array, plane: Transform, height: float, label: str
+) -> Array:
     """Return the points at which pixels' rays meet a plane, in its frame; raise OUT_OF_FIELD.
 
     ``plane``: ``T_camera_plane``; the rays meet it at ``height`` above its z = 0, metres.
+    ``label`` names the caller.
     """
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
     raised_origin = plane.rotation[:, 2] * height + plane.translation
@@ -404,7 +409,7 @@ def _intersect_rays(camera: CameraModel, pixels: Array, plane: Transform, height
     if is_missed.any():
         row = int(np.argmax(is_missed))
         raise Code.OUT_OF_FIELD.error(
-            "to_plane: expected pixels whose rays meet the plane before the camera, got "
+            f"{label}: expected pixels whose rays meet the plane in front of the camera, got "
             f"{pixels[row].tolist()} in row {row}, whose ray does not",
             got=pixels[row].tolist(),
         )

@@ -83,7 +83,7 @@ def adjust_with_noise(robot: RobotPoses, observations: Observations, start: Solu
 
 
 def _logs(noise: RobotNoise) -> Array:
-    logs: Array = np.log([*noise.robot, noise.shared])
+    logs: Array = np.log([*noise.robot, noise.view_error_factor])
     return logs
 
 
@@ -122,9 +122,9 @@ def _estimate_noise(
 def _likelihood_cost(products: Array, values: Array) -> float:
     """Return -2 log of the restricted likelihood, without its constants.
 
-    ``products`` (V, 6 + P + 1, 6 + P + 1): products of the derivatives by the robot's correction,
-    by the P other unknowns, and of the residuals without corrections. ``values`` (3,): sigmas of
-    rotation and translation, and the shared errors' factor.
+    ``products`` (V, 6 + P + 1, 6 + P + 1): products of the derivatives with respect to the robot's
+    correction and the P other unknowns, and of the residuals without corrections. ``values`` (3,):
+    sigmas of rotation and translation, and the factor of the views' errors.
     """
     # Residuals r = J x + B c + e, with corrections c of covariance D = diag(sigma^2) and noise e of
     # covariance I, have V = I + B D B^T. The restricted likelihood does not depend on x:

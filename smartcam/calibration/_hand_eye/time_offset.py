@@ -15,7 +15,7 @@ import numpy as np
 
 from smartcam._argument_checks import a_number, check_arguments, of_class
 from smartcam._extras import load
-from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_linear
+from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_closed_form
 from smartcam.calibration._hand_eye.equations import RobotPoses, is_in_hand, predicted_views
 from smartcam.calibration._hand_eye.validation import as_target_poses
 from smartcam.calibration._jackknife import jackknife
@@ -59,9 +59,13 @@ class TimeOffset(NamedTuple):
     rms_after: float
 
 
-@check_arguments(history=of_class("PoseHistory"), most=a_number)
+@check_arguments(history=of_class("PoseHistory"), max_offset=a_number)
 def estimate_time_offset(
-    history: PoseHistory, target_poses: Sequence[Transform], *, setup: Setup, most: float = 0.2
+    history: PoseHistory,
+    target_poses: Sequence[Transform],
+    *,
+    setup: Setup,
+    max_offset: float = 0.2,
 ) -> TimeOffset:
     """Estimate by how much the times of pictures differ from those of a robot's poses.
 
@@ -71,18 +75,19 @@ def estimate_time_offset(
         poses = [history.at(one.at + timedelta(seconds=offset.seconds)) for one in seen]
 
     Args:
-        history: ``T_base_flange`` while the pictures were taken, and ``most`` before and after.
+        history: ``T_base_flange`` while the pictures were taken, and for ``max_offset`` seconds
+            before and after.
         target_poses: ``T_camera_target`` of each picture, with its time (``at``): ten or more,
             taken while the robot moves and turns, fast enough to matter and in several directions.
         setup: place of the camera, as for :func:`~smartcam.calibration.calibrate_hand_eye`.
-        most: largest offset to look for, seconds.
+        max_offset: largest offset to look for, seconds.
 
     Raises:
         CalibrationError: TOO_FEW; BAD_TIME: a view without a time, a history that does not reach
             far enough, or views that determine no offset in the range, as when the robot stood
             still; and the errors of ``calibrate_hand_eye`` about poses.
     """
-    check_positive(most, "most", "seconds")
+    check_positive(max_offset, "max_offset", "seconds")
     views = as_target_poses(target_poses)
     if len(views) < MIN_VIEWS_FOR_OFFSET:
         raise Code.TOO_FEW.error_with_value(
@@ -90,7 +95,7 @@ def estimate_time_offset(
             MIN_VIEWS_FOR_OFFSET,
             len(views),
         )
-    fit = _OffsetFit(history, views, setup, most)
+    fit = _OffsetFit(history, views, setup, max_offset)
     all_views = np.arange(len(views))
     offset = fit.find_offset(all_views)
     fold_of_view = all_views % MAX_FOLDS
@@ -100,11 +105,12 @@ def estimate_time_offset(
     ]
     scatter = math.sqrt(float(jackknife(np.array(left_out_offsets)[:, None])[0, 0]))
     sigma = max(scatter, fit.noise_sigma(offset, all_views))
-    if abs(offset) > 0.99 * most or sigma > MAX_SIGMA_SHARE * most:
+    if abs(offset) > 0.99 * max_offset or sigma > MAX_SIGMA_SHARE * max_offset:
         raise Code.BAD_TIME.error(
-            f"time offset: expected views that tell one within {most:g} s, got {offset:.3g} s with "
-            f"a sigma of {sigma:.2g} s: take pictures while the robot moves, or allow more",
-            most,
+            f"time offset: expected views that determine an offset up to {max_offset:g} s, got "
+            f"{offset:.3g} s with a sigma of {sigma:.2g} s: take pictures while the robot moves, "
+            "or allow a larger offset",
+            max_offset,
             offset,
         )
     return TimeOffset(offset, sigma, fit.error(0.0, all_views), fit.error(offset, all_views))
@@ -136,7 +142,7 @@ class _OffsetFit:
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the RMS difference between poses and views at some indices, metres."""
         robot, target_poses = self._robot(offset, index), self._views.subset(index)
-        solution = solve_linear("shah", robot, target_poses)
+        solution = solve_closed_form("shah", robot, target_poses)
         if solution is None:
             return math.inf
         turn, shift = np.split(

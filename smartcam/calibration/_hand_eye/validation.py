@@ -1,7 +1,7 @@
 """Check whether a robot's poses and the views belong together, and find those that do not.
 
 A closed form finds camera and target from each of many small groups of poses. The result that fits
-most of the poses is used, so a few poses that belong to other views have no influence.
+most of the poses is used, so a few poses that were paired with a wrong view have no influence.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._hand_eye.closed_forms import solve_linear
+from smartcam.calibration._hand_eye.closed_forms import solve_closed_form
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
     RobotPoses,
@@ -46,7 +46,7 @@ MAX_GROUPS: Final = 60
 wrong pose."""
 
 MIN_GROSS_ERROR_RATIO: Final = 10.0
-"""A pose whose error is more than this many times the median belongs to another view."""
+"""A pose whose error is more than this many times the median was paired with a wrong view."""
 
 MIN_INVERTED_FIT_RATIO: Final = 5.0
 """Poses are taken as inverted, or a view as numbered from the target's other end, only if they then
@@ -54,7 +54,7 @@ fit this many times better."""
 
 MIN_OTHER_FIT_RATIO: Final = 20.0
 """Poses are taken as transposed, mirrored or in another unit of length only if they then fit this
-many times better: such mistakes are rarer than a single pose that belongs to another view."""
+many times better: such mistakes are rarer than a single pose with a wrong view."""
 
 WORST_USABLE_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
 """Largest noise of a usable robot: 2 degrees and 10 mm."""
@@ -65,7 +65,7 @@ MIRROR_X: Final = np.diag([-1.0, 1.0, 1.0])
 """Mirror of the x axis; mirrors of other axes differ only by rotations of base and flange."""
 
 
-class AgreedMotion(NamedTuple):
+class AgreedPoses(NamedTuple):
     """The poses of camera and target on which most of the robot's poses agree."""
 
     camera: Rigid  # ``X``
@@ -130,7 +130,7 @@ def max_plausible_error(problem: Problem) -> float:
     return min(meaningless_error(problem), expected_error(problem, WORST_USABLE_ROBOT))
 
 
-def find_agreement(problem: Problem) -> AgreedMotion | None:
+def find_agreement(problem: Problem) -> AgreedPoses | None:
     """Return the poses of camera and target that fit most of the views; None if there are none."""
     # The proposal with the least median error is chosen; it is right if most of the poses are.
     # Source: Rousseeuw, Least Median of Squares Regression (1984).
@@ -139,7 +139,7 @@ def find_agreement(problem: Problem) -> AgreedMotion | None:
         if isinstance(problem.observations, PixelObservations)
         else 0.0
     )
-    best: AgreedMotion | None = None
+    best: AgreedPoses | None = None
     for indices in _groups(problem.count):
         best = _improve_agreement(problem, indices, lever, best)
     if best is not None:
@@ -158,24 +158,27 @@ def _groups(count: int) -> Iterator[NDArray[np.intp]]:
 
 
 def _improve_agreement(
-    problem: Problem, indices: NDArray[np.intp], lever: float, best: AgreedMotion | None
-) -> AgreedMotion | None:
+    problem: Problem, indices: NDArray[np.intp], lever: float, best: AgreedPoses | None
+) -> AgreedPoses | None:
     """Return camera and target from the poses at ``indices`` if they fit better than ``best``."""
     for name in CLOSED_FORMS:
-        motions = solve_linear(
+        motions = solve_closed_form(
             name, problem.robot.subset(indices), problem.target_poses.subset(indices)
         )
         if motions is None:
             continue
         expected = predicted_views(motions[0], problem.robot, motions[1])
-        candidate = AgreedMotion(*motions, _pose_distances(problem.target_poses, expected, lever))
+        candidate = AgreedPoses(*motions, _pose_distances(problem.target_poses, expected, lever))
         if best is None or candidate.median < best.median:
             best = candidate
     return best
 
 
 def _pose_distances(poses: Rigid, expected: Rigid, lever: float) -> Array:
-    """Return the distances (V,) of poses from the expected ones, metres; turns act on the lever."""
+    """Return the distances (V,) of poses from the expected ones, metres.
+
+    A turn counts as the distance by which it moves a point at the distance ``lever``.
+    """
     turn, shift = np.split(poses.target_steps_to(expected), 2, axis=1)
     distances: Array = np.hypot(np.linalg.norm(shift, axis=1), lever * np.linalg.norm(turn, axis=1))
     return distances
@@ -191,7 +194,7 @@ def find_other_numbering(
     """
     least_median, is_turned = math.inf, np.zeros(poses.size, dtype=np.bool_)
     for indices, name in itertools.product(_groups(poses.size), CLOSED_FORMS):
-        solution = solve_linear(name, robot.subset(indices), poses.subset(indices))
+        solution = solve_closed_form(name, robot.subset(indices), poses.subset(indices))
         if solution is None:
             continue
         expected = predicted_views(solution[0], robot, solution[1])
@@ -235,7 +238,7 @@ def _other_readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code
     )
 
 
-def check_poses(problem: Problem) -> AgreedMotion:
+def check_poses(problem: Problem) -> AgreedPoses:
     """Return the poses of camera and target with which most of the robot's poses agree.
 
     Raises ``WRONG_FRAME``, ``MIRRORED`` or ``POOR_FIT`` if the poses fit far better after undoing a
@@ -252,9 +255,9 @@ def check_poses(problem: Problem) -> AgreedMotion:
         if other_error < max_plausible_error(other_problem) and error > min_ratio * other_error:
             error_text = f"{1e3 * error:.3g} mm off" if math.isfinite(error) else "nowhere near"
             raise code.error(
-                "hand-eye: expected poses of the flange in the base, and the setup as it is, got "
-                f"poses that are {error_text} as given, but {1e3 * other_error:.3g} mm when "
-                f"read {reading}",
+                "hand-eye: expected poses of the flange in the base and the right setup, got poses "
+                f"that are {error_text} as given, but only {1e3 * other_error:.3g} mm off if read "
+                f"{reading}",
                 "T_base_flange",
                 other_error,
             )
@@ -280,7 +283,7 @@ def poor_fit_error(actual: str, error: float | None) -> CalibrationError:
     )
 
 
-def _median_error(problem: Problem, agreed: AgreedMotion) -> float:
+def _median_error(problem: Problem, agreed: AgreedPoses) -> float:
     """Return the median error of the points on the target, metres."""
     solution = Solution(agreed.camera, agreed.target, np.zeros(problem.observations.extra_count))
     return float(np.median(np.concatenate(problem.errors(solution))))

@@ -25,7 +25,7 @@ from smartcam.calibration._least_squares import (
 from smartcam.calibration._lens.projection import (
     excess_variance,
     linearize,
-    pose_changes,
+    pixels_by_pose,
     whitening,
 )
 from smartcam.geometry._inside import IDENTITY, Rigid
@@ -71,11 +71,11 @@ Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 """An array of indices."""
 
 
-class Sight(NamedTuple):
+class Observation(NamedTuple):
     """A view with its camera and pose; of each pose, a camera has one view at most."""
 
-    camera: int  # index of the camera
-    pose: int  # index of the target's pose
+    camera_index: int
+    pose_index: int  # index of the target's pose
     view: TargetView
 
 
@@ -186,7 +186,7 @@ class AdjustedBundle:
     """The result of adjusting a bundle."""
 
     bundle: Bundle  # bundle with the least weighted squares
-    residuals: list[Array]  # residuals of each sight (N, 2), seen minus projected, pixels
+    residuals: list[Array]  # residuals of each observation (N, 2), seen minus projected, pixels
     # sum of the weighted squares of all residuals; infinite if points lie behind a camera
     weighted_squares: float
     extra_variance: float  # variance that was added to that of each coordinate, pixels^2
@@ -222,7 +222,7 @@ class AdjustedBundle:
 
 
 def adjust_weighted(
-    bundle: Bundle, sights: Sequence[Sight], extra_variance: float = 0.0
+    bundle: Bundle, observations: Sequence[Observation], extra_variance: float = 0.0
 ) -> AdjustedBundle:
     """Return the least-squares solution with weights that match its residuals.
 
@@ -232,21 +232,21 @@ def adjust_weighted(
     """
     # Weights need the variance, and the variance needs the residuals, so both are computed
     # alternately. The fit depends little on the weights, so the second round hardly changes it.
-    covariance = np.concatenate([sight.view.covariance for sight in sights])
+    covariance = np.concatenate([observation.view.covariance for observation in observations])
     for _ in range(3):
-        adjusted = adjust(bundle, sights, extra_variance)
+        adjusted = adjust(bundle, observations, extra_variance)
         covariance_excess = excess_variance(
             np.concatenate(adjusted.residuals), covariance, adjusted.freedom
         )
         if abs(covariance_excess - extra_variance) <= 0.01 * extra_variance:
             return adjusted
         bundle, extra_variance = adjusted.bundle, covariance_excess
-    return adjust(bundle, sights, extra_variance)
+    return adjust(bundle, observations, extra_variance)
 
 
 def adjust(
     bundle: Bundle,
-    sights: Sequence[Sight],
+    observations: Sequence[Observation],
     extra_variance: float,
     min_gain: float = MIN_COST_GAIN_RATIO,
 ) -> AdjustedBundle:
@@ -255,20 +255,20 @@ def adjust(
     Each point is weighted by its covariance plus ``extra_variance``, pixels^2. The fit ends when a
     step lowers the weighted squares by less than the part ``min_gain``.
     """
-    normal_at = BundleEquations(bundle, sights, extra_variance).normal
+    normal_at = BundleEquations(bundle, observations, extra_variance).normal
     bundle, normal = minimize(bundle, normal_at, Bundle.with_steps, min_gain=min_gain)
-    coordinate_count = 2 * sum(len(sight.view.ids) for sight in sights)
-    pose_count = len({sight.pose for sight in sights})
+    coordinate_count = 2 * sum(len(observation.view.ids) for observation in observations)
+    pose_count = len({observation.pose_index for observation in observations})
     return AdjustedBundle(
         bundle=bundle,
-        residuals=residuals(bundle, sights),
+        residuals=residuals(bundle, observations),
         weighted_squares=normal.cost,
         extra_variance=extra_variance,
         normal=normal,
         freedom=coordinate_count
         - bundle.camera_unknown_count
         - 6 * pose_count
-        - (_free_point_unknowns(sights) if bundle.has_free_points else 0),
+        - (_free_point_unknowns(observations) if bundle.has_free_points else 0),
     )
 
 
@@ -284,7 +284,7 @@ class LeftOut(NamedTuple):
     noise_covariance: Array
 
 
-def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut]:
+def leave_out(adjusted: AdjustedBundle, observations: Sequence[Observation]) -> list[LeftOut]:
     """Return the fit without each observed pose, from a single step or, if needed, a new fit."""
     # At the solution, the normal equations without a pose are all equations minus those of the
     # pose, both with the poses eliminated. Their solution is the Gauss-Newton step from the fit to
@@ -292,45 +292,58 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
     matrix, right, _, _ = adjusted.normal.eliminate_poses()
     count, left_out = adjusted.bundle.camera_unknown_count, []
-    poses = sorted({sight.pose for sight in sights})
+    poses = sorted({observation.pose_index for observation in observations})
     for pose in poses:
-        sights_of_pose = [sight._replace(pose=0) for sight in sights if sight.pose == pose]
+        observations_of_pose = [
+            observation._replace(pose_index=0)
+            for observation in observations
+            if observation.pose_index == pose
+        ]
         bundle = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.subset([pose]))
-        equations = BundleEquations(bundle, sights_of_pose, adjusted.extra_variance, prior=False)
+        equations = BundleEquations(
+            bundle, observations_of_pose, adjusted.extra_variance, prior=False
+        )
         pose_normal = equations.normal(bundle)
-        pose_part = pose_normal.eliminate_poses()
-        right_sides = np.column_stack([right - pose_part[1], np.eye(len(right), count)])
-        step, by_noise = np.split(solve_scaled(matrix - pose_part[0], right_sides), [1], axis=1)
+        pose_matrix, pose_right, pose_by_shared, pose_constant = pose_normal.eliminate_poses()
+        right_sides = np.column_stack([right - pose_right, np.eye(len(right), count)])
+        step, noise_covariance = np.split(
+            solve_scaled(matrix - pose_matrix, right_sides), [1], axis=1
+        )
         shared = step[:, 0]
-        refitted = bundle.with_steps(shared, pose_part[3] - pose_part[2] @ shared)
+        refitted = bundle.with_steps(shared, pose_constant - pose_by_shared @ shared)
         squares = (
             pose_normal.cost
-            - float((pose_normal.pose_right * pose_part[3]).sum())
-            - 2.0 * pose_part[1] @ shared
+            - float((pose_normal.pose_right * pose_constant).sum())
+            - 2.0 * pose_right @ shared
         )
-        squares += float(shared @ pose_part[0] @ shared)
+        squares += float(shared @ pose_matrix @ shared)
         if (
             len(poses) <= MAX_FEW_POSES
             or not equations.normal(refitted).cost <= MAX_ONE_STEP_COST_RATIO * squares
         ):
-            refitted = _fit_without_pose(adjusted, sights, pose, sights_of_pose)
+            refitted = _fit_without_pose(adjusted, observations, pose, observations_of_pose)
         left_out.append(
-            LeftOut(pose, refitted, residuals(refitted, sights_of_pose), by_noise[:count])
+            LeftOut(
+                pose, refitted, residuals(refitted, observations_of_pose), noise_covariance[:count]
+            )
         )
     return left_out
 
 
 def _fit_without_pose(
-    adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int, sights_of_pose: Sequence[Sight]
+    adjusted: AdjustedBundle,
+    observations: Sequence[Observation],
+    pose: int,
+    observations_of_pose: Sequence[Observation],
 ) -> Bundle:
     """Fit the cameras to all views but those of one pose, then this pose to its views."""
-    others = [sight for sight in sights if sight.pose != pose]
+    others = [observation for observation in observations if observation.pose_index != pose]
     others_fit = adjust(
         adjusted.bundle, others, adjusted.extra_variance, MIN_REFIT_GAIN_RATIO
     ).bundle
     refitted = dataclasses.replace(others_fit, poses=adjusted.bundle.poses.subset([pose]))
     poses = adjust(
-        refitted.with_known_cameras(), sights_of_pose, adjusted.extra_variance
+        refitted.with_known_cameras(), observations_of_pose, adjusted.extra_variance
     ).bundle.poses
     return dataclasses.replace(refitted, poses=poses)
 
@@ -347,9 +360,12 @@ def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> 
     )
 
 
-def _free_point_unknowns(sights: Sequence[Sight]) -> int:
+def _free_point_unknowns(observations: Sequence[Observation]) -> int:
     """Return the number of unknowns of the seen points, without the 7 of their pose and size."""
-    return 3 * len(np.unique(np.concatenate([sight.view.ids for sight in sights]))) - 7
+    return (
+        3 * len(np.unique(np.concatenate([observation.view.ids for observation in observations])))
+        - 7
+    )
 
 
 class _CameraPoints(NamedTuple):
@@ -364,8 +380,13 @@ class _CameraPoints(NamedTuple):
     whitening: Array  # (N, 2, 2), matrix that whitens each point's residual
 
 
-def _collect_points(camera: int, sights: Sequence[Sight], extra_variance: float) -> _CameraPoints:
-    views, poses = [sight.view for sight in sights], [sight.pose for sight in sights]
+def _collect_points(
+    camera: int, observations: Sequence[Observation], extra_variance: float
+) -> _CameraPoints:
+    views, poses = (
+        [observation.view for observation in observations],
+        [observation.pose_index for observation in observations],
+    )
     ends = np.cumsum([0, *(len(view.ids) for view in views)])
     return _CameraPoints(
         camera,
@@ -388,21 +409,24 @@ class BundleEquations:
     def __init__(
         self,
         bundle: Bundle,
-        sights: Sequence[Sight],
+        observations: Sequence[Observation],
         extra_variance: float,
         *,
         prior: bool = True,
     ) -> None:
-        sides = (
-            [sight for sight in sights if sight.camera == k] for k in range(len(bundle.cameras))
+        observations_by_camera = (
+            [observation for observation in observations if observation.camera_index == k]
+            for k in range(len(bundle.cameras))
         )
         self._groups = [
-            _collect_points(k, side, extra_variance) for k, side in enumerate(sides) if side
+            _collect_points(k, observations_of_camera, extra_variance)
+            for k, observations_of_camera in enumerate(observations_by_camera)
+            if observations_of_camera
         ]
         self._is_unseen_pose = ~np.isin(
-            np.arange(bundle.poses.size), [sight.pose for sight in sights]
+            np.arange(bundle.poses.size), [observation.pose_index for observation in observations]
         )
-        self._nominal = sights[0].view.target.points
+        self._nominal = observations[0].view.target.points
         self._prior = _prior_weights(self._nominal) if prior and bundle.has_free_points else None
 
     def normal(self, bundle: Bundle) -> NormalEquations:
@@ -459,7 +483,7 @@ class BundleEquations:
         derivatives by the points on the target, if these are adjusted.
         """
         # p = R_c (R m + t) + t_c moves with a pose's turn by R_c (w x R m), with the rig's by
-        # w x (R_c (R m + t)), with the point by R_c R; see pose_changes.
+        # w x (R_c (R m + t)), with the point by R_c R; see pixels_by_pose.
         camera, rig, pose = group.camera, bundle.rig_motion(group.camera), bundle.poses
         points, rotation = self._nominal if bundle.points is None else bundle.points, pose.rotation
         turned = np.einsum("nij,nj->ni", rotation[group.pose_of_point], points[group.ids])
@@ -467,10 +491,10 @@ class BundleEquations:
         seen = linearize(rotated + rig.translation, bundle.cameras[camera])
         by_first = seen.by_point @ rig.rotation
         columns = [np.arange(bundle.shared_count)[bundle.lens_columns[camera]]]
-        blocks = [pose_changes(by_first, turned), seen.by_lens @ bundle.basis[camera]]
+        blocks = [pixels_by_pose(by_first, turned), seen.by_lens @ bundle.basis[camera]]
         if camera and not bundle.is_rig_known:
             columns.append(bundle.lens_columns[-1].stop + 6 * (camera - 1) + np.arange(6))
-            blocks.append(pose_changes(seen.by_point, rotated))
+            blocks.append(pixels_by_pose(seen.by_point, rotated))
         blocks.append((group.pixels - seen.pixels)[..., None])
         by_point = (
             group.whitening @ (by_first @ rotation[group.pose_of_point])
@@ -480,10 +504,10 @@ class BundleEquations:
         return np.concatenate(columns), group.whitening @ np.concatenate(blocks, axis=2), by_point
 
 
-def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
+def residuals(bundle: Bundle, observations: Iterable[Observation]) -> list[Array]:
     """Return the residuals of each view (N, 2), seen minus projected, pixels."""
     per_view = []
-    for camera, pose, view in sights:
+    for camera, pose, view in observations:
         points = view.object_points if bundle.points is None else bundle.points[view.ids]
         in_camera = (bundle.rig_motion(camera) @ bundle.poses.subset(pose)).apply(points)
         per_view.append(view.points - bundle.cameras[camera].project(in_camera))

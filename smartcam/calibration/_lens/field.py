@@ -3,10 +3,10 @@
 Two calibrations of one lens may differ without disagreeing: if the principal point of one is off,
 the camera seems turned by as much, and every pose that is found with that lens is turned equally.
 So the small motion of the camera that fits an error over the field best is subtracted from the
-error. The points to which this motion is fitted, the gauge, can be chosen: best are the target's
-points where the calibration saw them. Points that are much nearer or farther than the gauge are
-then less certain. A program that finds the camera's pose at one distance and uses it at another has
-the same uncertainty.
+error. The points to which this motion is fitted can be chosen: best are the target's points where
+the calibration saw them. Points that are much nearer or farther than these are then less certain. A
+program that finds the camera's pose at one distance and uses it at another has the same
+uncertainty.
 
 Source: the idea is mrcal's (D. Kogan), which calls that motion the implied transformation; the
 formulas here are written anew.
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._lens.projection import linearize, pose_changes
+from smartcam.calibration._lens.projection import linearize, pixels_by_pose
 from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
@@ -48,13 +48,13 @@ class Sensitivity(NamedTuple):
     # (N, 2, 3), derivatives by the point, pixels per metre; for directions pixels per radian
     by_point: Array
 
-    def without_motion(self, gauge: Sensitivity) -> Array:
-        """Return ``by_lens`` minus the camera motion that fits best at the gauge's points."""
-        # Pixels move by B d with the lens and by A m with the motion: at the gauge m = -A_g^+ B_g d
-        # leaves the least squares, so B d + A m = (B - A A_g^+ B_g) d.
+    def without_motion(self, alignment: Sensitivity) -> Array:
+        """Return ``by_lens`` minus the camera motion that fits best at the alignment's points."""
+        # Pixels move by B d with the lens and by A m with the motion: at the alignment points g,
+        # m = -A_g^+ B_g d minimizes the squares, so B d + A m = (B - A A_g^+ B_g) d.
         count = self.by_lens.shape[2]
         motion = np.linalg.lstsq(
-            gauge.by_motion.reshape(-1, 6), gauge.by_lens.reshape(-1, count), rcond=None
+            alignment.by_motion.reshape(-1, 6), alignment.by_lens.reshape(-1, count), rcond=None
         )
         remaining: Array = self.by_lens - self.by_motion @ motion[0]
         return remaining
@@ -111,7 +111,7 @@ def sensitivity(camera: CameraModel, points: Array, *, at_infinity: bool = False
     finite = np.isfinite(points).all(axis=1, keepdims=True)
     safe_points = np.where(finite, points, [0.0, 0.0, 1.0])
     projection = linearize(safe_points, camera)
-    motion = pose_changes(projection.by_point, safe_points)
+    motion = pixels_by_pose(projection.by_point, safe_points)
     if at_infinity:
         motion[:, :, 3:] = 0.0
     missing = np.where(finite, 0.0, np.nan)[:, :, None]

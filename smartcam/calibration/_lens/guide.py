@@ -14,7 +14,7 @@ import numpy as np
 
 from smartcam._argument_checks import a_number, a_target, check_arguments, of_class, or_none
 from smartcam.calibration._least_squares import inverse_scaled
-from smartcam.calibration._lens.bundle import Bundle, BundleEquations, Sight
+from smartcam.calibration._lens.bundle import Bundle, BundleEquations, Observation
 from smartcam.calibration._lens.field import (
     check_distance,
     finite_points,
@@ -23,7 +23,7 @@ from smartcam.calibration._lens.field import (
     sensitivity,
 )
 from smartcam.calibration._lens.poses import CAMERA, TARGET
-from smartcam.calibration._lens.projection import MIN_SIGMA_PX, pose_changes
+from smartcam.calibration._lens.projection import MIN_SIGMA_PX, pixels_by_pose
 from smartcam.geometry import Transform
 from smartcam.geometry._inside import Rigid, exp_rotation
 
@@ -131,17 +131,17 @@ def suggest_views(
     information = _information_matrices(camera, suggestions.poses, shown_target.points, basis)
     information = information / (_point_variance(calibration) * scatter_ratio)
     new_covariances = np.linalg.inv(np.linalg.inv(covariance) + information)
-    means = np.sqrt(np.maximum(np.einsum("cij,ji->c", new_covariances, weight), 0.0) / 2)
-    present = math.sqrt(max(float(np.einsum("ij,ji->", covariance, weight)), 0.0) / 2)
+    rms_with = np.sqrt(np.maximum(np.einsum("cij,ji->c", new_covariances, weight), 0.0) / 2)
+    rms_without = math.sqrt(max(float(np.einsum("ij,ji->", covariance, weight)), 0.0) / 2)
     return [
         NextView(
             suggestions.texts[number],
             Transform(CAMERA, TARGET, *suggestions.poses.subset(number)),
             suggestions.outlines[number],
-            float(means[number]),
-            present,
+            float(rms_with[number]),
+            rms_without,
         )
-        for number in np.argsort(means, kind="stable").tolist()
+        for number in np.argsort(rms_with, kind="stable").tolist()
     ]
 
 
@@ -173,8 +173,8 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
         points = used[0].view.target.points + calibration.sheet
     poses = Rigid.stack(fit.transform.rigid for fit in used)
     bundle = Bundle.single(calibration.camera, poses, basis, points)
-    sights = [Sight(0, number, fit.view) for number, fit in enumerate(used)]
-    equations = BundleEquations(bundle, sights, calibration.sigma**2)
+    observations = [Observation(0, number, fit.view) for number, fit in enumerate(used)]
+    equations = BundleEquations(bundle, observations, calibration.sigma**2)
     information = equations.normal(bundle).eliminate_poses()[0]
     inverse = np.linalg.pinv(basis)
     scatter_covariance, count = inverse @ calibration.covariance @ inverse.T, len(information)
@@ -202,7 +202,7 @@ def _information_matrices(camera: CameraModel, poses: Rigid, points: Array, basi
     in_camera = (turned + poses.translation[:, None]).reshape(-1, 3)
     projection = sensitivity(camera, in_camera)
     by_lens = (projection.by_lens @ basis).reshape(shape)
-    by_pose = pose_changes(projection.by_point, turned.reshape(-1, 3)).reshape(shape)
+    by_pose = pixels_by_pose(projection.by_point, turned.reshape(-1, 3)).reshape(shape)
     mixed = by_pose.swapaxes(1, 2) @ by_lens
     pose_information = by_pose.swapaxes(1, 2) @ by_pose
     information: Array = by_lens.swapaxes(1, 2) @ by_lens - mixed.swapaxes(1, 2) @ np.linalg.solve(

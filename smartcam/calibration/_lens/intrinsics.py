@@ -14,7 +14,7 @@ from pydantic import Field
 from smartcam._argument_checks import check_arguments, each, of_class
 from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, camera_covariance
+from smartcam.calibration._lens.bundle import Bundle, Observation, adjust, camera_covariance
 from smartcam.calibration._lens.coverage import Coverage, coverage
 from smartcam.calibration._lens.field import DEFAULT_MAP_SHAPE, map_pixels, points_of_pixels
 from smartcam.calibration._lens.poses import (
@@ -118,7 +118,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
         covariance: (4 + K, 4 + K), of fx, fy, cx, cy and the coefficients, from how much each view
             changes them (a jackknife). It includes errors that all points of a view share, such as
             a sheet that bends anew. It is 0 for values that were not fitted. From V views its rank
-            is at most V, and from few views it is rough: from ten it is known to a quarter.
+            is at most V, and from few views it is rough: from ten views it is accurate to 25 %.
         views: fit of each given view, in the order of the views.
         rms: RMS of a coordinate of the residuals of the used views, pixels, corrected for their
             degrees of freedom. It is not the accuracy of the lens: see ``held_out``.
@@ -202,8 +202,8 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
         """Return the errors of the lens at any views.
 
-        Views that the lens was not fitted to show how good it is. Only the pose of the target is
-        fitted to each, as for :attr:`ViewFit.held_out`.
+        To see how good the lens is, give views to which it was not fitted. Only the pose of the
+        target is fitted to each, as for :attr:`ViewFit.held_out`.
 
         Args:
             views: views of any target; of the same one if its points were adjusted (``sheet``).
@@ -229,7 +229,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
         pose = Rigid.stack([locate(view, self.camera).transform.rigid])
         points = None if self.sheet is None else target.points + self.sheet
         bundle = Bundle.single(self.camera, pose, points=points)
-        return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
+        return adjust(bundle, [Observation(0, 0, view)], self.sigma**2).residuals[0]
 
     def _check(self, fields: Mapping[str, Any], called: str) -> None:
         count = 4 + len(self.camera.distortion)
@@ -276,7 +276,7 @@ def calibrate_intrinsics(
             bends. ``auto``: if that lowers the held-out error by more than chance. ``exact``:
             never. ``free``: always. Adjusted points that few views show stay near their nominal
             places. A warning ``SHEET_NOT_EXACT`` says that the held-out error contradicts an exact
-            sheet. Targets of more than 1000 points are taken as exact, untested.
+            sheet. Targets of more than 1000 points are taken as exact without this test.
         drop_bad: whether views that fit far worse than the others are left out, at most a third of
             them; a warning names them in any case.
 
@@ -340,7 +340,8 @@ def _renumber_views(
     The result is ``calibration`` and no names if no view is turned, or if renumbering does not
     reduce the residuals much.
     """
-    # Fitting the shape and choosing the numbers alternately only lowers the squares: Lloyd (1982).
+    # Fitting the lens and choosing each view's numbering in turn can only lower the sum of squared
+    # residuals: Lloyd (1982).
     views = [fit.view for fit in calibration.views]
     used = [number for number, fit in enumerate(calibration.views) if fit.used]
     bad = sorted(set(range(len(views))) - set(used))
@@ -474,8 +475,8 @@ def _build_calibration(
     sheet: SheetOption,
 ) -> IntrinsicCalibration:
     used_views = [views[number] for number in used]
-    sights = [Sight(0, number, view) for number, view in enumerate(used_views)]
-    sheet_fit = choose_shape(adjusted, sights, sheet)
+    observations = [Observation(0, number, view) for number, view in enumerate(used_views)]
+    sheet_fit = choose_shape(adjusted, observations, sheet)
     errors = [
         view_rms(left_out_fit.residuals[0]) if len(used) > MIN_VIEWS else math.nan
         for left_out_fit in sheet_fit.left_out
@@ -564,9 +565,9 @@ def _remarks(
     reached_share = float(np.isfinite(seen[:, 0]).mean())
     if reached_share < MIN_REACHED_SHARE:
         yield Code.OUT_OF_FIELD.remark(
-            f"the model {camera.distortion_model} ends before the image does: no direction leads "
-            f"to {1 - reached_share:.0%} of it, of which nothing is known; show the target there, "
-            "or take another model"
+            f"the model {camera.distortion_model} is not valid in {1 - reached_share:.0%} of the "
+            "image, to which no direction is projected; show the target there, or take another "
+            "model"
         )
     if lacking := calibration.coverage.lacking:
         values = ", ".join(f"{name} {getattr(calibration.coverage, name):.0%}" for name in lacking)

@@ -19,8 +19,8 @@ from smartcam.calibration._lens.bundle import lens_values
 from smartcam.calibration._lens.projection import (
     SMOOTH_TERM_COUNT,
     linearize,
-    pose_changes,
-    smooth_changes,
+    pixels_by_pose,
+    pixels_by_smooth_errors,
     whitening,
 )
 from smartcam.geometry._inside import COEFFICIENT_COUNTS, Code, Remark
@@ -67,8 +67,8 @@ cause to all others by this much. 170 random parts of recorded sets reach 32; pi
 
 RANDOM_ORDERS: Final = 100
 """A change from one view on is reported only if it explains more than the best change of this many
-random orders of the views: 4 parts of OpenCV's 13 right views, of which no camera changed, reach an
-evidence of 53 to 74, and 16 to 23 of 100 random orders reach more (measured)."""
+random orders of the views: four subsets of OpenCV's 13 right views, taken by an unchanged camera,
+reach an evidence of 53 to 74, and 16 to 23 of 100 random orders reach more (measured)."""
 
 APART_COST_RATIO: Final = 4.0
 """The views of a pair are reported as taken at different times if cameras that move between the
@@ -94,8 +94,8 @@ class FittedView(NamedTuple):
     camera: CameraModel
     pose: Rigid  # ``T_camera_target``
     points: Array  # (T, 3), points of the target, metres
-    # ``T_right_left`` if the camera is the right one of a pair: then the pose of the target in the
-    # left camera is eliminated
+    # ``T_right_left`` if the camera is the right one of a pair: ``pose`` is in this camera, but the
+    # eliminated unknown is the target's pose in the left one
     rig: Rigid | None = None
 
     def equations(self, extra_variance: float) -> Equations:
@@ -104,19 +104,19 @@ class FittedView(NamedTuple):
         turned = target_points @ self.pose.rotation.T
         projection = linearize(turned + self.pose.translation, self.camera)
         white = whitening(self.view.covariance, extra_variance)
-        by_pose, lens, image = pose_changes(projection.by_point, turned), LENS, IMAGE
+        by_pose, lens, image = pixels_by_pose(projection.by_point, turned), LENS, IMAGE
         shared = np.zeros((*projection.pixels.shape, UNKNOWN_COUNT))
         if self.rig is not None:
             lens, image = RIGHT_LENS, RIGHT_IMAGE
-            away = turned + self.pose.translation - self.rig.translation
-            shared[..., RIG] = pose_changes(projection.by_point, away)
-            by_pose = pose_changes(
+            from_rig_origin = turned + self.pose.translation - self.rig.translation
+            shared[..., RIG] = pixels_by_pose(projection.by_point, from_rig_origin)
+            by_pose = pixels_by_pose(
                 projection.by_point @ self.rig.rotation, turned @ self.rig.rotation
             )
         shared[..., lens[: projection.by_lens.shape[2]]] = projection.by_lens
         shared[..., SHEET] = projection.by_point @ self.pose.rotation @ _deformations(target_points)
         shared[..., SHUTTER] = projection.pixels[:, 1, None, None] / self.camera.size[1] * np.eye(2)
-        shared[..., image] = smooth_changes(projection.pixels, self.camera.size)
+        shared[..., image] = pixels_by_smooth_errors(projection.pixels, self.camera.size)
         return Equations(
             white @ by_pose,
             white @ shared,
@@ -146,12 +146,12 @@ class Equations(NamedTuple):
 class SharedEquations(NamedTuple):
     """Normal equations of views for the L shared unknowns, after eliminating the poses.
 
-    If the unknowns change by x, the weighted squares of view i are ``squares[i] - 2 right[i] x + x
-    matrix[i] x``.
+    If the unknowns change by x, the weighted squares of view i are ``squares[i] - 2
+    right_sides[i] x + x matrix[i] x``.
     """
 
     matrix: Array  # (V, L, L), J^T J
-    right: Array  # (V, L), J^T r
+    right_sides: Array  # (V, L), J^T r
     squares: Array  # (V,), weighted squares before any change
 
     @classmethod
@@ -172,7 +172,9 @@ class SharedEquations(NamedTuple):
 
     def misfits(self, change: Array) -> Array:
         """Return the weighted squares (V,) of the views after a change (L,) of the unknowns."""
-        misfits: Array = self.squares - 2.0 * self.right @ change + self.matrix @ change @ change
+        misfits: Array = (
+            self.squares - 2.0 * self.right_sides @ change + self.matrix @ change @ change
+        )
         return misfits
 
     def solve(self, free: Mask, per_view: Sequence[int] = ()) -> tuple[Array, float]:
@@ -181,20 +183,21 @@ class SharedEquations(NamedTuple):
         The unknowns at the indices ``per_view`` may differ between the views.
         """
         # Schur's complement eliminates the unknowns of each view: x_v = M_vv^-1 (b_v - M_v x)
-        matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
+        matrix, right_side = self.matrix.sum(axis=0), self.right_sides.sum(axis=0)
+        squares = self.squares.sum()
         for sums_matrix, sums_right in (
-            zip(self.matrix, self.right, strict=True) if per_view else ()
+            zip(self.matrix, self.right_sides, strict=True) if per_view else ()
         ):
             block = sums_matrix[np.ix_(per_view, per_view)]
             solved = solve_scaled(
                 block, np.column_stack([sums_matrix[per_view], sums_right[per_view]])
             )
             matrix = matrix - sums_matrix[:, per_view] @ solved[:, :-1]
-            right = right - sums_matrix[:, per_view] @ solved[:, -1]
+            right_side = right_side - sums_matrix[:, per_view] @ solved[:, -1]
             squares = squares - sums_right[per_view] @ solved[:, -1]
-        basis = np.eye(len(right))[:, free]
-        change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
-        return change, float(squares - change @ right)
+        basis = np.eye(len(right_side))[:, free]
+        change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right_side)
+        return change, float(squares - change @ right_side)
 
 
 class _FlippedLens(NamedTuple):
@@ -230,10 +233,10 @@ class _FlippedLens(NamedTuple):
                 reduced.matrix[mask].sum(axis=0) for mask in (~flipped, flipped)
             )
             flipped_right = self.mirror * (
-                reduced.right[flipped].sum(axis=0) - flipped_matrix @ self.shift
+                reduced.right_sides[flipped].sum(axis=0) - flipped_matrix @ self.shift
             )
             matrix = plain_matrix + self.mirror[:, None] * flipped_matrix * self.mirror
-            right = reduced.right[~flipped].sum(axis=0) + flipped_right
+            right = reduced.right_sides[~flipped].sum(axis=0) + flipped_right
             change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
             plain_misfits = reduced.misfits(change)
             flipped_misfits = reduced.misfits(self.shift + self.mirror * change)
@@ -315,12 +318,12 @@ class _Misfit:
         # The later views have a change d of their own besides the change x of all. Eliminating x
         # leaves (L - C M^-1 C^T) d = l - C M^-1 b, where L, C and l are sums over the later views.
         inverse = inverse_scaled(self.reduced.matrix.sum(axis=0)[np.ix_(free, free)])
-        right = self.reduced.right.sum(axis=0)[free]
+        right = self.reduced.right_sides.sum(axis=0)[free]
         rows = self.reduced.matrix[np.ix_(order, np.asarray(indices))]
         parts = (
             rows[..., free],
             rows[..., indices],
-            self.reduced.right[np.ix_(order, np.asarray(indices))],
+            self.reduced.right_sides[np.ix_(order, np.asarray(indices))],
         )
         coupling, own, own_right = (part[::-1].cumsum(axis=0)[-3:0:-1] for part in parts)
         projected = coupling @ inverse
@@ -352,8 +355,8 @@ class _Misfit:
         max_score = self.score(after, len(changes[best_cause]) + 1) + MIN_CHANGE_EVIDENCE
         if not self.accept_cause(after, len(changes[best_cause]) + 1, evidence=MIN_CHANGE_EVIDENCE):
             return
-        # What a view has wrong as a whole makes any two groups of views differ. A change at one
-        # moment is special only if the views in no other order show as large a one.
+        # Errors that all points of a view share make any two groups of views differ. So a change is
+        # reported only if no random order of the views shows a larger one.
         random = np.random.default_rng(len(names))
         for _ in range(RANDOM_ORDERS):
             order = random.permutation(len(names))
@@ -398,10 +401,10 @@ def misfit_remarks(
     if len(fitted) < MIN_VIEWS_TO_EXPLAIN:
         return
     equations = [[view.equations(extra_variance) for view in views] for views in fitted]
-    moments = [
+    equations_by_time = [
         Equations(*map(np.concatenate, zip(*equation, strict=True))) for equation in equations
     ]
-    misfit, is_apart = _Misfit(moments, free), False
+    misfit, is_apart = _Misfit(equations_by_time, free), False
     reduced, usable, changes = misfit.reduced, misfit.free, {ZOOM_QUESTION: LENS[:4]}
     if len(fitted[0]) > 1:
         sides = {"left": LENS[:4], "right": RIGHT_LENS[:4]}
@@ -447,7 +450,7 @@ def _guess_flips(reduced: SharedEquations, indices: Sequence[int]) -> Iterator[M
     """Yield masks of views that may be flipped: those that fit another principal point."""
     for index in indices:
         weight = np.maximum(reduced.matrix[:, index, index], np.finfo(np.float64).tiny)
-        shifts = reduced.right[:, index] / weight
+        shifts = reduced.right_sides[:, index] / weight
         yield shifts < np.median(shifts)
         yield shifts < 0
         yield np.abs(shifts) > 3 * np.median(np.abs(shifts))

@@ -11,7 +11,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._files import storage
-from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight, adjust
+from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Observation, adjust
 from smartcam.calibration._lens.projection import excess_variance
 from smartcam.calibration._views import TargetView, check_type
 from smartcam.geometry import CameraModel, Transform
@@ -41,10 +41,10 @@ MIN_SPREAD_RATIO: Final = 1e-3
 MAX_OUTSIDE_RATIO: Final = 0.1
 """A point may lie outside of the image by this part of the image's sides."""
 
-MIN_AGREEMENT: Final = 0.5
-"""The agreement of a view with its target, from -1 to 1, is near -1 in a correct view and must be
-below minus this value. If it is above this value, the view shows the sheet in a mirror. Views of
-steep sheets and of fisheyes have -0.8."""
+MIN_HANDEDNESS: Final = 0.5
+"""The handedness of a view, from -1 to 1, is near -1 in a correct view and must be below minus this
+value. If it is above this value, the view shows the sheet in a mirror. Views of steep sheets and of
+fisheyes have -0.8."""
 
 MAX_RAY_SHIFT_RATIO: Final = 1e-9
 """Rays are shifted by at most this part of the focal length, to avoid rounding errors in OpenCV."""
@@ -102,9 +102,10 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     """
     check_type(camera, CameraModel, "pose of the target: camera")
     check_view(view, camera.size)
-    sights = [Sight(0, 0, view)]
+    observations = [Observation(0, 0, view)]
     fits = [
-        adjust(Bundle.single(camera, start), sights, 0.0) for start in plane_poses(view, camera)
+        adjust(Bundle.single(camera, start), observations, 0.0)
+        for start in plane_poses(view, camera)
     ]
     fits = sorted(
         (fit for fit in fits if math.isfinite(fit.weighted_squares)),
@@ -112,13 +113,13 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     )
     if not fits:
         raise Code.POOR_FIT.error(
-            f"pose of the target{_in_view(view)}: expected one in front of the camera that shows "
-            f"its {len(view.ids)} points where they are, got none",
+            f"pose of the target{_in_view(view)}: expected one in front of the camera that "
+            f"explains where its {len(view.ids)} points are seen, got none",
             "a pose in front of the camera",
         )
     extra_variance = excess_variance(fits[0].residuals[0], view.covariance, fits[0].freedom)
     if extra_variance:
-        fits = [adjust(fit.bundle, sights, extra_variance) for fit in fits]
+        fits = [adjust(fit.bundle, observations, extra_variance) for fit in fits]
     best, pose = fits[0], fits[0].bundle.poses
     other = next(
         (fit for fit in fits[1:] if pose.angle_to(fit.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),
@@ -146,7 +147,7 @@ def view_rms(residuals: Array) -> float:
 
 
 def check_view(view: TargetView, size: tuple[int, int]) -> None:
-    """Raise an error for a view that does not determine the pose, or not of ``size``, pixels.
+    """Raise an error if a view does not determine the pose, or if its image has another size.
 
     Raises the errors of :func:`locate`.
     """
@@ -191,20 +192,20 @@ def _check_inside(view: TargetView, label: str) -> None:
 
 def _check_numbering(view: TargetView, label: str) -> None:
     """Raise ``MIRRORED`` for a mirrored sheet, and ``POOR_FIT`` for points with wrong numbers."""
-    agreement = view.agreement
-    if agreement > MIN_AGREEMENT:
+    handedness = view.handedness
+    if handedness > MIN_HANDEDNESS:
         raise Code.MIRRORED.error(
-            f"{label}: expected its x to turn left to its y as one reads the sheet, got a view as "
-            "in a mirror: was the picture flipped, or are u and v exchanged?",
+            f"{label}: expected the target's y axis to the left of its x axis, as on the sheet, "
+            "got a view as in a mirror: was the picture flipped, or are u and v exchanged?",
             "y to the left of x",
-            agreement,
+            handedness,
         )
-    if agreement > -MIN_AGREEMENT:
+    if handedness > -MIN_HANDEDNESS:
         raise Code.POOR_FIT.error(
             f"{label}: expected points with the numbers that they have on {view.target}, got an "
-            f"order that agrees with it by {-agreement:.2g} of 1 only",
-            MIN_AGREEMENT,
-            -agreement,
+            f"order that agrees with it by {-handedness:.2g} of 1 only",
+            MIN_HANDEDNESS,
+            -handedness,
         )
 
 

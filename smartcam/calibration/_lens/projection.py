@@ -69,8 +69,8 @@ def linearize(points: Array, camera: CameraModel) -> Projection:
     return Projection(pixels, by_point, by_lens)
 
 
-def pose_changes(by_point: Array, turned_points: Array) -> Array:
-    """Return the derivatives of pixels by the six changes of a pose (N, 2, 6).
+def pixels_by_pose(by_point: Array, turned_points: Array) -> Array:
+    """Return the derivatives of pixels with respect to the six steps of a pose (N, 2, 6).
 
     ``by_point`` (N, 2, 3): derivatives by the points in the camera's frame. ``turned_points`` (N,
     3): R @ points, without the translation.
@@ -84,8 +84,8 @@ def pose_changes(by_point: Array, turned_points: Array) -> Array:
     return changes
 
 
-def smooth_changes(pixels: Array, size: tuple[int, int]) -> Array:
-    """Return the derivatives (N, 2, T) of pixels (N, 2) by T smooth changes of their image."""
+def pixels_by_smooth_errors(pixels: Array, size: tuple[int, int]) -> Array:
+    """Return the derivatives (N, 2, T) of pixels (N, 2) by T coefficients of smooth lens errors."""
     x, y = (2.0 * pixels / max(size) - np.array(size) / max(size)).T
     powers = [x**i * y**j for i in range(MAX_DEGREE + 1) for j in range(MAX_DEGREE + 1 - i)]
     changes = np.kron(np.eye(2), np.stack(powers, axis=1)[:, None])

@@ -23,15 +23,15 @@ from smartcam.geometry._inside import Code, Remark, Rigid
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, LeftOut, Sight
+    from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, LeftOut, Observation
     from smartcam.geometry._inside import Array
 
 SheetOption: TypeAlias = Literal["auto", "exact", "free"]
 """Choice between nominal (``exact``) and adjusted points (``free``); ``auto``: the fit decides."""
 
 MIN_POSES: Final = 4
-"""At least this many left-out views show whether adjusted points predict better by more than
-chance."""
+"""Only this many left-out views or more can show whether adjusted points predict better by more
+than chance."""
 
 MAX_FREE_POINTS: Final = 1000
 """A target with free points has at most this many: the equations for more would take gigabytes."""
@@ -47,7 +47,9 @@ class SheetFit(NamedTuple):
     remarks: list[Remark]
 
 
-def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: SheetOption) -> SheetFit:
+def choose_shape(
+    adjusted: AdjustedBundle, observations: Sequence[Observation], sheet: SheetOption
+) -> SheetFit:
     """Return the fit with the target's points either nominal or adjusted.
 
     ``adjusted`` has the nominal points. With ``sheet`` ``auto``, points are adjusted if
@@ -55,20 +57,20 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
 
     Raises ``SHAPE`` if there are more points than may be adjusted.
     """
-    count = len(sights[0].view.target.points)
+    count = len(observations[0].view.target.points)
     if sheet == "free" and count > MAX_FREE_POINTS:
         raise Code.SHAPE.error_with_value(
             f"sheet: expected a target of {MAX_FREE_POINTS} points at most that are free",
             MAX_FREE_POINTS,
             count,
         )
-    exact = SheetFit(adjusted, leave_out(adjusted, sights), None, [])
+    exact = SheetFit(adjusted, leave_out(adjusted, observations), None, [])
     if count > MAX_FREE_POINTS or (sheet != "free" and len(exact.left_out) < MIN_POSES):
         return exact
-    free_fit = adjust_shape(adjusted.bundle, sights, adjusted.extra_variance)
+    free_fit = adjust_shape(adjusted.bundle, observations, adjusted.extra_variance)
     left_out, offsets = (
-        leave_out(free_fit, sights),
-        _offsets(free_fit.bundle, sights[0].view.target.points),
+        leave_out(free_fit, observations),
+        _offsets(free_fit.bundle, observations[0].view.target.points),
     )
     # nominal points, unless adjusted ones predict better by more than one standard error: Breiman,
     # Friedman, Olshen and Stone, Classification and Regression Trees (1984), section 3.4
@@ -81,7 +83,7 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
             [_remark(offsets, "the print or the board is not exact")] if is_free_better else []
         )
         return SheetFit(free_fit, left_out, offsets, remarks)
-    text = "it is taken as exact all the same, which sheet='auto' does not"
+    text = "sheet='exact' keeps the nominal points; sheet='auto' would adjust them"
     return exact._replace(remarks=[_remark(offsets, text)] if is_free_better else [])
 
 
@@ -104,17 +106,19 @@ def _remark(offsets: Array, text: str) -> Remark:
     )
 
 
-def adjust_shape(bundle: Bundle, sights: Sequence[Sight], extra_variance: float) -> AdjustedBundle:
+def adjust_shape(
+    bundle: Bundle, observations: Sequence[Observation], extra_variance: float
+) -> AdjustedBundle:
     """Return the least-squares solution in which the target's points are adjusted, too.
 
     ``bundle`` is near the solution; the target's points start from its ``points``, or from their
     nominal places if that is None. ``extra_variance``, pixels^2, is a first guess of the variance
     in addition to the points' covariance, which is estimated anew.
     """
-    nominal = sights[0].view.target.points
+    nominal = observations[0].view.target.points
     points = nominal if bundle.points is None else bundle.points
     free_bundle = dataclasses.replace(bundle, points=points, has_free_points=True)
-    adjusted = adjust_weighted(free_bundle, sights, extra_variance)
+    adjusted = adjust_weighted(free_bundle, observations, extra_variance)
     return dataclasses.replace(adjusted, bundle=_move_bundle_to_nominal(adjusted.bundle, nominal))
 
 

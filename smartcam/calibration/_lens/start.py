@@ -9,7 +9,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._lens.bundle import (
     Bundle,
-    Sight,
+    Observation,
     adjust_weighted,
     lens_values,
     with_lens,
@@ -46,19 +46,19 @@ def parameter_names(model: DistortionModel) -> tuple[str, ...]:
 
 
 def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
-    """Return the derivatives (4 + K, F) of the values of a lens by its unknowns.
+    """Return the derivatives of the 4 + K values of a lens with respect to its F free unknowns.
 
     ``fixed``: names of coefficients that stay 0; ``aspect``: fx and fy are one unknown. Raises
     ``SHAPE`` if there is no such model, or if it has no coefficient of that name.
     """
     names, coefficients, fixed_names = parameter_names(model), coefficient_names(model), set(fixed)
-    unknown = sorted(fixed_names.difference(coefficients, {"aspect"}))
-    if unknown:
+    invalid_names = sorted(fixed_names.difference(coefficients, {"aspect"}))
+    if invalid_names:
         raise Code.SHAPE.error(
             f"fixed: expected coefficients of {model} ({', '.join(coefficients)}) or aspect, got "
-            f"{', '.join(unknown)}",
+            f"{', '.join(invalid_names)}",
             [*coefficients, "aspect"],
-            unknown,
+            invalid_names,
         )
     columns = np.eye(len(names))
     if "aspect" in fixed_names:
@@ -101,8 +101,10 @@ def _fit_from_length(
     guess = _opencv_lens(views[:: -(-len(views) // MAX_VIEWS_OF_OPENCV)], model, length)
     # coefficients that stay 0 are set to 0, and fy to fx if they are one unknown
     lens = with_lens(guess, basis @ np.linalg.pinv(basis) @ lens_values(guess))
-    sights = [Sight(0, number, view) for number, view in enumerate(views)]
-    adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), sights)
+    observations = [Observation(0, number, view) for number, view in enumerate(views)]
+    adjusted = adjust_weighted(
+        Bundle.single(lens, likeliest_poses(views, lens), basis), observations
+    )
     if not np.isfinite(adjusted.weighted_squares):
         raise Code.POOR_FIT.error("points behind the camera")
     return adjusted

@@ -103,12 +103,12 @@ def find_strays(
     if not is_lens_fitted and any(squares.any() for squares in squares_of_views):
         equations = _refit_lens(equations, [squares == 0 for squares in squares_of_views])
         squares_of_views = _stray_squares_of_views(equations, used)
-    outliers = []
+    strays = []
     for view_index, (equation, squares) in enumerate(zip(equations, squares_of_views, strict=True)):
         for row in np.flatnonzero(squares).tolist():
             distance = float(equation.deviations[row]) * math.sqrt(squares[row])
-            outliers.append(Stray(view_index, row, int(fitted[view_index].view.ids[row]), distance))
-    return outliers
+            strays.append(Stray(view_index, row, int(fitted[view_index].view.ids[row]), distance))
+    return strays
 
 
 def _refit_lens(equations: Sequence[Equations], kept_masks: Sequence[Mask]) -> list[Equations]:
@@ -171,12 +171,12 @@ def _stray_squares_of_views(equations: Sequence[Equations], used: Sequence[bool]
     ]
 
 
-def remove_points(views: Sequence[TargetView], outliers: Sequence[Stray]) -> list[TargetView]:
-    """Return the views without the ``outliers``."""
+def remove_points(views: Sequence[TargetView], strays: Sequence[Stray]) -> list[TargetView]:
+    """Return the views without the ``strays``."""
     cleaned = list(views)
-    for view_index, group in itertools.groupby(outliers, key=lambda outlier: outlier.view_index):
+    for view_index, group in itertools.groupby(strays, key=lambda stray: stray.view_index):
         view = views[view_index]
-        rows = np.setdiff1d(np.arange(len(view.ids)), [outlier.row for outlier in group])
+        rows = np.setdiff1d(np.arange(len(view.ids)), [stray.row for stray in group])
         cleaned[view_index] = dataclasses.replace(
             view,
             ids=view.ids[rows],
@@ -186,26 +186,24 @@ def remove_points(views: Sequence[TargetView], outliers: Sequence[Stray]) -> lis
     return cleaned
 
 
-def stray_remarks(
-    outliers: Sequence[Stray], names: Sequence[str], outcome: str
-) -> Iterator[Remark]:
+def stray_remarks(strays: Sequence[Stray], names: Sequence[str], outcome: str) -> Iterator[Remark]:
     """Yield remarks on strays in views with these names; ``outcome``: what was done, in words."""
-    view_counts = collections.Counter(outlier.point_id for outlier in outliers)
+    view_counts = collections.Counter(stray.point_id for stray in strays)
     frequent_ids = {
         point_id for point_id, count in view_counts.items() if count >= max(3, len(names) / 2)
     }
     for point_id in sorted(frequent_ids):
-        distances = [outlier.distance for outlier in outliers if outlier.point_id == point_id]
+        distances = [stray.distance for stray in strays if stray.point_id == point_id]
         yield Code.OUTLIER.remark(
             f"point {point_id} of the target is {np.median(distances):.3g} pixels off in "
             f"{len(distances)} of {len(names)} views: it is not at its nominal place, "
             f"or something is taken for it; it {outcome} there"
         )
-    others = [outlier for outlier in outliers if outlier.point_id not in frequent_ids]
+    others = [stray for stray in strays if stray.point_id not in frequent_ids]
     if others:
         descriptions = [
-            f"{outlier.point_id} in {names[outlier.view_index]} ({outlier.distance:.3g} pixels)"
-            for outlier in others
+            f"{stray.point_id} in {names[stray.view_index]} ({stray.distance:.3g} pixels)"
+            for stray in others
         ]
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
@@ -238,13 +236,13 @@ def remove_strays(
         FittedView(view, camera, pose.transform.rigid, view.target.points)
         for view, pose in zip(views, poses, strict=True)
     ]
-    outliers = find_strays(fitted, extra_variance, [True] * len(fitted), is_lens_fitted=False)
+    strays = find_strays(fitted, extra_variance, [True] * len(fitted), is_lens_fitted=False)
     names = [view_name(view, number) for number, view in enumerate(views)]
-    cleaned_views = remove_points(views, outliers)
+    cleaned_views = remove_points(views, strays)
     cleaned_fits = [
         fit._replace(view=view) for fit, view in zip(fitted, cleaned_views, strict=True)
     ]
-    remarks = stray_remarks(outliers, names, "was not used"), view_remarks(views, names)
+    remarks = stray_remarks(strays, names, "was not used"), view_remarks(views, names)
     lens_warnings = lens_remarks(cleaned_fits, "lens", extra_variance) if is_lens_given else ()
     return cleaned_views, [*itertools.chain(*remarks), *lens_warnings]
 
@@ -280,12 +278,12 @@ def examine_views(
         free,
     )
     fit_remarks += misfit_remarks(*misfit_arguments, list(itertools.compress(names, used)))
-    outliers = find_strays(fitted, calibration.sigma**2, used)
-    if outliers and drop_strays:
+    strays = find_strays(fitted, calibration.sigma**2, used)
+    if strays and drop_strays:
         # the new calibration already has the remarks on its own fit
-        calibration, fit_remarks = recalibrate(remove_points(views, outliers)), []
+        calibration, fit_remarks = recalibrate(remove_points(views, strays)), []
     outcome = "was not used" if drop_strays else "is used all the same"
-    remarks = stray_remarks(outliers, names, outcome)
+    remarks = stray_remarks(strays, names, outcome)
     return dataclasses.replace(
         calibration, warnings=(*remarks, *calibration.warnings, *fit_remarks)
     )
@@ -301,7 +299,7 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         yield Code.COINCIDENT.remark(
             "views that are the same to the last digit: "
             f"{_join_first(copies, '; ')}: "
-            "they count as often as they are there, and errors come out too small"
+            "each copy counts as a view of its own, so the estimated errors are too small"
         )
 
 
@@ -316,7 +314,7 @@ def _centre_remarks(calibration: IntrinsicCalibration) -> Iterator[Remark]:
         yield Code.WRONG_SIZE.remark(
             f"expected the principal point near the middle of an image of {size[0]} x {size[1]} "
             f"pixels, got ({centre[0]:.0f}, {centre[1]:.0f}): were points taken from an image of "
-            "another size? Where images are cut to a part of the sensor's, all is well"
+            "another size? If the images are a cut-out of the sensor's image, ignore this"
         )
 
 

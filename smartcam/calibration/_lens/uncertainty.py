@@ -107,21 +107,22 @@ def _rms(values: Array) -> float:
 def uncertainty(
     camera: CameraModel,
     covariance: Array,
-    gauge: Array,
+    alignment_points: Array,
     *,
     distance: float | None = None,
     shape: tuple[int, int] = DEFAULT_MAP_SHAPE,
 ) -> ProjectionUncertainty:
     """Return the map of a lens' uncertainty, from the covariance of the lens' values.
 
-    ``gauge``: (N, 3), points in the camera's frame that the motion is fitted to. Other arguments
-    and errors: as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
+    ``alignment_points``: (N, 3), points in the camera's frame; a change of the lens that a motion
+    of the camera explains at them is left out. Other arguments and errors: as in
+    :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     check_distance(distance)
     pixels = map_pixels(camera.size, shape)
     points = points_of_pixels(camera, pixels.reshape(-1, 2), distance)
     field = sensitivity(camera, points, at_infinity=distance is None)
-    by_lens = field.without_motion(sensitivity(camera, finite_points(gauge)))
+    by_lens = field.without_motion(sensitivity(camera, finite_points(alignment_points)))
     return ProjectionUncertainty(
         size=camera.size,
         distance=distance,

@@ -13,7 +13,12 @@ import numpy as np
 from smartcam._argument_checks import a_list, check_arguments, each
 from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust_weighted, camera_covariance
+from smartcam.calibration._lens.bundle import (
+    Bundle,
+    Observation,
+    adjust_weighted,
+    camera_covariance,
+)
 from smartcam.calibration._lens.intrinsics import (
     BAD_VIEW_RATIO,
     MAX_BAD_VIEW_SHARE,
@@ -33,8 +38,8 @@ from smartcam.calibration._stereo.start import (
     RIGHT,
     SIDES,
     Lenses,
-    Moment,
-    as_moments,
+    ViewPair,
+    as_view_pairs,
     guess_start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
@@ -244,12 +249,12 @@ class StereoCalibration(storage.SavedCalibration):
             CalibrationError: ``SHAPE``: lists of different lengths; ``WRONG_SIZE``; ``TOO_FEW``,
                 ``COLLINEAR``, ``NOT_FINITE``: a view is unusable; ``DIFFERENT_TARGETS``.
         """
-        moments = as_moments(left_views, right_views)
+        view_pairs = as_view_pairs(left_views, right_views)
         for side, camera in enumerate((self.left, self.right)):
-            for moment in moments:
-                if (view := moment[side]) is not None:
+            for view_pair in view_pairs:
+                if (view := view_pair[side]) is not None:
                     check_view(view, camera.size)
-        return tuple(self._view_errors(*moment) for moment in moments)
+        return tuple(self._view_errors(*view_pair) for view_pair in view_pairs)
 
     def _view_errors(self, left: TargetView | None, right: TargetView | None) -> PairErrors:
         if left is None or right is None:
@@ -349,11 +354,11 @@ def calibrate_stereo(
             camera; ``SWAPPED_LENSES``: ``left`` is the right camera's, and ``right`` the left
             one's.
     """
-    moments = as_moments(left_views, right_views)
-    check_pairs(moments, (left, right))
+    view_pairs = as_view_pairs(left_views, right_views)
+    check_pairs(view_pairs, (left, right))
     check_choice(sheet, get_args(SheetOption), "sheet")
     min_pairs = MIN_PAIRS if left and right else MIN_VIEWS
-    complete = [number for number, moment in enumerate(moments) if None not in moment]
+    complete = [number for number, view_pair in enumerate(view_pairs) if None not in view_pair]
     if len(complete) < min_pairs:
         raise Code.TOO_FEW.error_with_value(
             f"stereo: expected {min_pairs} pairs or more in which both cameras see the target",
@@ -361,37 +366,41 @@ def calibrate_stereo(
             len(complete),
         )
     lenses = Lenses((left, right), distortion_model, tuple(as_list(fixed, str, "fixed: name")))
-    moments, bundle, mismatched = guess_start(moments, lenses)
-    sights = [
-        Sight(side, number, view)
-        for number, moment in enumerate(moments)
-        for side, view in enumerate(moment)
+    view_pairs, bundle, mismatched = guess_start(view_pairs, lenses)
+    observations = [
+        Observation(side, number, view)
+        for number, view_pair in enumerate(view_pairs)
+        for side, view in enumerate(view_pair)
         if view is not None
     ]
-    max_bad, bad = MAX_BAD_VIEW_SHARE * len(sights), list[Sight]()
-    bad += [sight for sight in sights if sight.camera == 1 and sight.pose in mismatched]
-    others = [sight for sight in sights if sight not in bad]
+    max_bad, bad = MAX_BAD_VIEW_SHARE * len(observations), list[Observation]()
+    bad += [
+        observation
+        for observation in observations
+        if observation.camera_index == 1 and observation.pose_index in mismatched
+    ]
+    others = [observation for observation in observations if observation not in bad]
     if (
         drop_bad
         and len(bad) <= MAX_BAD_VIEW_SHARE * len(complete)
         and len(_complete_pairs(others)) >= min_pairs
     ):
-        sights = others
+        observations = others
     while True:
-        adjusted = adjust_weighted(bundle, sights)
+        adjusted = adjust_weighted(bundle, observations)
         if not math.isfinite(adjusted.weighted_squares):
             raise Code.POOR_FIT.error(
                 "stereo: expected cameras that show the pairs as they are, got points behind one"
             )
-        worst, ratio = worst_view([sight.view for sight in sights], adjusted)
+        worst, ratio = worst_view([observation.view for observation in observations], adjusted)
         if ratio <= BAD_VIEW_RATIO:
             break
-        if sights[worst] not in bad:
-            bad.append(sights[worst])
-        others = sights[:worst] + sights[worst + 1 :]
+        if observations[worst] not in bad:
+            bad.append(observations[worst])
+        others = observations[:worst] + observations[worst + 1 :]
         if not drop_bad or len(bad) > max_bad or len(_complete_pairs(others)) < min_pairs:
             break
-        sights, bundle = others, adjusted.bundle
+        observations, bundle = others, adjusted.bundle
     recalibrate = functools.partial(
         calibrate_stereo,
         left=left,
@@ -402,23 +411,26 @@ def calibrate_stereo(
         drop_bad=drop_bad,
     )
     calibration = _build_calibration(
-        _StereoSolution(moments, sights, bad, adjusted, min_pairs, mismatched), sheet
+        _StereoSolution(view_pairs, observations, bad, adjusted, min_pairs, mismatched), sheet
     )
     return examine_pairs(calibration, recalibrate, known=(left, right), drop_strays=drop_bad)
 
 
-def _complete_pairs(sights: Sequence[Sight]) -> list[int]:
+def _complete_pairs(observations: Sequence[Observation]) -> list[int]:
     """Return the indices of the moments at which both cameras see the target."""
-    sides = [{sight.pose for sight in sights if sight.camera == side} for side in range(2)]
+    sides = [
+        {observation.pose_index for observation in observations if observation.camera_index == side}
+        for side in range(2)
+    ]
     return sorted(sides[0] & sides[1])
 
 
 class _StereoSolution(NamedTuple):
     """The fit from which a calibration is built."""
 
-    moments: list[Moment]  # all views, the right ones numbered as the left ones
-    sights: list[Sight]  # used views
-    bad: list[Sight]  # views that fit badly, whether used or not
+    view_pairs: list[ViewPair]  # all views, the right ones numbered as the left ones
+    observations: list[Observation]  # used views
+    bad: list[Observation]  # views that fit badly, whether used or not
     adjusted: AdjustedBundle  # fitted cameras
     min_pairs: int  # number of pairs that are needed
     # moments whose views do not belong together, as in :class:`FirstGuess`
@@ -426,7 +438,7 @@ class _StereoSolution(NamedTuple):
 
     def pair(self, number: int) -> tuple[TargetView, TargetView]:
         """Return the views of a moment that both cameras see."""
-        left, right = self.moments[number]
+        left, right = self.view_pairs[number]
         if left is None or right is None:
             raise KeyError(number)
         return left, right
@@ -436,7 +448,7 @@ def _held_out_errors(
     solution: _StereoSolution, left_out: Sequence[LeftOut]
 ) -> dict[int, PairErrors]:
     """Return the errors of each pair, with cameras that were fitted without this pair."""
-    pairs = _complete_pairs(solution.sights)
+    pairs = _complete_pairs(solution.observations)
     if len(pairs) <= solution.min_pairs:
         return {}
     return {
@@ -452,8 +464,8 @@ def _camera_pair(bundle: Bundle) -> CameraPair:
 
 
 def _build_calibration(solution: _StereoSolution, sheet: SheetOption) -> StereoCalibration:
-    check_fit(solution.adjusted.rms, solution.sights, solution.bad)
-    sheet_fit = choose_shape(solution.adjusted, solution.sights, sheet)
+    check_fit(solution.adjusted.rms, solution.observations, solution.bad)
+    sheet_fit = choose_shape(solution.adjusted, solution.observations, sheet)
     adjusted = sheet_fit.adjusted
     solution, held_out_errors = (
         solution._replace(adjusted=adjusted),
@@ -461,13 +473,15 @@ def _build_calibration(solution: _StereoSolution, sheet: SheetOption) -> StereoC
     )
     cameras = _camera_pair(adjusted.bundle)
     epipolar = [
-        pair_errors(cameras, *solution.pair(n)).epipolar for n in _complete_pairs(solution.sights)
+        pair_errors(cameras, *solution.pair(n)).epipolar
+        for n in _complete_pairs(solution.observations)
     ]
     calibration = StereoCalibration(
         **cameras._asdict(),
         covariance=camera_covariance(adjusted, sheet_fit.left_out)[-6:, -6:],
         pairs=tuple(
-            _pair_fit(solution, number, held_out_errors) for number in range(len(solution.moments))
+            _pair_fit(solution, number, held_out_errors)
+            for number in range(len(solution.view_pairs))
         ),
         rms=adjusted.rms,
         sigma=math.sqrt(adjusted.extra_variance),
@@ -490,12 +504,14 @@ def _pair_fit(
     solution: _StereoSolution, number: int, held_out_errors: Mapping[int, PairErrors]
 ) -> PairFit:
     rms = {
-        sight.camera: _rms([residuals])
-        for sight, residuals in zip(solution.sights, solution.adjusted.residuals, strict=True)
-        if sight.pose == number
+        observation.camera_index: _rms([residuals])
+        for observation, residuals in zip(
+            solution.observations, solution.adjusted.residuals, strict=True
+        )
+        if observation.pose_index == number
     }
     pose = Transform(LEFT, TARGET, *solution.adjusted.bundle.poses.subset(number))
-    left, right = solution.moments[number]
+    left, right = solution.view_pairs[number]
     errors = held_out_errors.get(number)
     return PairFit(
         left=left,
@@ -511,18 +527,18 @@ def _pair_fit(
 def _remarks(
     calibration: StereoCalibration, solution: _StereoSolution, sheet_remarks: list[Remark]
 ) -> Iterator[Remark]:
-    for bad_sight in solution.bad:
-        is_used = any(bad_sight is sight for sight in solution.sights)
+    for bad in solution.bad:
+        is_used = any(bad is observation for observation in solution.observations)
         outcome = "is used all the same" if is_used else "was not used"
         reason = f"fits more than {BAD_VIEW_RATIO:g} times worse than the others"
-        if bad_sight.camera == 1 and bad_sight.pose in solution.mismatched:
-            pixels = solution.mismatched[bad_sight.pose]
+        if bad.camera_index == 1 and bad.pose_index in solution.mismatched:
+            pixels = solution.mismatched[bad.pose_index]
             distance = f"{pixels:.3g} pixels off" if math.isfinite(pixels) else "nowhere near"
             reason = (
                 f"is {distance} where the left view and the other pairs have it: the two are of "
                 "different moments, or swapped"
             )
-        name = f"{view_name(bad_sight.view, bad_sight.pose)}, {SIDES[bad_sight.camera]}"
+        name = f"{view_name(bad.view, bad.pose_index)}, {SIDES[bad.camera_index]}"
         yield Code.BAD_VIEW.remark(f"{name}: {reason}; it {outcome}")
     if calibration.rms > POOR_FIT_RMS_PX:
         yield Code.POOR_FIT.remark(
@@ -534,8 +550,8 @@ def _remarks(
     yield from sheet_remarks
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{len(_complete_pairs(solution.sights))} pairs are no more than the cameras have need "
-            "of: none can be left out to see how good they are"
+            f"{len(_complete_pairs(solution.observations))} pairs are just enough for the fit: "
+            "with more pairs, the cameras could be tested with pairs that were not used to fit them"
         )
 
 

@@ -34,9 +34,9 @@ from smartcam.geometry._inside import Code, Remark
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from smartcam.calibration._lens.bundle import Sight
+    from smartcam.calibration._lens.bundle import Observation
     from smartcam.calibration._stereo.calibration import StereoCalibration
-    from smartcam.calibration._stereo.start import Moment
+    from smartcam.calibration._stereo.start import ViewPair
     from smartcam.calibration._views import TargetView
     from smartcam.geometry import Transform
     from smartcam.geometry._inside import Array
@@ -63,7 +63,7 @@ RIGHT_ANGLE_TRACE: Final = 1.0
 """Trace of a rotation by a right angle."""
 
 
-def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]) -> None:
+def check_pairs(view_pairs: Sequence[ViewPair], known: tuple[CameraModel | None, ...]) -> None:
     """Refuse pairs that one camera took, and known lenses that were given for the wrong sides.
 
     Raises ``COINCIDENT`` if an image is given for both sides, and ``SWAPPED_LENSES``.
@@ -72,7 +72,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         check_type(lens, (CameraModel, type(None)), f"stereo: {side}")
     pairs = [
         (number, left, right)
-        for number, (left, right) in enumerate(moments)
+        for number, (left, right) in enumerate(view_pairs)
         if left is not None and right is not None
     ]
     for number, left, right in pairs:
@@ -154,22 +154,32 @@ def examine_pairs(
         [pair.right for pair in calibration.pairs],
     ]
     side_views = list(_side_views(calibration))
-    fitted, used = [sight.fitted for sight in side_views], [sight.used for sight in side_views]
+    fitted, used = (
+        [observation.fitted for observation in side_views],
+        [observation.used for observation in side_views],
+    )
     names = [
-        f"{view_name(sight.fitted.view, sight.pair)}, {SIDES[sight.side]}" for sight in side_views
+        f"{view_name(observation.fitted.view, observation.pair)}, {SIDES[observation.side]}"
+        for observation in side_views
     ]
     fit_remarks = list(view_remarks([fit.view for fit in fitted], names))
     for side, name in enumerate(SIDES):
         if known[side] is not None:
-            fits = [sight.fitted for sight in side_views if sight.used and sight.side == side]
+            fits = [
+                observation.fitted
+                for observation in side_views
+                if observation.used and observation.side == side
+            ]
             fit_remarks += lens_remarks(fits, f"{name} lens", calibration.sigma**2)
     pairs = [
-        list(group) for _, group in itertools.groupby(side_views, key=lambda sight: sight.pair)
+        list(group)
+        for _, group in itertools.groupby(side_views, key=lambda observation: observation.pair)
     ]
     complete = [
-        sights_of_pair
-        for sights_of_pair in pairs
-        if len(sights_of_pair) == 2 and all(sight.used for sight in sights_of_pair)
+        observations_of_pair
+        for observations_of_pair in pairs
+        if len(observations_of_pair) == 2
+        and all(observation.used for observation in observations_of_pair)
     ]
     free = np.zeros(UNKNOWN_COUNT, dtype=np.bool_)
     free[LENS], free[RIGHT_LENS] = (lens is None for lens in known)
@@ -185,10 +195,10 @@ def examine_pairs(
     )
     outliers = find_strays(fitted, calibration.sigma**2, used)
     if outliers and drop_strays:
-        for sight, view in zip(
+        for observation, view in zip(
             side_views, remove_points([fit.view for fit in fitted], outliers), strict=True
         ):
-            views_by_side[sight.side][sight.pair] = view
+            views_by_side[observation.side][observation.pair] = view
         # the new calibration already has the remarks on its own fit
         calibration, fit_remarks = recalibrate(*views_by_side), []
     outcome = "was not used" if drop_strays else "is used all the same"
@@ -226,17 +236,20 @@ def _side_views(calibration: StereoCalibration) -> Iterator[_SideView]:
                 )
 
 
-def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None:
+def check_fit(rms: float, observations: Sequence[Observation], bad: Sequence[Observation]) -> None:
     """Raise ``POOR_FIT`` if the views of pairs do not belong together.
 
-    ``rms``: RMS of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
-    views that fit worst.
+    ``rms``: RMS of a coordinate of the residuals, pixels. ``observations``: the used views.
+    ``bad``: the views that fit worst.
     """
-    max_rms = max_plausible_rms([sight.view for sight in sights], MAX_RMS_PX, MAX_RMS_SHARE)
+    max_rms = max_plausible_rms(
+        [observation.view for observation in observations], MAX_RMS_PX, MAX_RMS_SHARE
+    )
     if rms <= max_rms:
         return
     names = ", ".join(
-        f"{view_name(sight.view, sight.pose)} ({SIDES[sight.camera]})" for sight in bad
+        f"{view_name(observation.view, observation.pose_index)} ({SIDES[observation.camera_index]})"
+        for observation in bad
     )
     raise Code.POOR_FIT.error(
         "stereo: expected cameras that show the pairs as they are, got residuals of "

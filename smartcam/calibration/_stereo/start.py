@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, empty_basis
+from smartcam.calibration._lens.bundle import Bundle, Observation, adjust, empty_basis
 from smartcam.calibration._lens.intrinsics import check_tilts, check_views
 from smartcam.calibration._lens.poses import half_turn, half_turned, likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
@@ -57,13 +57,13 @@ class Lenses(NamedTuple):
         return lens_basis(self.model, self.fixed) if known is None else empty_basis(known)
 
 
-Moment: TypeAlias = tuple["TargetView | None", "TargetView | None"]
+ViewPair: TypeAlias = tuple["TargetView | None", "TargetView | None"]
 """Views of the target by both cameras at one time."""
 
 
-def as_moments(
+def as_view_pairs(
     left_views: Sequence[TargetView | None], right_views: Sequence[TargetView | None]
-) -> list[Moment]:
+) -> list[ViewPair]:
     """Return the views as pairs.
 
     Raises ``SHAPE``: the lists have different lengths; ``DIFFERENT_TARGETS`` or ``WRONG_SIZE``:
@@ -82,8 +82,8 @@ def as_moments(
         )
     for side, views in zip(SIDES, (left_views, right_views), strict=True):
         check_views([view for view in views if view is not None], f"{side} camera", 1)
-    moments = list(zip(left_views, right_views, strict=True))
-    for left, right in moments:
+    view_pairs = list(zip(left_views, right_views, strict=True))
+    for left, right in view_pairs:
         if left is not None and right is not None and left.target != right.target:
             raise Code.DIFFERENT_TARGETS.error(
                 f"stereo: expected views of one target, {left.target}, got {right.target} on the "
@@ -91,41 +91,41 @@ def as_moments(
                 left.target,
                 right.target,
             )
-    return moments
+    return view_pairs
 
 
 class FirstGuess(NamedTuple):
     """A first guess of lenses, transform and poses, with the views numbered alike."""
 
-    moments: list[Moment]  # the right views numbered as the left ones are
+    view_pairs: list[ViewPair]  # the right views numbered as the left ones are
     bundle: Bundle  # lenses, transform and poses
     # moments whose views do not belong together, with the distance, pixels, of the right view from
     # its prediction by the left view and the other pairs; infinite behind the camera
     mismatched: dict[int, float]
 
 
-def guess_start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
+def guess_start(view_pairs: list[ViewPair], lenses: Lenses) -> FirstGuess:
     """Return a first guess of lenses, transform and poses.
 
     Raises ``POOR_FIT`` if no lens or no transform fits the views; ``INSUFFICIENT_ROTATION``;
     ``WRONG_SIZE`` if views are from another camera than the known one.
     """
     (left, left_poses), (right, right_poses) = (
-        _fit_side(moments, side, lenses) for side in range(2)
+        _fit_side(view_pairs, side, lenses) for side in range(2)
     )
     poses: list[Poses] = list(zip(left_poses, right_poses, strict=True))
-    target = next(view.target for moment in moments for view in moment if view is not None)
+    target = next(view.target for view_pair in view_pairs for view in view_pair if view is not None)
     turns = [IDENTITY]
     if target.half_turn_symmetric:
         turns.append(half_turn(target))
-    rig, mismatched, renumbered = _guess_rig(moments, poses, right, turns)
+    rig, mismatched, renumbered = _guess_rig(view_pairs, poses, right, turns)
     for moment_index in renumbered:
         (left_pose, right_pose), (left_view, right_view) = (
             poses[moment_index],
-            moments[moment_index],
+            view_pairs[moment_index],
         )
         if right_pose is not None and right_view is not None:
-            moments[moment_index], poses[moment_index] = (
+            view_pairs[moment_index], poses[moment_index] = (
                 (left_view, half_turned(right_view)),
                 (left_pose, right_pose @ turns[1]),
             )
@@ -135,7 +135,7 @@ def guess_start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
     )
     basis = lenses.basis(0), lenses.basis(1)
     return FirstGuess(
-        moments, Bundle((left, right), Rigid.stack([rig]), target_poses, basis), mismatched
+        view_pairs, Bundle((left, right), Rigid.stack([rig]), target_poses, basis), mismatched
     )
 
 
@@ -143,27 +143,29 @@ Poses: TypeAlias = tuple["Rigid | None", "Rigid | None"]
 
 
 def _fit_side(
-    moments: list[Moment], side: int, lenses: Lenses
+    view_pairs: list[ViewPair], side: int, lenses: Lenses
 ) -> tuple[CameraModel, list[Rigid | None]]:
     """Return one side's lens, and the target's pose at each moment."""
-    moment_indices = [index for index, moment in enumerate(moments) if moment[side] is not None]
-    views = [view for moment in moments if (view := moment[side]) is not None]
+    moment_indices = [
+        index for index, view_pair in enumerate(view_pairs) if view_pair[side] is not None
+    ]
+    views = [view for view_pair in view_pairs if (view := view_pair[side]) is not None]
     known, label = lenses.known[side], f"{SIDES[side]} camera"
     if known is None:
         adjusted = fit_lens(views, lenses.model, lenses.fixed)
         check_tilts(adjusted, label)
     else:
         check_views(views, label, 1, known.size)
-        sights = [Sight(0, index, view) for index, view in enumerate(views)]
-        adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
-    poses: list[Rigid | None] = [None] * len(moments)
+        observations = [Observation(0, index, view) for index, view in enumerate(views)]
+        adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), observations, 0.0)
+    poses: list[Rigid | None] = [None] * len(view_pairs)
     for pose_index, index in enumerate(moment_indices):
         poses[index] = adjusted.bundle.poses.subset(pose_index)
     return adjusted.bundle.cameras[0], poses
 
 
 def _guess_rig(
-    moments: list[Moment], poses: list[Poses], right: CameraModel, turns: Sequence[Rigid]
+    view_pairs: list[ViewPair], poses: list[Poses], right: CameraModel, turns: Sequence[Rigid]
 ) -> tuple[Rigid, dict[int, float], list[int]]:
     """Return the transform that fits most of the pairs, and the distances of pairs that do not fit.
 
@@ -172,9 +174,11 @@ def _guess_rig(
     fits, since a camera may be upside down. Raises ``POOR_FIT``.
     """
     pairs = [
-        (number, in_left, in_right, moment[1])
-        for number, ((in_left, in_right), moment) in enumerate(zip(poses, moments, strict=True))
-        if in_left is not None and in_right is not None and moment[1] is not None
+        (number, in_left, in_right, view_pair[1])
+        for number, ((in_left, in_right), view_pair) in enumerate(
+            zip(poses, view_pairs, strict=True)
+        )
+        if in_left is not None and in_right is not None and view_pair[1] is not None
     ]
     best_guess, least_median, distances = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
     sampled = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]

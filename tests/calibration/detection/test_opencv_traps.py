@@ -75,7 +75,7 @@ def test_trap_turns_about_one_axis_are_refused_by_each_method(name: str) -> None
         type(one)(one.target, one.source, about_z(0.2 * i) @ poses[0].rotation, one.translation)
         for i, one in enumerate(poses)
     ]
-    with refused(Code.INSUFFICIENT_ROTATION, "along a single axis"):
+    with refused(Code.INSUFFICIENT_ROTATION, "about a single axis"):
         calibrate_hand_eye(turned, views, setup="eye-in-hand", camera=CAMERA, method=name)
 
 

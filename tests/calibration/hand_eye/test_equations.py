@@ -16,7 +16,7 @@ from smartcam.calibration import CameraModel, RobotSigmas
 from smartcam.calibration._hand_eye.robot_noise import adjust_with_noise
 from smartcam.geometry._inside import Rigid, exp_rotation
 from tests.calibration.inside import (
-    LINEAR,
+    OPENCV_METHODS,
     Observations,
     PixelObservations,
     PoseObservations,
@@ -28,7 +28,7 @@ from tests.calibration.inside import (
     check_motion,
     leave_each_out,
     predicted_views,
-    solve_linear,
+    solve_closed_form,
     view_products,
 )
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
@@ -196,7 +196,7 @@ def test_noise_of_the_robot_is_told() -> None:
     found = adjust_with_noise(said, blurred, Solution(camera, target))
     assert found.noise is not None
     np.testing.assert_allclose(found.noise.robot, sigmas, rtol=0.3)
-    assert found.noise.shared == pytest.approx(1.0, abs=0.8)
+    assert found.noise.view_error_factor == pytest.approx(1.0, abs=0.8)
 
 
 @pytest.mark.parametrize("free", [(), (0,), (1, 2, 3, 4)])
@@ -226,7 +226,9 @@ def test_closed_forms_of_many_poses_begin_with_some_of_them() -> None:
     off = np.random.default_rng(7).normal(scale=1e-4, size=(60, 6))
     said = RobotPoses(robot.poses.turned_in_source(off), in_hand=True)
     for name in ("park", "shah"):
-        some, whole = (solve_linear(name, said, seen, use_all_views=one) for one in (False, True))
+        some, whole = (
+            solve_closed_form(name, said, seen, use_all_views=one) for one in (False, True)
+        )
         assert some is not None
         assert whole is not None
         same = np.array_equal(some[0].translation, whole[0].translation)
@@ -250,15 +252,15 @@ def test_noise_that_a_views_points_share_is_told() -> None:
     blurred = dataclasses.replace(observed, pixels=shown)
     found = adjust_with_noise(robot, blurred, Solution(camera, target))
     assert found.noise is not None
-    assert found.noise.shared > 3.0
+    assert found.noise.view_error_factor > 3.0
     assert found.noise.robot.translation < 2e-4
 
 
 @pytest.mark.parametrize("in_hand", [True, False])
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", OPENCV_METHODS)
 def test_closed_forms_of_exact_samples_find_the_truth(name: str, in_hand: bool) -> None:
     robot, camera, target, seen = problem(in_hand)
-    found = solve_linear(name, robot, seen)
+    found = solve_closed_form(name, robot, seen)
     assert found is not None
     np.testing.assert_allclose(found[0].rotation, camera.rotation, atol=1e-6)
     np.testing.assert_allclose(found[0].translation, camera.translation, atol=1e-6)
@@ -271,7 +273,7 @@ def test_closed_forms_are_the_ones_that_were_named() -> None:
     shaken = RobotPoses(
         robot.poses.turned_in_source(np.random.default_rng(5).normal(scale=1e-3, size=(7, 6))), True
     )
-    found = {name: solve_linear(name, shaken, seen) for name in LINEAR}
+    found = {name: solve_closed_form(name, shaken, seen) for name in OPENCV_METHODS}
     places = {tuple(one[0].translation.round(9)) for one in found.values() if one is not None}
     assert len(places) >= 6
     trap = cv2.calibrateHandEye(  # type: ignore[call-overload]
@@ -291,8 +293,8 @@ def test_closed_forms_that_give_no_rotation_give_nothing() -> None:
     same = RobotPoses(Rigid(robot.poses.rotation[[0] * 7], robot.poses.translation), True)
     still = Rigid(seen.rotation[[0] * 7], seen.translation)
     with np.errstate(all="ignore"):
-        for name in LINEAR:
-            found = solve_linear(name, same, still)
+        for name in OPENCV_METHODS:
+            found = solve_closed_form(name, same, still)
             if found is not None:
                 assert np.isfinite(found[0].translation).all()
 

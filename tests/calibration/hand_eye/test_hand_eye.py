@@ -353,7 +353,7 @@ def test_hand_eye_refuses_a_print_of_quite_another_size(setup: Setup, factor: fl
 @pytest.mark.parametrize("setup", ONE_LONG)
 def test_hand_eye_finds_a_print_of_any_size_that_is_allowed(setup: Setup) -> None:
     poses, views = printed(setup, 1.27)
-    found = calibrate_hand_eye(poses, views, setup=setup, camera=CAMERA, most_scale=0.3)
+    found = calibrate_hand_eye(poses, views, setup=setup, camera=CAMERA, max_scale_error=0.3)
     assert found.target_scale == pytest.approx(1 / 1.27, rel=0.01)
     assert Code.SCALE_MISMATCH in {one.code for one in found.warnings}
     assert scene(setup, poses=10).errors(found.camera_pose)[1] < 2e-3
@@ -648,7 +648,9 @@ def test_to_plane_of_raised_features_is_where_they_are() -> None:
 def test_to_plane_that_cannot_be_is_refused(exact: HandEyeCalibration) -> None:
     pose = exact.robot_poses[0]
     away = exact.camera_at(pose) @ Transform("camera", "plane", np.eye(3), np.array([0, 0, -0.5]))
-    with refused("OUT_OF_FIELD", "whose rays meet the plane before the camera, got [5.0, 6.0]"):
+    with refused(
+        "OUT_OF_FIELD", "whose rays meet the plane in front of the camera, got [5.0, 6.0]"
+    ):
         exact.to_plane([[5, 6]], plane=away, robot_pose=pose)
     if exact.setup == "eye-in-hand":
         with refused("WRONG_FRAME", "the robot's pose when the image was taken, got none"):

@@ -20,7 +20,7 @@ from smartcam.calibration import (
     calibrate_intrinsics,
 )
 from smartcam.geometry._inside import Code
-from tests.calibration.inside import LINEAR
+from tests.calibration.inside import OPENCV_METHODS
 
 pytestmark = pytest.mark.long
 
@@ -45,7 +45,7 @@ def best_closed_form(one: Recorded) -> float:
         calibrate_hand_eye(
             poses, views, setup=one.setup, camera=camera, method=name, drop_bad=False
         ).held_out_error
-        for name in LINEAR
+        for name in OPENCV_METHODS
     ]
     return min(error for error in errors if error is not None)
 
@@ -92,7 +92,7 @@ def test_poses_of_moveit_are_as_good_as_the_best_closed_form() -> None:
         method: calibrate_hand_eye_from_poses(
             poses[::2], seen[::2], setup="eye-to-hand", method=method
         ).held_out_error
-        for method in ("auto", *LINEAR)
+        for method in ("auto", *OPENCV_METHODS)
     }
     ours = errors.pop("auto")
     assert ours is not None

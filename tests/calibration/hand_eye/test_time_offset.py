@@ -81,7 +81,7 @@ def test_time_offset_of_a_robot_that_stands_still_is_not_told() -> None:
             moment = one.at + timedelta(seconds=step)
             still.add(Transform("base", "flange", *there, at=moment))
     with refused("BAD_TIME", "take pictures while the robot moves"):
-        estimate_time_offset(still, seen, setup="eye-in-hand", most=0.04)
+        estimate_time_offset(still, seen, setup="eye-in-hand", max_offset=0.04)
 
 
 def test_time_offset_says_what_it_wants() -> None:
@@ -91,7 +91,7 @@ def test_time_offset_says_what_it_wants() -> None:
     with refused("BAD_TIME", "view 0 with a time, got none"):
         estimate_time_offset(history, [seen[0].undated(), *seen[1:]], setup="eye-in-hand")
     with refused("BAD_TIME", "nothing is extrapolated"):
-        estimate_time_offset(history, seen, setup="eye-in-hand", most=5.0)
+        estimate_time_offset(history, seen, setup="eye-in-hand", max_offset=5.0)
     for setup in ("eye_in_hand", "", None, ["eye-in-hand"]):
         with refused("SHAPE", "setup: expected one of ['eye-in-hand', 'eye-to-hand'], got"):
             estimate_time_offset(history, seen, setup=setup)  # type: ignore[arg-type]

@@ -111,7 +111,7 @@ def test_hand_eye_of_two_exchanged_poses_leaves_both_out() -> None:
         found.camera_pose.translation, rest.camera_pose.translation, rtol=1e-7
     )
     assert [one.code for one in found.warnings] == [Code.BAD_VIEW] * 2
-    assert "it belongs to another view, or numbers the target" in found.warnings[0].text
+    assert "it was paired with a wrong view, or its view" in found.warnings[0].text
 
 
 @pytest.mark.judged

@@ -11,7 +11,7 @@ import numpy as np
 from smartcam.calibration import CameraModel, IntrinsicCalibration, Transform
 from smartcam.geometry._inside import Rigid, exp_rotation
 from tests.calibration import lenskit
-from tests.calibration.inside import Coverage, ViewFit, linearize, pose_changes
+from tests.calibration.inside import Coverage, ViewFit, linearize, pixels_by_pose
 
 if TYPE_CHECKING:
     from smartcam.calibration import TargetView
@@ -59,7 +59,7 @@ class Bench:
             row[:, : self.values] = at.by_lens.reshape(-1, self.values)
             place = self.values + 6 * number
             turned = view.object_points @ pose.rotation.T
-            row[:, place : place + 6] = pose_changes(at.by_point, turned).reshape(-1, 6)
+            row[:, place : place + 6] = pixels_by_pose(at.by_point, turned).reshape(-1, 6)
             rows.append(row)
         jacobian = np.concatenate(rows)
         scale = np.linalg.norm(jacobian, axis=0)

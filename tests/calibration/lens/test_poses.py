@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from smartcam import CalibrationError
 from smartcam.calibration import Transform, locate
 from smartcam.geometry._inside import Code, exp_rotation
-from tests.calibration.inside import excess_variance, linearize, pose_changes, whitening
+from tests.calibration.inside import excess_variance, linearize, pixels_by_pose, whitening
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, TURNED, WIDE, poses, seen
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def test_linearize_of_a_point_behind_the_camera_gives_nan() -> None:
 def test_pose_changes_are_those_of_a_turn_and_a_shift() -> None:
     rotation, shift = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0, 0, 0.4])
     near = POINTS @ rotation.T
-    found = pose_changes(linearize(near + shift, LEFT).by_point, near)
+    found = pixels_by_pose(linearize(near + shift, LEFT).by_point, near)
     for axis, step in enumerate(STEP * np.eye(6)):
         there, back = (
             LEFT.project(

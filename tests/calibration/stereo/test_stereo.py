@@ -18,9 +18,15 @@ from smartcam.calibration import (
     calibrate_stereo,
 )
 from smartcam.calibration._stereo.errors import spacing_errors
-from smartcam.calibration._stereo.start import Lenses, as_moments, guess_start
+from smartcam.calibration._stereo.start import Lenses, as_view_pairs, guess_start
 from smartcam.geometry._inside import Code
-from tests.calibration.inside import Sight, check_fit, half_turned, moved_to_nominal, side_remarks
+from tests.calibration.inside import (
+    Observation,
+    check_fit,
+    half_turned,
+    moved_to_nominal,
+    side_remarks,
+)
 from tests.calibration.lenskit import BOARD, LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused
 
@@ -414,8 +420,8 @@ def test_calibrate_stereo_with_a_known_lens_of_another_size_raises() -> None:
 def test_start_is_near_the_truth() -> None:
     left, right = pairs(4)
     lenses = Lenses((LEFT, RIGHT), "plumb_bob", ())
-    moments, bundle, apart = guess_start(as_moments(left, right), lenses)
-    assert [one[0] for one in moments] == left
+    view_pairs, bundle, apart = guess_start(as_view_pairs(left, right), lenses)
+    assert [one[0] for one in view_pairs] == left
     np.testing.assert_allclose(bundle.rig.rotation[0], RIG.rotation, atol=0.01)
     np.testing.assert_allclose(bundle.rig.translation[0], RIG.translation, atol=2e-3)
     assert bundle.shared_count == 6
@@ -425,7 +431,9 @@ def test_start_is_near_the_truth() -> None:
 def test_start_names_the_pair_that_does_not_belong_together() -> None:
     left, right = pairs(6)
     views = [*right[:4], right[0], right[5]]
-    _, bundle, apart = guess_start(as_moments(left, views), Lenses((LEFT, RIGHT), "plumb_bob", ()))
+    _, bundle, apart = guess_start(
+        as_view_pairs(left, views), Lenses((LEFT, RIGHT), "plumb_bob", ())
+    )
     assert list(apart) == [4]
     assert apart[4] > 50
     np.testing.assert_allclose(bundle.rig.translation[0], RIG.translation, atol=2e-3)
@@ -436,18 +444,18 @@ def test_start_names_the_pair_that_does_not_belong_together() -> None:
 
 def test_check_fit_of_more_pixels_than_can_be_names_the_worst_views() -> None:
     left, right = pairs(2)
-    sights = [Sight(0, 0, left[0]), Sight(1, 0, right[0])]
-    check_fit(4.9, sights, [])
+    observations = [Observation(0, 0, left[0]), Observation(1, 0, right[0])]
+    check_fit(4.9, observations, [])
     with refused("POOR_FIT", "got residuals of 5.1 pixels rms, 5 at most", "worst: 01 (right)"):
-        check_fit(5.1, sights, [Sight(1, 1, right[1])])
+        check_fit(5.1, observations, [Observation(1, 1, right[1])])
 
 
 def test_check_fit_allows_more_for_less_certain_points() -> None:
     left, _ = pairs(2, sigma=0.5)
-    sights = [Sight(0, 0, left[0])]
-    check_fit(9.9, sights, [])
+    observations = [Observation(0, 0, left[0])]
+    check_fit(9.9, observations, [])
     with refused("POOR_FIT", "10 at most expected", "worst: all alike"):
-        check_fit(10.1, sights, [])
+        check_fit(10.1, observations, [])
 
 
 @pytest.mark.parametrize(
