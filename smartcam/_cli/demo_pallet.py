@@ -264,7 +264,7 @@ def _move_parts(
                 *(f"{1e3 * length:.3f}" for length in (placed_part.error, sigma)),
                 f"{math.degrees(placed_part.turned):+.3f}",
                 f"{math.degrees(part.sigma_theta):.3f}",
-                "/".join(str(1 + count) for count in pattern.at(number))
+                "/".join(str(1 + count) for count in pattern.row_column_layer(number))
                 if placed_part.taken
                 else "missed",
                 f"{1e3 * placed_part.off_place:.2f}",

@@ -332,7 +332,7 @@ class TableRobot:
         if error > MAX_GRIP_ERROR:
             return Placed(pose[0], pose[1], error, turned, False, math.nan)
         self._table.parts.remove(part)
-        row, column, layer = pattern.at(number)
+        row, column, layer = pattern.row_column_layer(number)
         true = self._pallet_pose.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
         # the part does not move in the gripper, so its offset turns with the gripper
         place = pattern[number]

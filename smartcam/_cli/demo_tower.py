@@ -288,7 +288,9 @@ def measure_top(table: TowerTable, x: float, y: float) -> BlockPose:
             f"{CAMERA_NAME}: expected a block on top of the tower, got {_region_text(top)}",
             source=CAMERA_NAME,
         )
-    measured = region_depth(depth, _without_rim(top.mask), shared=smooth.shared)
+    measured = region_depth(
+        depth, _without_rim(top.mask), correlated_pixels=smooth.correlated_pixels
+    )
     return _block_pose(sight, top, sight.camera[2] - measured.median)._replace(sigma=measured.sigma)
 
 

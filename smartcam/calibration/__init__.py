@@ -7,13 +7,14 @@
     for part in calibration.to_robot(result.value):
         ...
 
-:func:`fit_plane` takes points that camera and robot have both measured, :func:`fit_touches` takes
-the origin mark and touches of the printed rays. Other calibrations begin with images::
+:func:`fit_plane` takes points that camera and robot have both measured. :func:`fit_touches` takes
+the seen origin mark of a sheet, and points that the robot touched on the lines printed on it. Other
+calibrations begin with images::
 
     board = Checkerboard(columns=9, rows=6, square=0.025, origin_mark=True)
     views = [find_target(image, board) for image in images]
     lens = calibrate_intrinsics(views)
-    lens.held_out                              # pixels, of views that were left out
+    lens.held_out                              # rms error, pixels, in views that were left out
 
 Pixels and images are arrays: the caller takes the pictures, and talks to cameras and robots. The
 package needs the extra ``calibration``, whose libraries are imported when they are first used.

@@ -1,6 +1,7 @@
-"""Map a plane as a camera without distortion does: ``w (p, 1) = matrix (u, v, 1)``.
+"""Map points (x, y) of a plane as a camera without distortion does.
 
-The matrix is (3, 3) if the results are points in a plane, and (4, 3) if they are points in space.
+A point p is mapped by ``w (p, 1) = matrix (x, y, 1)``. The matrix is (3, 3) if the results are
+points in a plane, and (4, 3) if they are points in space.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ def fit_homography(flat: Array, pixels: Array) -> Array | None:
 
     Four points or more are needed: ``flat`` (N, 2), metres, and ``pixels`` (N, 2).
     """
-    # Each pair gives two linear equations of the nine elements, u (h3 x) = h1 x and
-    # v (h3 x) = h2 x. The singular vector of the least singular value, for normalised points, is
-    # the start of a refinement of the squares in pixels.
+    # Each pair of a point x and its pixel (u, v) gives two linear equations of the nine elements,
+    # u (h3 x) = h1 x and v (h3 x) = h2 x. The singular vector of the least singular value, for
+    # normalised points, is the start of a least-squares refinement of the distances in pixels.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, sections 4.1 and 4.4.4.
     cv2 = load("cv2")
     matrix = cv2.findHomography(flat, pixels)[0]

@@ -12,25 +12,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._least_squares import RANK_TOLERANCE, unit_diagonal
+from smartcam.calibration._least_squares import RANK_TOLERANCE, diagonal_scale
 
 if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 
-def jackknife(left_out: Array) -> Array:
+def jackknife(left_out_estimates: Array) -> Array:
     """Return the covariance (K, K) of an estimate of K values.
 
-    ``left_out`` (V, K): the estimate without each of its V views, 2 or more, or the difference of
-    this estimate to any fixed value. The covariance is NaN for values of which an estimate is NaN.
+    ``left_out_estimates`` (V, K): the estimate without each of its V views, 2 or more, or the
+    difference of this estimate to any fixed value. The covariance is NaN for values of which an
+    estimate is NaN.
     """
     # (V - 1) / V times the squares about their mean: leaving out one view changes the estimate by
     # 1 / (V - 1) of that view's difference from the mean of all views.
     # Source: Efron, The Jackknife, the Bootstrap and Other Resampling Plans (1982), section 3.
-    count = len(left_out)
+    count = len(left_out_estimates)
     if count < 2:
         raise ValueError(f"jackknife: expected 2 views or more, got {count}")
-    deviations = left_out - left_out.mean(axis=0)
+    deviations = left_out_estimates - left_out_estimates.mean(axis=0)
     covariance: Array = (count - 1) / count * deviations.T @ deviations
     return covariance
 
@@ -53,7 +54,7 @@ def weighted_jackknife(
     # in Standard Errors for Linear Regression with Multi-Stage Samples (2002).
     if not changes.size:
         return np.zeros(covariance_of_all.shape)
-    scale = unit_diagonal(covariance_of_all)
+    scale = diagonal_scale(covariance_of_all)
     values, vectors = np.linalg.eigh(covariance_of_all / np.outer(scale, scale))
     significant = values > RANK_TOLERANCE * values.max()
     root = scale[:, None] * vectors[:, significant] * np.sqrt(values[significant])

@@ -52,10 +52,10 @@ class NormalEquations(NamedTuple):
 
     cost: float  # sum of the squared residuals; infinite where there is no model
     shared: Array  # (S, S), J^T J of the shared unknowns
-    shared_right: Array  # (S,), J^T r of the shared unknowns
+    shared_right_side: Array  # (S,), J^T r of the shared unknowns
     # (P, K, K), J^T J of each pose's K unknowns; 0 for a pose that has no observation
     pose_blocks: Array
-    pose_right: Array  # (P, K), J^T r of each pose's unknowns
+    pose_right_sides: Array  # (P, K), J^T r of each pose's unknowns
     coupling: Array  # (P, K, S), J^T J between a pose's unknowns and the shared ones
 
     @classmethod
@@ -86,11 +86,11 @@ class NormalEquations(NamedTuple):
         # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
         # (1963); Triggs et al., section 6.1.
         damped = self.pose_blocks + damping * self.pose_blocks * np.eye(self.pose_blocks.shape[-1])
-        right_sides = np.concatenate([self.coupling, self.pose_right[..., None]], axis=2)
+        right_sides = np.concatenate([self.coupling, self.pose_right_sides[..., None]], axis=2)
         solved = np.asarray(np.linalg.solve(damped, right_sides), dtype=np.float64)
         complement = np.tensordot(self.coupling, solved, axes=((0, 1), (0, 1)))
         matrix = self.shared + damping * np.diag(np.diag(self.shared)) - complement[:, :-1]
-        return matrix, self.shared_right - complement[:, -1], solved[..., :-1], solved[..., -1]
+        return matrix, self.shared_right_side - complement[:, -1], solved[..., :-1], solved[..., -1]
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Return the changes of the shared unknowns (S,) and of the poses (P, K)."""
@@ -161,8 +161,8 @@ def minimize(
     return solution, normal
 
 
-def unit_diagonal(matrix: Array) -> Array:
-    """Return the divisors of a positive matrix' rows and columns that make its diagonal 1."""
+def diagonal_scale(matrix: Array) -> Array:
+    """Return the divisors of the rows and columns of a positive matrix that make its diagonal 1."""
     # Pixels, radians and metres differ by orders of magnitude; with D = diag(A)^(1/2) the condition
     # of D^-1 A D^-1 is near the least that any diagonal scaling gives.
     # Source: van der Sluis, Condition numbers and equilibration of matrices (1969).
@@ -175,7 +175,7 @@ def solve_scaled(matrix: Array, right: Array) -> Array:
     """Return the solution (S, ...) of positive equations whose unknowns have several units."""
     if not len(matrix):
         return right
-    scale = unit_diagonal(matrix)
+    scale = diagonal_scale(matrix)
     by_row = scale.reshape(-1, *[1] * (right.ndim - 1))
     scaled = matrix / np.outer(scale, scale)
     if len(matrix) > MAX_UNKNOWNS_BY_SVD:
@@ -187,7 +187,7 @@ def solve_scaled(matrix: Array, right: Array) -> Array:
 
 def inverse_scaled(matrix: Array) -> Array:
     """Return the pseudoinverse (S, S) of a positive matrix whose unknowns have several units."""
-    scale = unit_diagonal(matrix)
+    scale = diagonal_scale(matrix)
     outer = np.outer(scale, scale)
     inverse = np.linalg.pinv(matrix / outer, rcond=RANK_TOLERANCE, hermitian=True)
     return np.asarray(inverse / outer, dtype=np.float64)
@@ -195,7 +195,7 @@ def inverse_scaled(matrix: Array) -> Array:
 
 def independent_parts(covariance: Array) -> Array:
     """Return independent vectors (K, S) whose outer products add up to a covariance."""
-    scale = unit_diagonal(covariance)
+    scale = diagonal_scale(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     significant = values > COVARIANCE_RANK_TOLERANCE * values.max(initial=0.0)
     parts: Array = (vectors[:, significant] * np.sqrt(values[significant])).T * scale

@@ -94,7 +94,7 @@ class Poses(NamedTuple):
         turned = quaternion_multiply(quaternion_from_matrix(rotation), self.quaternions)
         return Poses(self.points @ rotation.T + translation, turned)
 
-    def put(self, localizations: Iterable[Localization]) -> list[Localization]:
+    def replace_poses_of(self, localizations: Iterable[Localization]) -> list[Localization]:
         """Return the localizations with these poses, in the same order, and their own headers."""
         rows = zip(localizations, self.points.tolist(), self.quaternions.tolist(), strict=True)
         return [
@@ -105,10 +105,10 @@ class Poses(NamedTuple):
 
 @runtime_checkable
 class Solver(Protocol):
-    """One part of a coordinate transformation."""
+    """One step of a coordinate transformation."""
 
     def solve(self, poses: Poses) -> Poses:
-        """Return the poses after this part; the given ones are not changed."""
+        """Return the poses after this step; the given ones are not changed."""
         ...
 
 
@@ -157,7 +157,7 @@ class RealWorldPosition:
         CalibrationError: ``NOT_RIGID``: the matrix is no rotation.
 
     Source: the thesis' ``solver_real_world_position``, 3.2.5.1. Point, normal and scale do not
-    determine the turn about the normal, so the whole rotation is given (derived).
+    determine the turn about the normal, so the whole rotation is given.
     """
 
     def __init__(self, origin: ArrayLike, rotation: ArrayLike) -> None:
@@ -351,8 +351,9 @@ class Chain:
         frame: name of the frame that the chain leads to, which :meth:`to_robot` writes into
             headers.
         camera_frame: name of the frame that localizations must come in; None for any.
-        y_down: whether the camera's y axis points down and is turned up before localizations come,
-            as :func:`smartcam.connect` does and compares; None: not known.
+        y_down: whether the camera's own y axis points down; the chain takes localizations with the
+            opposite y, as :func:`smartcam.connect` gives them (it checks this value); None: not
+            known.
     """
 
     @check_arguments(solvers=a_list)
@@ -418,7 +419,7 @@ class Chain:
     def _map_localizations(self, parts: list[Localization]) -> list[Localization]:
         check_frames(parts, self.camera_frame, "chain: ")
         mapped = []
-        for part in self.solve(Poses.of(parts)).put(parts):
+        for part in self.solve(Poses.of(parts)).replace_poses_of(parts):
             header = part.pose.header._replace(frame_id=self.frame)
             mapped.append(part._replace(pose=part.pose._replace(header=header)))
         return mapped
@@ -465,12 +466,14 @@ def chain_of(
     if calibration.model in {"affine", "homography"}:
         projection = PlaneProjection(calibration.matrix)
         return Chain([projection], frame=frame, camera_frame=camera_frame, y_down=y_down)
-    sheet = as_vector(origin, 2, "origin")
+    origin_point = as_vector(origin, 2, "origin")
     rotation = matrix_from_quaternion(quaternion_about_z(theta))
     return Chain(
         [
-            CameraPosition2D(sheet, theta, calibration.scale),
-            RealWorldPosition(calibration.transform([sheet])[0], calibration.rotation @ rotation),
+            CameraPosition2D(origin_point, theta, calibration.scale),
+            RealWorldPosition(
+                calibration.transform([origin_point])[0], calibration.rotation @ rotation
+            ),
         ],
         frame=frame,
         camera_frame=camera_frame,

@@ -12,13 +12,14 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_MOVE_SPREAD: Final = 0.2
-"""Offsets count as one common shift if none differs from their mean by more than this part of the
-mean. Without this test, calibrations were called good although the sheet was pushed by 3 to 50 mm
-before the last two to four of nine touches, or by 20 mm before the last three of fourteen views."""
+"""Offsets of left-out points are one common shift, which is reported, if none differs from their
+mean by more than this part of the mean. Without this remark, calibrations were called good although
+the sheet was pushed by 3 to 50 mm before the last two to four of nine touches, or by 20 mm before
+the last three of fourteen views."""
 
 
 class Noise(NamedTuple):
-    """The variance of the touches' noise, and its degrees of freedom."""
+    """The variance of the noise of touched points or views, and its degrees of freedom."""
 
     variance: float  # variance of one coordinate, m^2
     # degrees of freedom of the estimate that the variance comes from; None if it was given

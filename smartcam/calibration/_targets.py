@@ -268,7 +268,7 @@ class MarkerGrid:
             columns: tags along x, Kalibr's ``tagCols``.
             rows: tags along y, ``tagRows``.
             tag: side of a tag from edge to edge of its black border, metres, ``tagSize``.
-            spacing: distance between two tags as a part of ``tag``, ``tagSpacing``.
+            spacing: distance between two tags as a fraction of ``tag``, ``tagSpacing``.
             border: width of a tag's black border in modules; Kalibr prints 2.
         """
         return cls(

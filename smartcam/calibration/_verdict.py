@@ -1,6 +1,6 @@
 """Judge a calibration: its quality, its error in millimetres, and the next action.
 
-A calibration is "good" if none of its warnings has a cure (is in :data:`CURES`), if the error at
+A calibration is "good" if no warning asks for an action (none is in :data:`CURES`), if the error at
 left-out points is known, and if twice that error is at most the allowed error. The user gives the
 allowed error; the default is :data:`MAX_ERROR_SHARE` of the field. Loading a calibration that is
 not good logs a warning.
@@ -24,13 +24,13 @@ _log = logging.getLogger(__name__)
 MAX_ERROR_SHARE: Final = 0.01
 """Largest allowed error, as a part of the field, if the user gives none."""
 
-_RMS_OF_95_PERCENT: Final = 2.0
+_ERROR_95_PER_RMS: Final = 2.0
 """Twice an RMS error includes 95 of 100 errors or more, in one direction as well as in three."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationVerdict:
-    """A judgement of a calibration, or of the outcome of a wizard's step.
+    """A verdict on a calibration, or on the outcome of a wizard's step.
 
     Attributes:
         level: ``good``, ``poor`` (not good enough), or ``unknown``.
@@ -92,7 +92,7 @@ VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
 """The table :data:`CURES` for calibrations from views."""
 
 
-class Judgement(NamedTuple):
+class AdvisedVerdict(NamedTuple):
     """A verdict, and the option of a wizard's step that is advised."""
 
     verdict: CalibrationVerdict
@@ -121,7 +121,7 @@ def judge(
     cures: Mapping[Code, tuple[str, str]] = CURES,
     advice: str = "touch more points",
     where: str = "",
-) -> Judgement:
+) -> AdvisedVerdict:
     """Return the judgement of a calibration.
 
     ``held_out``: RMS error at points that were left out, mm. ``warnings``: codes and texts;
@@ -135,19 +135,19 @@ def judge(
         if code in texts:
             return poor_judgement(code, texts[code], worst=worst, cures=cures)
     if held_out is None:
-        return Judgement(
+        return AdvisedVerdict(
             CalibrationVerdict("unknown", f"Not known how good: {advice}"), option="more"
         )
-    good_for = _rounded_up(_RMS_OF_95_PERCENT * max(held_out, predicted or 0.0))
+    good_for = _rounded_up(_ERROR_95_PER_RMS * max(held_out, predicted or 0.0))
     promise = f"95 of 100 new points lie within {good_for:g} mm{where}"
     if good_for > max(allowed.error, _rounded_up(0.0)):
         text = f"Not good enough: {promise}, but {allowed.text}: {advice}"
-        return Judgement(CalibrationVerdict("poor", text), option="more")
+        return AdvisedVerdict(CalibrationVerdict("poor", text), option="more")
     if Code.SIDE_UNKNOWN in texts:
         text = f"Not known how good: say where the tool points. If y is not mirrored, {promise}"
-        return Judgement(CalibrationVerdict("unknown", text), option="side")
+        return AdvisedVerdict(CalibrationVerdict("unknown", text), option="side")
     text = f"Good for {good_for:g} mm{where}: 95 of 100 new points lie within it; {allowed.text}"
-    return Judgement(CalibrationVerdict("good", text), good_for)
+    return AdvisedVerdict(CalibrationVerdict("good", text), good_for)
 
 
 def poor_judgement(
@@ -156,13 +156,13 @@ def poor_judgement(
     *,
     worst: int = 1,
     cures: Mapping[Code, tuple[str, str]] = CURES,
-) -> Judgement:
+) -> AdvisedVerdict:
     """Return the judgement that a calibration is not good; ``text`` names the fault."""
     point_number = re.search(r"\bpoints? (\d+)", text)
     number = int(point_number[1]) if point_number else worst
     cure, option = next((pair for fault, pair in cures.items() if fault == code), _DEFAULT_CURE)
     verdict = CalibrationVerdict("poor", f"Not good enough: {cure.format(number=number)}")
-    return Judgement(verdict, option=option, number=number)
+    return AdvisedVerdict(verdict, option=option, number=number)
 
 
 def _rounded_up(value: float) -> float:

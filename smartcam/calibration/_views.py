@@ -84,7 +84,7 @@ class TargetView(storage.Stored):
     def _read(cls, fields: dict[str, Any], context: storage.Context) -> TargetView:
         if context.get("target") is None:
             raise storage.invalid_data_error(
-                context["called"], "target: expected the one that it shows", None
+                context["label"], "target: expected the one that it shows", None
             )
         return super()._read({"target": context["target"], **fields}, context)
 
@@ -150,7 +150,7 @@ def as_list(values: Any, types: type | tuple[type, ...], label: str) -> list[Any
     """Return values as a list; raise SHAPE unless each is of one of the types."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
         raise Code.SHAPE.error_with_value(
-            f"{label}: expected a list of them", "a list", describe_type(values)
+            f"{label}: expected a list", "a list", describe_type(values)
         )
     return [check_type(value, types, f"{label} {number}") for number, value in enumerate(values)]
 

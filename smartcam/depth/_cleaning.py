@@ -48,7 +48,7 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
     """
     if not (scale > 0 and math.isfinite(scale)):
         raise ConfigurationError(
-            f"depth: scale: expected metres a step above 0, got {excerpt(scale)}"
+            f"depth: scale: expected the metres of one step, above 0, got {excerpt(scale)}"
         )
     given: NDArray[Any] = as_array(depth, "depth")
     if (
@@ -112,8 +112,8 @@ class SpatialFilter:
         return smooth
 
     @property
-    def shared(self) -> float:
-        """Number of pixels with common noise after filtering, away from edges."""
+    def correlated_pixels(self) -> float:
+        """Number of pixels over which noise is correlated after filtering, away from edges."""
         reach = min(1000, math.ceil(8 / self.alpha))
         single_pass = (1 - self.alpha) ** np.abs(np.arange(-reach, reach + 1))
         kernel = single_pass = single_pass / single_pass.sum()
@@ -219,8 +219,8 @@ def fill_holes(
     Args:
         depth: (H, W), float, or uint16, which becomes metres.
         how: ``"left"``: the next depth to the left; ``"nearest"`` or ``"farthest"``: the least or
-            the largest of the eight neighbours, ring by ring. ``"farthest"`` is right near an
-            edge, where one of two cameras sees nothing.
+            the largest of the eight neighbours, ring by ring. Near an edge, where one of two
+            cameras sees nothing, ``"farthest"`` is the correct choice.
         reach: width, pixels, of the rim of a hole that is filled, 1 to 16.
         scale: metres of a step of uint16.
 

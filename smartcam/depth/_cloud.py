@@ -122,17 +122,17 @@ class Cloud:
         Raises:
             ConfigurationError: only some of the clouds have colours, or sigma.
         """
-        parts = list(clouds)
+        clouds = list(clouds)
         columns: dict[str, NDArray[Any] | None] = {}
         for name in ("colours", "sigma"):
-            arrays = [part for cloud in parts if (part := getattr(cloud, name)) is not None]
-            if arrays and len(arrays) < len(parts):
+            arrays = [array for cloud in clouds if (array := getattr(cloud, name)) is not None]
+            if arrays and len(arrays) < len(clouds):
                 raise ConfigurationError(
                     f"joined: expected all clouds with {name} or none, "
-                    f"got {len(arrays)} of {len(parts)}"
+                    f"got {len(arrays)} of {len(clouds)}"
                 )
             columns[name] = np.concatenate(arrays) if arrays else None
-        points = [np.empty((0, 3), np.float32), *(part.points for part in parts)]
+        points = [np.empty((0, 3), np.float32), *(cloud.points for cloud in clouds)]
         return cls(np.concatenate(points), **columns)
 
     def transformed(self, pose: Transform) -> Self:

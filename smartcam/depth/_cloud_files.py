@@ -15,7 +15,7 @@ from smartcam._whole_files import replace_file
 from smartcam.calibration._inside import METRES_PER_UNIT
 from smartcam.depth import _pcd, _ply
 from smartcam.depth._cloud import Cloud
-from smartcam.depth._tables import BadTableError
+from smartcam.depth._tables import BadFileError
 from smartcam.exceptions import (
     ConfigurationError,
     FrameFormatError,
@@ -100,20 +100,20 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
         raise FrameSourceError(f"{path}: cannot be read: {reason}", source=str(path)) from exc
     try:
         if len(data) > MAX_FILE_BYTES:
-            raise BadTableError(f"a file of {MAX_FILE_BYTES:,} bytes at most", "more")
+            raise BadFileError(f"a file of {MAX_FILE_BYTES:,} bytes at most", actual="a larger one")
         return _make_cloud(cloud_format.read(data), METRES_PER_UNIT[unit or _read_unit(data)])
-    except BadTableError as exc:
+    except BadFileError as exc:
         raise FrameFormatError(f"{path}: {exc}", source=str(path)) from exc
 
 
 def _read_unit(data: bytes) -> str:
-    """Return the unit from the header's comment; raise BadTableError if it is missing."""
+    """Return the unit from the header's comment; raise BadFileError if it is missing."""
     match = UNIT_COMMENT.search(data[:MAX_HEAD_BYTES])
     if match is None:
-        raise BadTableError(
+        raise BadFileError(
             'a unit, which neither the file nor its format says: give unit="m" or unit="mm", or '
             "--unit on the command line",
-            "none",
+            actual="none",
         )
     return match[1].decode()
 
@@ -145,13 +145,13 @@ def _find_format(path: Path) -> _CloudFormat:
 
 
 def _make_cloud(columns: Mapping[str, NDArray[Any]], unit_metres: float) -> Cloud:
-    """Return the cloud of a file's columns; raise BadTableError if the columns are not valid.
+    """Return the cloud of a file's columns; raise BadFileError if the columns are not valid.
 
     ``unit_metres``: metres of the file's unit.
     """
     missing = [name for name in "xyz" if name not in columns]
     if missing:
-        raise BadTableError("x, y and z", f"no {', '.join(missing)}, but {', '.join(columns)}")
+        raise BadFileError("x, y and z", f"no {', '.join(missing)}, but {', '.join(columns)}")
     coordinates = [columns[name] for name in "xyz"]
     valid = np.isfinite(coordinates[0])
     for column in coordinates[1:]:
@@ -162,7 +162,7 @@ def _make_cloud(columns: Mapping[str, NDArray[Any]], unit_metres: float) -> Clou
         with np.errstate(over="ignore"):
             points[:, axis] = values
         if values.dtype == np.float64 and values.size and _rounds_too_much(values, points[:, axis]):
-            raise BadTableError(
+            raise BadFileError(
                 "coordinates that float32 keeps to a millimetre",
                 f"{'xyz'[axis]} up to {np.abs(values).max():g} m: move the origin",
             )
@@ -175,7 +175,7 @@ def _make_cloud(columns: Mapping[str, NDArray[Any]], unit_metres: float) -> Clou
         )
         return Cloud(points, _find_colours(columns, valid), scaled)
     except ConfigurationError as exc:
-        raise BadTableError("a cloud", str(exc)) from exc
+        raise BadFileError("a cloud", str(exc)) from exc
 
 
 def _rounds_too_much(exact: NDArray[Any], stored: NDArray[Any]) -> bool:
@@ -203,7 +203,7 @@ def _find_colours(
     elif colours.dtype.itemsize > 1 and least >= 0 and most <= 255:
         scale = 1.0
     else:
-        raise BadTableError(
+        raise BadFileError(
             "colours of 0 to 1, of 0 to 255 or of 16 bits",
             f"{colours.dtype} of {least:g} to {most:g}",
         )

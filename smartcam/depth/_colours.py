@@ -34,9 +34,9 @@ class ColourRange:
     """A range of colours in HSV, in OpenCV's units of 8 bits; both ends belong to the range.
 
     Attributes:
-        hue: from, to, each 0 to 179: half degrees on the circle of colours: 0 red, 30 yellow, 60
-            green, 90 cyan, 120 blue, 150 magenta. If the first hue is above the second, the range
-            goes through 0: ``(170, 10)`` is red.
+        hue: from, to, each 0 to 179, in steps of two degrees on the circle of colours: 0 red, 30
+            yellow, 60 green, 90 cyan, 120 blue, 150 magenta. If the first hue is above the second,
+            the range goes through 0: ``(170, 10)`` is red.
         saturation: from, to, each 0 (grey) to 255.
         value: from, to, each 0 (black) to 255: the largest of red, green and blue.
 
@@ -207,7 +207,7 @@ class ColourRegion:
     ratio=each(a_number, 2),
     fullness=a_number,
     whole=check_flag,
-    most=an_integer,
+    max_regions=an_integer,
 )
 def find_regions(
     mask: NDArray[np.bool_],
@@ -216,9 +216,11 @@ def find_regions(
     ratio: tuple[float, float] = (1, math.inf),
     fullness: float = 0.0,
     whole: bool = False,
-    most: int = 1000,
+    max_regions: int = 1000,
 ) -> list[ColourRegion]:
-    """Return the connected regions of a mask, the largest first; corners connect pixels, too.
+    """Return the connected regions of a mask, the largest first.
+
+    Pixels that touch only at a corner are connected, too.
 
     Args:
         mask: (H, W) of bool.
@@ -226,7 +228,7 @@ def find_regions(
         ratio: least and largest ratio of the longer to the shorter side.
         fullness: least share of the rectangle around a region that the region fills, 0 to 1.
         whole: whether to leave out regions that touch the picture's rim, since they may be cut.
-        most: number of regions at most; the largest are returned.
+        max_regions: number of regions at most; the largest are returned.
 
     Raises:
         ConfigurationError: a range whose lower end is above its upper end.
@@ -258,7 +260,7 @@ def find_regions(
         region = _make_region(labels, label, np.s_[top : top + height, left : left + width])
         if ratio[0] <= region.ratio <= ratio[1] and region.fullness >= fullness:
             regions.append(region)
-        if len(regions) == most:
+        if len(regions) == max_regions:
             break
     return regions
 

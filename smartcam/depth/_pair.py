@@ -170,9 +170,9 @@ class CalibratedPair:
         shape = self._shapes[side]
         if abs(width * shape[1] / (height * shape[0]) - 1) > MAX_ASPECT_DEVIATION:
             raise FrameFormatError(
-                f"{source}: expected a picture of the shape that the {SIDES[side]} camera was "
-                f"calibrated with, {shape[0]}x{shape[1]} made larger or smaller, got "
-                f"{width}x{height}: cut, or of another mode of the sensor?",
+                f"{source}: expected a picture with the aspect ratio of {shape[0]}x{shape[1]}, "
+                f"with which the {SIDES[side]} camera was calibrated, got {width}x{height}: cut, "
+                "or of another mode of the sensor?",
                 source=source,
             )
         if width > MIN_AVERAGING_FACTOR * self.size[0]:
@@ -218,7 +218,7 @@ class CalibratedPair:
         return np.where(has_depth, sigma, np.float32(np.nan)).astype(np.float32)
 
     def _calibration_variance(
-        self, z: NDArray[np.float32], spread: NDArray[np.float64]
+        self, z: NDArray[np.float32], covariance_root: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Return the variance of the disparity that follows from the transform's covariance."""
         # A point (X, Y, Z) is at P - (b, 0, 0) in the right rectified frame; a small turn w and
@@ -238,7 +238,7 @@ class CalibratedPair:
             -right_x * inverse_depth,
         )
         variance = np.zeros_like(z)
-        for column in spread.T:
+        for column in covariance_root.T:
             part = np.zeros_like(z)
             for factor, weight in zip(factors, column, strict=True):
                 part += np.float32(weight) * factor

@@ -14,7 +14,7 @@ import numpy as np
 
 from smartcam.depth._tables import (
     MAX_FIELDS,
-    BadTableError,
+    BadFileError,
     check_row,
     from_bytes,
     from_text,
@@ -43,7 +43,7 @@ MAX_UNPACKED_BYTES: Final = 1 << 30
 """Largest size of unpacked points, bytes: the limit of uncompressed files."""
 
 COLOURS: Final = ("rgb", "rgba")
-"""Fields of 4 bytes with a colour, blue in the lowest byte; in a float, the colour is its bits."""
+"""Fields of 4 bytes with a colour, blue in the lowest byte; a float holds the same 4 bytes."""
 
 PADDING_NAME: Final = "_"
 """Name of padding fields, which are skipped and may occur more than once."""
@@ -60,7 +60,7 @@ class _PcdHeader:
 
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the columns of a file's points; raise BadTableError if the file is not valid."""
+    """Return the columns of a file's points; raise BadFileError if the file is not valid."""
     head = _read_header(data)
     columns = READERS[head.data](data, head)
     for name in COLOURS:
@@ -81,37 +81,37 @@ def _read_header(data: bytes) -> _PcdHeader:
         if not words or words[0].startswith("#"):
             continue
         if words[0] not in HEADER_WORDS or words[0] in lines:
-            raise BadTableError(f"a PCD file's {', '.join(HEADER_WORDS)}, each once", shown(line))
+            raise BadFileError(f"a PCD file's {', '.join(HEADER_WORDS)}, each once", shown(line))
         lines[words[0]] = words[1:]
     if lines.get("VERSION") not in (["0.7"], [".7"]):
-        raise BadTableError("VERSION 0.7", shown(" ".join(lines.get("VERSION", ["none"]))))
+        raise BadFileError("VERSION 0.7", shown(" ".join(lines.get("VERSION", ["none"]))))
     names = lines.get("FIELDS", [])
     sizes, kinds, counts = (
         lines.get(name, default)
         for name, default in (("SIZE", []), ("TYPE", []), ("COUNT", ["1"] * len(names)))
     )
     if not 0 < len(names) <= MAX_FIELDS or {len(sizes), len(kinds), len(counts)} != {len(names)}:
-        raise BadTableError(
+        raise BadFileError(
             f"up to {MAX_FIELDS} FIELDS, with SIZE, TYPE and COUNT of each",
             f"{len(names)}, {len(sizes)}, {len(kinds)} and {len(counts)}",
         )
     unpadded = [name for name in names if name != PADDING_NAME]
     if len(set(unpadded)) < len(unpadded):
-        raise BadTableError("each of the FIELDS once", shown(" ".join(names)))
+        raise BadFileError("each of the FIELDS once", shown(" ".join(names)))
     types = []
     for kind, size in zip(kinds, sizes, strict=True):
         number_type = TYPES.get((kind, parse_count(size, "bytes")))
         if number_type is None:
-            raise BadTableError("I or U of 1, 2, 4 or 8, or F of 4 or 8 bytes", shown(kind + size))
+            raise BadFileError("I or U of 1, 2, 4 or 8, or F of 4 or 8 bytes", shown(kind + size))
         types.append(number_type)
     width, height, points = (_single_count(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
     if width * height != points:
-        raise BadTableError("WIDTH times HEIGHT POINTS", f"{width}, {height} and {points}")
+        raise BadFileError("POINTS equal to WIDTH times HEIGHT", f"{points}, {width} and {height}")
     if lines["DATA"] not in [[reader] for reader in READERS]:
-        raise BadTableError(f"DATA {', '.join(READERS)}", shown(" ".join(lines["DATA"])))
+        raise BadFileError(f"DATA {', '.join(READERS)}", shown(" ".join(lines["DATA"])))
     value_counts = [parse_count(count, "numbers") for count in counts]
     if max(value_counts) > MAX_FIELDS or min(value_counts) < 1:
-        raise BadTableError(
+        raise BadFileError(
             f"COUNT from 1 to {MAX_FIELDS}", f"{min(value_counts)} to {max(value_counts)}"
         )
     return _PcdHeader(names, types, value_counts, points, lines["DATA"][0], offset)
@@ -120,7 +120,7 @@ def _read_header(data: bytes) -> _PcdHeader:
 def _single_count(lines: Mapping[str, list[str]], name: str) -> int:
     words = lines.get(name, [])
     if len(words) != 1:
-        raise BadTableError(f"{name} and a number", shown(" ".join(words)))
+        raise BadFileError(f"{name} and a number", shown(" ".join(words)))
     return parse_count(words[0], name.lower())
 
 
@@ -145,12 +145,12 @@ def _read_compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     """Return the columns of compressed data, which stores one column after the other."""
     size = head.points * _row_type(head).itemsize
     if size > MAX_UNPACKED_BYTES:  # 3 bytes of LZF can expand to 264
-        raise BadTableError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
+        raise BadFileError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
     if len(data) < head.start + 8:
-        raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
+        raise BadFileError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
     packed, unpacked_size = struct.unpack_from("<II", data, head.start)
     if unpacked_size != size or packed > len(data) - head.start - 8:
-        raise BadTableError(
+        raise BadFileError(
             f"up to {len(data) - head.start - 8} bytes that unpack to {size}",
             f"{packed} that unpack to {unpacked_size}",
         )
@@ -165,7 +165,7 @@ def _read_compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
 
 
 def unpack_lzf(data: bytes, size: int) -> bytes:
-    """Unpack LZF-packed data; raise BadTableError unless the result has the given size."""
+    """Unpack LZF-packed data; raise BadFileError unless the result has the given size."""
     out, position, end = bytearray(), 0, len(data)
     while position < end and len(out) <= size:
         control, position = data[position], position + 1
@@ -181,12 +181,14 @@ def unpack_lzf(data: bytes, size: int) -> bytes:
         distance, position = ((control & 31) << 8 | data[position]) + 1, position + 1
         begin = len(out) - distance
         if begin < 0:
-            raise BadTableError("an offset in the unpacked data", f"{-begin} bytes before it")
+            raise BadFileError("an offset in the unpacked data", f"{-begin} bytes before it")
         length += 2
         copied = out[begin : begin + length]  # may overlap with its own output
         out += (copied * (length // len(copied) + 1))[:length]
     if len(out) != size or position != end:
-        raise BadTableError(f"{end} bytes that unpack to {size}", f"{position} to {len(out)}")
+        raise BadFileError(
+            f"{end} bytes that unpack to {size}", f"{position} bytes that unpack to {len(out)}"
+        )
     return bytes(out)
 
 
@@ -214,7 +216,7 @@ HEADER_WORDS: Final = (
 
 
 def write(cloud: Cloud, text: bool) -> bytes:
-    """Return a cloud as a PCD file: a colour is the bits of a float, or in text a number."""
+    """Return a cloud as a PCD file: a colour is the 4 bytes of a float, or in text a number."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.T, strict=True))
     if cloud.colours is not None:
         red, green, blue = cloud.colours.T.astype(np.uint32)

@@ -12,7 +12,7 @@ import numpy as np
 
 from smartcam.depth._tables import (
     MAX_FIELDS,
-    BadTableError,
+    BadFileError,
     check_row,
     from_bytes,
     from_text,
@@ -72,7 +72,7 @@ class _PlyElement:
     def row_type(self, byte_order: str) -> np.dtype[Any]:
         """Return NumPy's type of a row."""
         if self.has_lists or not self.properties:
-            raise BadTableError(
+            raise BadFileError(
                 f"rows of numbers for {self.name}", "lists" if self.has_lists else "none"
             )
         row = np.dtype(
@@ -86,7 +86,7 @@ class _PlyElement:
         if not self.has_lists:
             return start + (self.count * self.row_type(byte_order).itemsize if self.count else 0)
         if self.count > MAX_LIST_ROWS:
-            raise BadTableError(
+            raise BadFileError(
                 f"up to {MAX_LIST_ROWS} rows of lists before the vertices", f"{self.count}"
             )
         kinds = [[np.dtype(byte_order + kind) for kind in part] for part in self.parts]
@@ -98,12 +98,12 @@ class _PlyElement:
                     end += max(0, item_count) * items[0].itemsize
                 start = end
             if start > len(data):
-                raise BadTableError(f"{self.count} rows for {self.name}", "fewer")
+                raise BadFileError(f"{self.count} rows for {self.name}", "fewer")
         return start
 
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the columns of a file's vertices; raise BadTableError if the file is not valid."""
+    """Return the columns of a file's vertices; raise BadFileError if the file is not valid."""
     byte_order, elements, start = _read_header(data)
     before, vertex = _split_at_vertices(elements)
     row = vertex.row_type(byte_order)
@@ -121,7 +121,7 @@ def _read_header(data: bytes) -> tuple[str, list[_PlyElement], int]:
     """Return the byte order ("" for text), the elements, and the offset of the first row."""
     line, offset = read_header_line(data, 0) if data.startswith(b"ply") else ("", 0)
     if line.rstrip() != "ply":
-        raise BadTableError("a PLY file, which begins with ply", shown(data[:60]))
+        raise BadFileError("a PLY file, which begins with ply", shown(data[:60]))
     byte_order: str | None = None
     elements: list[_PlyElement] = []
     while True:
@@ -140,22 +140,22 @@ def _read_header(data: bytes) -> tuple[str, list[_PlyElement], int]:
             case ["property", kind, name] if elements and kind in TYPES:
                 _add_property(elements[-1], name, TYPES[kind])
             case _:
-                raise BadTableError("a line of a PLY header", shown(line))
+                raise BadFileError("a line of a PLY header", shown(line))
     if byte_order is None:
-        raise BadTableError(f"a format of {', '.join(ORDERS)}", "none")
+        raise BadFileError(f"a format of {', '.join(ORDERS)}", "none")
     return byte_order, elements, offset
 
 
 def _add_property(element: _PlyElement, name: str, kind: str) -> None:
     if name in element.properties or len(element.properties) >= MAX_FIELDS:
-        raise BadTableError(f"up to {MAX_FIELDS} properties, each once", f"{shown(name)} again")
+        raise BadFileError(f"up to {MAX_FIELDS} properties, each once", f"{shown(name)} again")
     element.properties[name] = kind
     _add_part(element, kind)
 
 
 def _add_part(element: _PlyElement, *part: str) -> None:
     if len(element.parts) >= MAX_FIELDS or (len(part) > 1 and part[0].startswith("f")):
-        raise BadTableError(
+        raise BadFileError(
             f"up to {MAX_FIELDS} properties, lists with a whole number as their size",
             f"{len(element.parts) + 1}, the last one of {' and '.join(part)}",
         )
@@ -168,7 +168,7 @@ def _split_at_vertices(elements: list[_PlyElement]) -> tuple[list[_PlyElement], 
         if element.name == "vertex":
             return elements[:index], element
     names = ", ".join(shown(element.name) for element in elements) or "none"
-    raise BadTableError("an element vertex", names)
+    raise BadFileError("an element vertex", names)
 
 
 def write(cloud: Cloud, text: bool) -> bytes:

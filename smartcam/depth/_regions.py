@@ -50,13 +50,13 @@ class RegionDepth:
     pixels: int
 
 
-@check_arguments(scale=a_number, shared=a_number)
+@check_arguments(scale=a_number, correlated_pixels=a_number)
 def region_depth(
     depth: NDArray[Any],
     region: DepthArea | None = None,
     *,
     scale: float = MILLIMETRE,
-    shared: float = 1.0,
+    correlated_pixels: float = 1.0,
 ) -> RegionDepth:
     """Return the median of a region's depths; holes do not count.
 
@@ -65,17 +65,19 @@ def region_depth(
         region: a box, a polygon or a mask; None: the whole map. Parts outside of the map are
             ignored.
         scale: metres of a step of uint16.
-        shared: number of pixels with common noise, for ``sigma``: 1 if each pixel has its own
-            noise; :attr:`SpatialFilter.shared` after this filter (holes reduce it: ``sigma`` is a
-            fifth too large with 5 % of holes); about the pixels of the window for a window matcher.
+        correlated_pixels: number of pixels over which noise is correlated, for ``sigma``. It is 1
+            if each pixel has its own noise. After a filter it is
+            :attr:`SpatialFilter.correlated_pixels` (with 5 % of holes, ``sigma`` is then a fifth
+            too large). For a window matcher it is about the number of pixels of the window.
 
     Raises:
-        ConfigurationError: the region is not valid, or ``shared`` is below 1.
+        ConfigurationError: the region is not valid, or ``correlated_pixels`` is below 1.
         FrameFormatError: no pixel of the region has a depth, or the array is no depth map.
     """
-    if not (shared >= 1 and math.isfinite(shared)):
+    if not (correlated_pixels >= 1 and math.isfinite(correlated_pixels)):
         raise ConfigurationError(
-            f"region_depth: shared: expected 1 or more pixels, got {excerpt(shared)}"
+            "region_depth: correlated_pixels: expected 1 or more pixels, got "
+            f"{excerpt(correlated_pixels)}"
         )
     metres = as_metres(depth, scale)
     region_depths = metres[_region_mask(region, metres.shape)]
@@ -88,7 +90,7 @@ def region_depth(
     median = float(np.median(measured))
     spread = SIGMA_PER_MAD * float(np.median(np.abs(measured - median)))
     # variance of the median as a share of a pixel's variance
-    variance = min(1.0, (shared + MEDIAN_EXCESS_VARIANCE) / measured.size)
+    variance = min(1.0, (correlated_pixels + MEDIAN_EXCESS_VARIANCE) / measured.size)
     return RegionDepth(
         median=median,
         sigma=spread * math.sqrt(variance),

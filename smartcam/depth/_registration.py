@@ -12,7 +12,7 @@ from smartcam._argument_checks import a_number, check_arguments, of_class, or_no
 from smartcam._arguments import check_text, excerpt
 from smartcam._extras import load
 from smartcam.depth._filters import voxel_grid
-from smartcam.depth._surface import displacement_jacobian, fit_planes, open_directions
+from smartcam.depth._surface import displacement_jacobian, fit_planes, undetermined_steps
 from smartcam.exceptions import ConfigurationError
 from smartcam.geometry import Transform
 
@@ -182,7 +182,7 @@ def _align(
         gicp.estimate_normals_covariances(cloud, None, NEIGHBOURS)
     tree = gicp.KdTree(clouds[1])
 
-    def run_steps(motion: Array, most: int) -> Any:
+    def run_steps(motion: Array, max_steps: int) -> Any:
         return gicp.align(
             clouds[1],
             clouds[0],
@@ -190,7 +190,7 @@ def _align(
             motion,
             registration_type=kind,
             max_correspondence_distance=reach,
-            max_iterations=most,
+            max_iterations=max_steps,
             rotation_epsilon=MIN_TURN_STEP,
             translation_epsilon=MIN_SHIFT_STEP * reach,
         )
@@ -249,7 +249,7 @@ def _judge(
             plane_of_match.reshape(-1)
         )
         centre = match.moved.mean(axis=0)
-        steps = open_directions(match.moved - centre, planes)
+        steps = undetermined_steps(match.moved - centre, planes)
         reasons += [_describe_motion(step, match.moved - centre) for step in steps]
         undetermined = steps.copy()
         undetermined[:, 3:] += np.cross(steps[:, :3], pose.translation - centre)

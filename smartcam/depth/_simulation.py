@@ -101,7 +101,7 @@ def to_robot(
     return float(place[0]), float(place[1])
 
 
-class Grip(NamedTuple):
+class PoseError(NamedTuple):
     """Errors of a grasp or of an estimated pose."""
 
     off: float  # distance from the true place, metres
@@ -143,7 +143,7 @@ class TowerTable:
         stack = [block for block in self.blocks if _distance(block, top) < BLOCK[0] / 2]
         return sorted(stack, key=lambda block: block.z)
 
-    def pick(self, x: float, y: float, angle: float) -> Grip:
+    def pick(self, x: float, y: float, angle: float) -> PoseError:
         """Close the gripper at a pose on the table, and grasp a block within its tolerance.
 
         Returns the errors from the nearest black block; ``held`` is None if it is missed.
@@ -151,7 +151,7 @@ class TowerTable:
         gripper = WoodenBlock(x, y, angle)
         loose = [block for block in self.blocks if block.z == 0 and block.colour == "black"]
         block = min(loose, key=lambda block: _distance(block, gripper))
-        grip = Grip(_distance(block, gripper), math.remainder(angle - block.angle, math.pi))
+        grip = PoseError(_distance(block, gripper), math.remainder(angle - block.angle, math.pi))
         if grip.off < GRIP_TOLERANCE_METRES and block.size == BLOCK:
             self.blocks.remove(block)
             c, s = math.cos(angle), math.sin(angle)
@@ -300,9 +300,9 @@ class _TableRays:
         off_x, off_y = block.x - self._camera[0], block.y - self._camera[1]
         lows: list[int] = []
         highs: list[int] = []
-        for middle, most in ((-off_x, SIZE[1]), (-off_y, SIZE[0])):
+        for middle, picture_side in ((-off_x, SIZE[1]), (-off_y, SIZE[0])):
             ends = [
-                FOCAL * (middle + sign * reach) / (self._camera[2] - z) + most / 2
+                FOCAL * (middle + sign * reach) / (self._camera[2] - z) + picture_side / 2
                 for sign in (-1, 1)
                 for z in (block.z, block.top)
             ]

@@ -233,7 +233,7 @@ def _gauss_newton_step(
     e, g, level, mask = linear
     gg, rg, constant = g * g, g * level, e - g * disparity
     n = np.maximum(sums(mask), 1)
-    sg, sr, mean = sums(g), sums(level), sums(level * level)
+    sg, sr, srr_all = sums(g), sums(level), sums(level * level)
     sy, gy, ry = (
         sums(constant_) + plane.slope_x * sums(g_, 1) + plane.slope_y * sums(g_, 0, 1)
         for constant_, g_ in ((constant, g), (constant * g, gg), (constant * level, rg))
@@ -241,7 +241,7 @@ def _gauss_newton_step(
     gy -= sg * sy / n
     ry -= sr * sy / n
     if trusted is None:
-        m, st, srr, e_, level_ = n, sr, mean, e, level
+        m, st, srr, e_, level_ = n, sr, srr_all, e, level
     else:
         e_, level_ = e * trusted, level * trusted
         m, st, srr = np.maximum(sums(mask * trusted), 1), sums(level_), sums(level_ * level)
@@ -252,7 +252,7 @@ def _gauss_newton_step(
     gain_weight = np.maximum(see / np.maximum(m - 2, 1), MIN_VARIANCE) / np.float32(GAIN_SIGMA**2)
     gain = sre / (srr + gain_weight)
     variance = np.maximum((see - gain * sre) / np.maximum(m - 3, 1), MIN_VARIANCE)
-    rr = np.maximum(mean - sr * sr / n, 0) + gain_weight
+    rr = np.maximum(srr_all - sr * sr / n, 0) + gain_weight
     gr = sums(rg) - sg * sr / n
     curvature = sums(gg) - sg * sg / n - gr * gr / rr
     # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's

@@ -74,7 +74,7 @@ def displacement_jacobian(arms: Array, directions: Array) -> Array:
     return np.concatenate([np.cross(arms, directions), directions], axis=1)
 
 
-def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
+def undetermined_steps(arms: Array, planes: SurfacePlanes) -> Array:
     """Return the steps (K, 6), turn in radians and shift in metres, that planes do not determine.
 
     ``arms`` (N, 3): vectors to the points on the planes from their centre, about which the steps
@@ -95,6 +95,6 @@ def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     ratios, steps = load("scipy.linalg").eigh(information, noise)
     basis, _ = np.linalg.qr(steps[:, ratios < MIN_INFORMATION_FACTOR])
     # Any combination of undetermined steps is undetermined: return turns first, then pure shifts.
-    apart, _, _ = np.linalg.svd(basis.T[:, :3])
-    directions: Array = (apart.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)
-    return directions
+    turn_basis, _, _ = np.linalg.svd(basis.T[:, :3])
+    undetermined: Array = (turn_basis.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)
+    return undetermined

@@ -26,7 +26,7 @@ NUMBERS_AT_A_TIME: Final = 1 << 18
 """Number of text items that are parsed at a time, which bounds the memory."""
 
 
-class BadTableError(Exception):
+class BadFileError(Exception):
     """Error in a file's content; the caller adds the file's name."""
 
     def __init__(self, expected: str, actual: str) -> None:
@@ -43,7 +43,7 @@ def read_header_line(data: bytes, start: int) -> tuple[str, int]:
     """Return a line of the header, without LF or CR LF, and the offset of the next line."""
     end = data.find(b"\n", start, MAX_HEADER_BYTES)
     if end < 0:
-        raise BadTableError(
+        raise BadFileError(
             f"a header of up to {MAX_HEADER_BYTES} bytes",
             shown(data[start : start + MAX_HEADER_BYTES]),
         )
@@ -57,27 +57,27 @@ def read_header_line(data: bytes, start: int) -> tuple[str, int]:
 
 
 def parse_count(text: str, label: str) -> int:
-    """Return a count from text; raise BadTableError if the text is not a count."""
+    """Return a count from text; raise BadFileError if the text is not a count."""
     if not (text.isascii() and text.isdigit() and len(text) <= 15):
         _fail(f"a number of {label}", text)
     return int(text)
 
 
 def _fail(expected: str, actual: bytes | str) -> NoReturn:
-    raise BadTableError(expected, shown(actual)) from None
+    raise BadFileError(expected, shown(actual)) from None
 
 
 def check_row(row_type: np.dtype[Any]) -> None:
-    """Raise BadTableError if rows are too long."""
+    """Raise BadFileError if rows are too long."""
     if row_type.itemsize > MAX_ROW_BYTES:
-        raise BadTableError(f"rows of up to {MAX_ROW_BYTES} bytes", f"{row_type.itemsize}")
+        raise BadFileError(f"rows of up to {MAX_ROW_BYTES} bytes", f"{row_type.itemsize}")
 
 
 def from_bytes(data: bytes, start: int, count: int, row_type: np.dtype[Any]) -> NDArray[Any]:
     """Return ``count`` rows from the offset ``start``; bytes after them are ignored."""
     available = len(data) - start
     if count * row_type.itemsize > available:
-        raise BadTableError(
+        raise BadFileError(
             f"{count} rows of {row_type.itemsize} bytes, {count * row_type.itemsize} in all",
             f"{available}",
         )
@@ -93,18 +93,18 @@ def from_text(
     """
     check_row(np.dtype([(str(index), column_type) for index, column_type in enumerate(types)]))
     if 2 * len(types) * count > len(data) - start + 1:
-        raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
+        raise BadFileError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
     columns = tuple(np.empty(count, column_type) for column_type in types)
     row_count, offset, to_skip = 0, start, skip
     while row_count < count:
         lines: list[list[bytes]] = []
         while len(lines) < min(NUMBERS_AT_A_TIME // len(types), count - row_count):
             if offset >= len(data):
-                raise BadTableError(f"{count} lines of numbers", f"{row_count + len(lines)}")
+                raise BadFileError(f"{count} lines of numbers", f"{row_count + len(lines)}")
             end = data.find(b"\n", offset)
             end = len(data) if end < 0 else end
             if end - offset > MAX_LINE_BYTES:
-                raise BadTableError(f"lines of up to {MAX_LINE_BYTES} bytes", f"{end - offset}")
+                raise BadFileError(f"lines of up to {MAX_LINE_BYTES} bytes", f"{end - offset}")
             words, offset = data[offset:end].split(), end + 1
             if to_skip:
                 to_skip -= 1
@@ -112,7 +112,8 @@ def from_text(
                 lines.append(words)
             elif words:
                 _fail(
-                    f"{len(types)} numbers in line {row_count + len(lines) + 1}", b" ".join(words)
+                    f"{len(types)} numbers in row {row_count + len(lines) + 1} of the data",
+                    b" ".join(words),
                 )
         for column, texts in zip(columns, zip(*lines, strict=True), strict=True):
             column[row_count : row_count + len(lines)] = _parse_numbers(texts, column.dtype)
@@ -121,7 +122,7 @@ def from_text(
 
 
 def _parse_numbers(texts: Sequence[bytes], number_type: np.dtype[Any]) -> NDArray[Any]:
-    """Return the numbers of a column; raise BadTableError if a text is no number of the type."""
+    """Return the numbers of a column; raise BadFileError if a text is no number of the type."""
     try:
         if number_type.kind == "f":
             values = np.array([float(text) for text in texts], np.float64)
@@ -129,10 +130,12 @@ def _parse_numbers(texts: Sequence[bytes], number_type: np.dtype[Any]) -> NDArra
                 return values.astype(number_type)
         numbers = [int(text) for text in texts if len(text) <= 20]
     except ValueError as exc:
-        raise BadTableError("numbers", shown(str(exc))) from None
+        raise BadFileError("numbers", shown(str(exc))) from None
     limits = np.iinfo(number_type)
     if len(numbers) < len(texts) or not limits.min <= min(numbers) <= max(numbers) <= limits.max:
-        raise BadTableError(f"numbers from {limits.min} to {limits.max}", "others")
+        raise BadFileError(
+            f"numbers from {limits.min} to {limits.max}", "a number out of this range"
+        )
     return np.array(numbers, number_type)
 
 

@@ -1,8 +1,8 @@
-"""Values that several packages share: motions between frames, and the lens of a camera.
+"""Values that several packages share: motions between coordinate frames, and a camera's lens.
 
-Calibrations find these values; frames, depth, the fleet and ROS use them without a calibration.
-Right-handed frames, metres, Hamilton quaternions ``x, y, z, w``. :mod:`smartcam.calibration` gives
-the same names to those who calibrate.
+Calibrations find these values; the packages ``frames``, ``depth``, ``fleet`` and ``ros2`` use them
+without a calibration. Frames are right-handed, lengths are metres, and quaternions are Hamilton's
+``x, y, z, w``. :mod:`smartcam.calibration` exports the same classes.
 """
 
 from __future__ import annotations

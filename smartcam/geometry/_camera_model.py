@@ -1,4 +1,4 @@
-"""A camera's lens, which maps directions to pixels and back.
+"""A camera's intrinsic parameters ("lens"), which map directions to pixels and back.
 
 The camera's frame is that of OpenCV and ROS' optical frames: x to the right of the image, y down,
 z forward. The middle of the upper left pixel has the coordinates (0, 0).
@@ -139,13 +139,13 @@ class CameraModel(Stored):
         return pixels
 
     def directions(self, pixels: ArrayLike) -> Array:
-        """Return the points at which the rays through pixels meet the camera's plane z = 1.
+        """Return the directions x/z and y/z of the rays through pixels, corrected for distortion.
 
         Args:
             pixels: (N, 2).
 
         Returns:
-            (N, 2), x and y in this plane, without the lens' distortion.
+            (N, 2), x and y where the rays meet the plane z = 1 of the camera's frame.
 
         Raises:
             CalibrationError: SHAPE or NOT_FINITE.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def check_choice(value: object, among: Sequence[str], label: str) -> None:
-    """Raise SHAPE if an option is not in the list of known ones."""
+    """Raise SHAPE, the code of wrong arguments, if an option is not in the list of known ones."""
     word = as_plain_value(value)  # a user's str may hash and compare otherwise
     if not isinstance(word, str) or word not in among:
         known = list(among)

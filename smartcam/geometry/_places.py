@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from smartcam.geometry._rotations import Array
 
-MAX_PLACES: Final = 1000
+MAX_PLACES_PER_DIRECTION: Final = 1000
 """Largest number of rows, columns or layers of a pattern."""
 
 MIN_SINE: Final = 0.5
@@ -67,7 +67,7 @@ class PlacePattern(Sequence[Transform]):
         caller = "PlacePattern"
         as_motion(self.frame, f"{caller}: frame", "robot", "place")
         for name in ("rows", "columns", "layers"):
-            count = check_integer(getattr(self, name), name, 1, MAX_PLACES, caller)
+            count = check_integer(getattr(self, name), name, 1, MAX_PLACES_PER_DIRECTION, caller)
             object.__setattr__(self, name, count)
         if not isinstance(self.pitch, tuple | list) or len(self.pitch) != 3:
             raise wrong_argument(
@@ -109,12 +109,12 @@ class PlacePattern(Sequence[Transform]):
 
         Raises:
             ConfigurationError: a number of places or a distance that is not possible.
-            CalibrationError: ``SHAPE``, ``NOT_FINITE``; ``NOT_RIGID``: the three points nearly
-                coincide, or lie on one line.
+            CalibrationError: ``SHAPE``, ``NOT_FINITE``; ``NOT_RIGID``: row and column are at less
+                than 30 degrees to each other.
         """
         caller = "PlacePattern.from_touches"
-        rows = check_integer(rows, "rows", 2, MAX_PLACES, caller)
-        columns = check_integer(columns, "columns", 2, MAX_PLACES, caller)
+        rows = check_integer(rows, "rows", 2, MAX_PLACES_PER_DIRECTION, caller)
+        columns = check_integer(columns, "columns", 2, MAX_PLACES_PER_DIRECTION, caller)
         frame_name = check_text(robot_frame, "robot_frame", caller)
         corner = as_vector(first, 3, "first")
         row_vector = as_vector(row_end, 3, "row_end") - corner
@@ -153,7 +153,7 @@ class PlacePattern(Sequence[Transform]):
             return [self._pose_of(number) for number in range(len(self))[index]]
         return self._pose_of(range(len(self))[index])
 
-    def at(self, number: int) -> tuple[int, int, int]:
+    def row_column_layer(self, number: int) -> tuple[int, int, int]:
         """Return row, column and layer of a place, each from 0.
 
         Args:
@@ -162,13 +162,13 @@ class PlacePattern(Sequence[Transform]):
         Raises:
             ConfigurationError: there is no such place.
         """
-        number = check_integer(number, "number", 0, len(self) - 1, "PlacePattern.at")
+        number = check_integer(number, "number", 0, len(self) - 1, "PlacePattern.row_column_layer")
         layer, rest = divmod(number, self.rows * self.columns)
         row, column = divmod(rest, self.columns)
         return row, column, layer
 
     def _pose_of(self, number: int) -> Transform:
-        row, column, layer = self.at(number)
+        row, column, layer = self.row_column_layer(number)
         steps: Array = np.array([column, row, layer]) * self.pitch
         return Transform(
             self.frame.target,

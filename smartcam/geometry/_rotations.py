@@ -25,7 +25,7 @@ MIN_SINE = 0.17
 """Sine of the least angle between two axes that span a plane: 10 degrees.
 
 An error of 0.5 mm in height tilts the plane's normal by 2.2 degrees if the axes are 5 degrees
-apart, and by 10.8 degrees if they are 1 degree apart (derived).
+apart, and by 10.8 degrees if they are 1 degree apart.
 """
 
 MAX_COORDINATE = 1e100

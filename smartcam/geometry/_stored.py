@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from pydantic_core import CoreSchema
 
 Context: TypeAlias = MutableMapping[str, Any]
-"""Values that are known while a file is read: the object's name in errors (``called``), and the
+"""Values that are known while a file is read: the object's name in errors (``label``), and the
 values of earlier keys that later keys need."""
 
 Keys: TypeAlias = Mapping[str, str]
@@ -60,27 +60,27 @@ object."""
 class Form:
     """The form in which the annotated value is stored in a file."""
 
-    checked: Any  # type with which pydantic checks the data
+    data_type: Any  # type with which pydantic checks the data
     read: Callable[[Any, Context], Any]  # makes the value from checked data and context
     write: Callable[[Any], Any]  # makes plain data of the value
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.with_info_after_validator_function(
             lambda value, info: self.read(value, info.context),
-            handler.generate_schema(self.checked),
+            handler.generate_schema(self.data_type),
             serialization=core_schema.plain_serializer_function_ser_schema(self.write),
         )
 
 
 @dataclass(eq=False)
 class AsList:
-    """Stores a tuple of any length as a list of at least ``least`` items."""
+    """Stores a tuple of any length as a list of at least ``min_length`` items."""
 
-    least: int = 0
+    min_length: int = 0
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         items = handler.generate_schema(get_args(kind)[0])
-        schema = core_schema.list_schema(items, min_length=self.least)
+        schema = core_schema.list_schema(items, min_length=self.min_length)
         return _schema_of_parts(schema, read=lambda values, _: tuple(values), write=list)
 
 
@@ -186,10 +186,10 @@ class Stored:
         instance = cls(
             **{name: value for name, value in fields.items() if name not in cls._extra_keys}
         )
-        instance._check(fields, context["called"])
+        instance._check(fields, context["label"])
         return instance
 
-    def _check(self, fields: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], label: str) -> None:
         """Raise SHAPE if fields contradict each other or the values of ``_extra_keys``."""
 
 
@@ -206,9 +206,9 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _validate(kind: Any, data: Any, called: str, **known: Any) -> Any:
+def _validate(kind: Any, data: Any, label: str, **known: Any) -> Any:
     try:
-        return _adapter(kind).validate_python(data, context={"called": called, **known})
+        return _adapter(kind).validate_python(data, context={"label": label, **known})
     except ValidationError as exc:
         first_error = exc.errors()[0]
         error = first_error.get("ctx", {}).get("error")
@@ -216,26 +216,26 @@ def _validate(kind: Any, data: Any, called: str, **known: Any) -> Any:
             raise error from None
         location = ".".join(map(str, first_error["loc"]))
         raise invalid_data_error(
-            called, f"{location}: {first_error['msg']}", first_error["input"]
+            label, f"{location}: {first_error['msg']}", first_error["input"]
         ) from exc
 
 
-def invalid_data_error(called: str, text: str, actual: object) -> CalibrationError:
+def invalid_data_error(label: str, text: str, actual: object) -> CalibrationError:
     """Return the error for stored data that are not valid."""
-    return Code.SHAPE.error(f"stored {called}: {text}", got=actual)
+    return Code.SHAPE.error(f"stored {label}: {text}", got=actual)
 
 
-def check_counts(fields: Mapping[str, Any], names: Iterable[str], count: int, called: str) -> None:
+def check_counts(fields: Mapping[str, Any], names: Iterable[str], count: int, label: str) -> None:
     """Raise SHAPE if a field does not have ``count`` items."""
     for name in names:
         if len(fields[name]) != count:
-            raise invalid_data_error(called, f"{name}: expected {count}", len(fields[name]))
+            raise invalid_data_error(label, f"{name}: expected {count}", len(fields[name]))
 
 
-def check_shape(values: Array, shape: tuple[int, ...], called: str, name: str) -> None:
+def check_shape(values: Array, shape: tuple[int, ...], label: str, name: str) -> None:
     """Raise SHAPE if a field's array does not have the given shape."""
     if values.shape != shape:
-        raise invalid_data_error(called, f"{name}: expected shape {shape}", values.shape)
+        raise invalid_data_error(label, f"{name}: expected shape {shape}", values.shape)
 
 
 # ---------------------------------------------------------------------- numbers
@@ -281,9 +281,9 @@ PairOrNaN = Annotated[
 ]
 
 
-def row(checked: Any, make: Callable[[Any], Any] = tuple) -> Form:
+def row(data_type: Any, make: Callable[[Any], Any] = tuple) -> Form:
     """Return the form of a tuple of fixed length, stored as a list; ``make`` builds the value."""
-    return Form(checked, read=lambda values, _: make(values), write=list)
+    return Form(data_type, read=lambda values, _: make(values), write=list)
 
 
 Size = Annotated[tuple[int, int], row(tuple[int, int])]
@@ -321,18 +321,18 @@ Matrix43 = Annotated[Array, Form(tuple[Triple, Triple, Triple, Triple], as_array
 
 def matrix(count: int | None = None) -> Form:
     """Return the form of a matrix of ``count`` rows; its class checks the number of columns."""
-    checked = Annotated[list[list[Number]], Field(min_length=count or 0, max_length=count)]
-    return Form(checked, as_array, _to_lists)
+    data_type = Annotated[list[list[Number]], Field(min_length=count or 0, max_length=count)]
+    return Form(data_type, as_array, _to_lists)
 
 
-def rows(checked: Any, *shape: int, least: int = 0, nulls: bool = False) -> Form:
+def rows(data_type: Any, *shape: int, min_length: int = 0, nulls: bool = False) -> Form:
     """Return the form of an array (N, ``*shape``) that is stored as a list.
 
-    ``checked``: type with which pydantic checks an item. ``least``: least number of items.
+    ``data_type``: type with which pydantic checks an item. ``min_length``: of the list.
     ``nulls``: whether values may be NaN, which is stored as null.
     """
     return Form(
-        Annotated[list[checked], Field(min_length=least)],
+        Annotated[list[data_type], Field(min_length=min_length)],
         read=lambda values, _: as_array(values).reshape(-1, *shape),
         write=_to_nullable_lists if nulls else _to_lists,
     )

@@ -221,8 +221,8 @@ class Transform:
         """Return points (..., 3) of the source in the target, metres; raise SHAPE."""
         return _rows(points, 3, f"{self.label}: points") @ self.rotation.T + self.translation
 
-    def turn(self, quaternions: ArrayLike) -> Array:
-        """Return the orientations in the target of those in the source, (..., 4); raise SHAPE."""
+    def apply_to_orientations(self, quaternions: ArrayLike) -> Array:
+        """Return orientations (..., 4) of the source in the target; raise SHAPE."""
         return quaternion_multiply(self.quaternion, _rows(quaternions, 4, "orientations"))
 
     def between(self, later: Transform, at: datetime) -> Transform:
@@ -285,8 +285,8 @@ def as_motion(value: object, label: str, target: str, source: str) -> Transform:
     shape = np.shape(value) if isinstance(value, np.ndarray) else ()
     kind = "None" if value is None else type(value).__name__
     raise Code.SHAPE.error(
-        f"{label}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
-        f'matrix M (4, 4) it is Transform("{target}", "{source}", M[:3, :3], M[:3, 3])',
+        f"{label}: expected a Transform, which knows its frames, got {kind}{shape or ''}: to make "
+        f'one of a matrix M (4, 4), write Transform("{target}", "{source}", M[:3, :3], M[:3, 3])',
         "Transform",
         kind,
     )
@@ -344,13 +344,10 @@ class PoseHistory:
         if moment in self._times[index : index + 1]:
             return self._transforms[index]
         if index in (0, len(self._times)):
-            known = (
-                f"from {self._times[0]} to {self._times[-1]}" if self._times else "that is known"
-            )
+            known = f"from {self._times[0]} to {self._times[-1]}" if self._times else "in it"
+            reason = "nothing is extrapolated" if self._times else "the pose history is empty"
             raise Code.BAD_TIME.error(
-                f"pose history: expected a time {known}, got {moment}: nothing is extrapolated",
-                known,
-                moment,
+                f"pose history: expected a time {known}, got {moment}: {reason}", known, moment
             )
         before, after = self._transforms[index - 1 : index + 1]
         gap = self._times[index] - self._times[index - 1]

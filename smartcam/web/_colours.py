@@ -177,7 +177,9 @@ class ColourSite(ThreadedSite):
         jpeg_data = jpeg(frame, self._quality)
         mask = colours.mask_hsv(hsv(frame))
         _, png = load("cv2").imencode(".png", mask.view(np.uint8) * 255)
-        regions = find_regions(mask, area=(MIN_REGION_SHARE * mask.size, np.inf), most=MAX_REGIONS)
+        regions = find_regions(
+            mask, area=(MIN_REGION_SHARE * mask.size, np.inf), max_regions=MAX_REGIONS
+        )
         values = {
             "sequence": frame.sequence,
             "width": frame.width,

@@ -73,7 +73,7 @@ def test_minimize_takes_back_a_step_without_gain(*, fails: bool) -> None:
         return NormalEquations.zeros(2, 1, 0)._replace(
             cost=float((residuals**2).sum()),
             shared=jacobian.T @ jacobian,
-            shared_right=jacobian.T @ residuals,
+            shared_right_side=jacobian.T @ residuals,
         )
 
     def moved(at: np.ndarray, shared: np.ndarray, _own: np.ndarray) -> np.ndarray:

@@ -149,7 +149,10 @@ def test_file_is_drawn(files: Path, file: str, what: str | None, has: str) -> No
 def test_picture_that_a_file_does_not_have_is_refused() -> None:
     outcome = run("calibrate", "draw", "pair.json", "-o", "out.svg", "--what", "uncertainty")
     assert outcome.code == 2
-    assert "holds 'stereo', of which there is views and scene; expected uncertainty" in outcome.err
+    said = (
+        "expected the picture uncertainty, got a file of kind 'stereo', which has views and scene"
+    )
+    assert said in outcome.err
 
 
 def test_calibrate_alone_is_the_wizard_as_before() -> None:

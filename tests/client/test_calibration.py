@@ -135,7 +135,7 @@ async def test_calibration_of_a_moving_camera_is_its_chain_for_the_present_pose(
     here = Transform.from_quaternion("robot", "flange", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
     there = Transform.from_quaternion("robot", "flange", [0.0, 0.1, 0.0], [0.0, 0.0, 0.0, 1.0])
     moving = MovingCamera(static, here, field=CALIBRATION.robot_points)
-    still, moved = await _tangram(static), await _tangram(moving.now(there))
+    still, moved = await _tangram(static), await _tangram(moving.at_pose(there))
     for one, other in zip(still.value, moved.value, strict=True):
         assert other.pose.position.y - one.pose.position.y == pytest.approx(0.1)
 
@@ -446,7 +446,7 @@ _HERE = Transform.from_quaternion("robot", "flange", [0.0, 0.0, 0.0], [0.0, 0.0,
         lambda one: one,
         lambda one: {5: None, 7: one},
         chain_of,
-        lambda one: MovingCamera(chain_of(one), _HERE, field=one.robot_points).now(_HERE),
+        lambda one: MovingCamera(chain_of(one), _HERE, field=one.robot_points).at_pose(_HERE),
     ],
 )
 def test_calibration_made_with_the_other_y_down_is_refused(make: Any, y_down: bool) -> None:

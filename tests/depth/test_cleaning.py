@@ -171,8 +171,8 @@ def test_shared_counts_pixels_with_common_noise(iterations: int) -> None:
     smooth = SpatialFilter(0.4, 1.0, iterations)
     depth = 5 + np.random.default_rng(6).normal(0, 1e-2, (400, 400))
     found = (1e-2 / np.std(smooth(depth)[30:-30, 30:-30])) ** 2
-    assert smooth.shared == pytest.approx(found, rel=0.1)
-    assert SpatialFilter(1.0).shared == pytest.approx(1.0)
+    assert smooth.correlated_pixels == pytest.approx(found, rel=0.1)
+    assert SpatialFilter(1.0).correlated_pixels == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

@@ -70,10 +70,10 @@ def test_sigma_equals_the_scatter_of_the_median(smoothed: int, holes: float, mos
     for _ in range(400):
         depth: Map = 0.5 + random.normal(0, 0.002, (50, 70))
         depth[random.random(depth.shape) < holes] = 0
-        shared = 1.0
+        correlated_pixels = 1.0
         if smoothed:
-            depth, shared = smooth(depth), smooth.shared
-        told = region_depth(depth, (5, 5, 60, 40), shared=shared)
+            depth, correlated_pixels = smooth(depth), smooth.correlated_pixels
+        told = region_depth(depth, (5, 5, 60, 40), correlated_pixels=correlated_pixels)
         medians.append(told.median)
         sigmas.append(told.sigma)
     assert 0.9 < np.mean(sigmas) / np.std(medians) < 1 + most
@@ -84,8 +84,10 @@ def test_spread_is_that_of_a_pixel_and_sigma_that_of_a_median() -> None:
     told = region_depth(depth)
     assert told.spread == pytest.approx(0.002, rel=0.05)
     assert told.sigma == pytest.approx(told.spread * math.sqrt(math.pi / 2) / 100)
-    assert region_depth(depth, shared=100).sigma == pytest.approx(told.spread / 10, rel=0.01)
-    assert region_depth(depth, shared=1e9).sigma == told.spread
+    assert region_depth(depth, correlated_pixels=100).sigma == pytest.approx(
+        told.spread / 10, rel=0.01
+    )
+    assert region_depth(depth, correlated_pixels=1e9).sigma == told.spread
 
 
 def test_region_without_a_depth_is_refused_with_its_place() -> None:
@@ -117,8 +119,8 @@ def test_wrong_region_is_refused(wrong: Any) -> None:
 
 
 def test_shared_below_one_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="shared: expected 1 or more"):
-        region_depth(np.ones((4, 4)), shared=0.5)
+    with pytest.raises(ConfigurationError, match="correlated_pixels: expected 1 or more"):
+        region_depth(np.ones((4, 4)), correlated_pixels=0.5)
 
 
 # ---------------------------------------------------------------------- equalized

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from smartcam.depth import Cloud, load_cloud, save_cloud
 from smartcam.depth import _cloud_files as files_module
 from smartcam.depth._pcd import unpack_lzf
-from smartcam.depth._tables import BadTableError
+from smartcam.depth._tables import BadFileError
 from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
 
 CLOUD = Cloud(
@@ -227,7 +227,7 @@ def test_compressed_pcd(tmp_path: Path) -> None:
     for wrong in (data[:-1], data[:-14], data.replace(b"\x18\0\0\0", b"\xff\xff\xff\xff")):
         with pytest.raises(FrameFormatError):
             loaded(tmp_path, "a.pcd", wrong)
-    with pytest.raises(BadTableError, match="4 bytes before it"):
+    with pytest.raises(BadFileError, match="4 bytes before it"):
         unpack_lzf(bytes.fromhex("20 03"), 3)
 
 
@@ -247,15 +247,15 @@ def test_compressed_pcd(tmp_path: Path) -> None:
         ("a.ply", b"little_endian 1.0", b"little_endian 2.0", "PLY header"),
         ("a.ply", b"end_header\n", b"", "PLY header|header"),
         ("a.ply", b"\x6f\x12\x83\x3a", b"\x6f\x12\x83\xba", "a cloud, got sigma"),
-        ("t.ply", b"4 -8.25", b"4", "7 numbers in line 2"),
-        ("t.ply", b"4 -8.25", b"4 -8.25 7", "7 numbers in line 2"),
+        ("t.ply", b"4 -8.25", b"4", "7 numbers in row 2 of the data"),
+        ("t.ply", b"4 -8.25", b"4 -8.25 7", "7 numbers in row 2 of the data"),
         ("t.ply", b"4 -8.25", b"4 x", "expected numbers, got"),
         ("t.ply", b"255", b"256", "numbers from 0 to 255"),
         ("t.ply", b"255", b"1e2", "expected numbers"),
         ("t.ply", b"vertex 2", b"vertex 4", "4 lines of"),
         ("a.pcd", b"VERSION 0.7", b"VERSION 0.5", "VERSION 0.7, got '0.5'"),
         ("a.pcd", b"FIELDS x", b"FIELD x", "a PCD file's"),
-        ("a.pcd", b"WIDTH 2", b"WIDTH 3", "WIDTH times HEIGHT POINTS, got 3, 1 and 2"),
+        ("a.pcd", b"WIDTH 2", b"WIDTH 3", "POINTS equal to WIDTH times HEIGHT, got 2, 3 and 1"),
         ("a.pcd", b"WIDTH 2\nHEIGHT 1", b"WIDTH 2\nHEIGHT 9999", "POINTS"),
         ("a.pcd", b"SIZE 4", b"SIZE 3", "got 'F3'"),
         ("a.pcd", b"COUNT 1", b"COUNT 0", "COUNT from 1"),
@@ -339,7 +339,7 @@ def test_torn_and_mixed_files_are_clouds_or_typed_errors(
 
 @given(st.binary(max_size=64), st.integers(0, 4096))
 def test_any_bytes_unpack_or_are_refused(data: bytes, size: int) -> None:
-    with contextlib.suppress(BadTableError):
+    with contextlib.suppress(BadFileError):
         assert len(unpack_lzf(data, size)) == size
 
 

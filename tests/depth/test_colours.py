@@ -225,7 +225,7 @@ def test_other_shapes_are_left_out() -> None:
     assert len(find_regions(mask)) == 6
     areas = [one.area for one in find_regions(mask)]
     assert areas == sorted(areas, reverse=True)
-    assert [one.area for one in find_regions(mask, most=2)] == areas[:2]
+    assert [one.area for one in find_regions(mask, max_regions=2)] == areas[:2]
 
 
 def test_smallest_regions_have_sides() -> None:

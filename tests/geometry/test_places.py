@@ -21,7 +21,7 @@ def test_pattern_of_three_touches_has_the_touched_places(frame: Transform) -> No
     pattern = PlacePattern.from_touches(*corners, rows=2, columns=4, layers=3, height=0.01)
     assert len(pattern) == len(list(pattern)) == 24
     for number, place in enumerate(pattern):
-        row, column, layer = pattern.at(number)
+        row, column, layer = pattern.row_column_layer(number)
         assert number == (layer * 2 + row) * 4 + column
         true = frame.apply([0.04 * column, 0.05 * row, 0.01 * layer])
         np.testing.assert_allclose(place.translation, true, atol=1e-9)
@@ -75,6 +75,6 @@ def test_numbers_that_cannot_be_are_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"columns: expected .* 2"):
         PlacePattern.from_touches([0, 0, 0], [1, 0, 0], [0, 1, 0], rows=2, columns=1)
     with pytest.raises(ConfigurationError, match="number"):
-        PlacePattern(frame=FLAT).at(1)
+        PlacePattern(frame=FLAT).row_column_layer(1)
     with pytest.raises(CalibrationError, match="expected a Transform"):
         PlacePattern(frame=np.eye(4))  # type: ignore[arg-type]

@@ -62,7 +62,7 @@ def test_transform_pose_there_and_back_keeps_frame_and_time() -> None:
 
 def test_transform_turn_is_the_product_of_quaternions() -> None:
     one = Transform("a", "b", yaw(0.5), np.zeros(3))
-    turned = one.turn([[0.0, 0.0, 1.0, 0.0]])
+    turned = one.apply_to_orientations([[0.0, 0.0, 1.0, 0.0]])
     np.testing.assert_allclose(turned, [[0, 0, math.cos(0.25), -math.sin(0.25)]], atol=1e-15)
 
 
@@ -183,7 +183,7 @@ def test_history_of_other_frames_or_without_a_time_is_refused() -> None:
 @pytest.mark.parametrize("seconds", [-0.001, 0.201], ids=["before", "after"])
 def test_history_is_not_extrapolated(seconds: float) -> None:
     history = PoseHistory()
-    with refused("BAD_TIME", "a time that is known"):
+    with refused("BAD_TIME", "the pose history is empty"):
         history.at(NOON)
     for at in (0.0, 0.1, 0.2):
         history.add(shift("a", "b", at, after(at)))

@@ -147,7 +147,7 @@ async def test_tf_finds_the_poses_of_a_camera_that_the_robot_carries() -> None:
     tree.put("base_link", "tool0", (0.7, -0.1, 0.6))  # and somewhere else
     calibration = fit_plane(SEEN, TOUCHED, model="similarity")
     carried = MovingCamera(chain_of(calibration), calibrated_at, field=TOUCHED)
-    wanted = carried.now(now).transform([[0.001, -0.25]])
+    wanted = carried.at_pose(now).transform([[0.001, -0.25]])
     moved = tree.lookup("base_link", poses.header.frame_id)
     assert np.allclose(moved.apply(where(poses.poses[0])), wanted)
 

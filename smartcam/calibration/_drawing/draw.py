@@ -99,7 +99,7 @@ def draw_uncertainty(
     name = f"standard deviation of the projection of a point at {distance_text}"
     caption = _figures_text(shown.figures)
     if not (is_reached := np.isfinite(shown.sigma)).all():
-        caption += f"; the model of the lens ends before {1 - is_reached.mean():.1%} of the image"
+        caption += f"; the lens model does not reach {1 - is_reached.mean():.1%} of the image"
     return draw_maps([Map(name, shown.size, shown.sigma, caption, points)], title, "px")
 
 

@@ -40,9 +40,10 @@ def draw_file(
     available = PICTURES.get(document.kind, ())
     if not available or picture not in {None, *available}:
         expected = picture or " or ".join(PICTURES)
+        wanted = f"the picture {picture}" if picture else f"a file of kind {expected}"
         raise Code.WRONG_KIND.error(
-            f"{path}: holds {document.kind!r}, of which there is "
-            f"{' and '.join(available) or 'no picture'}; expected {expected}",
+            f"{path}: expected {wanted}, got a file of kind {document.kind!r}, which has "
+            f"{' and '.join(available) or 'no picture'}",
             expected,
             document.kind,
         )

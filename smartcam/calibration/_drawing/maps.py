@@ -44,7 +44,7 @@ class Map(NamedTuple):
 
     title: str
     size: tuple[int, int]  # size of the image, pixels
-    values: Array  # (h, w), a grid of places up to the image's corners; NaN: no value
+    values: Array  # (h, w), at a grid of points from corner to corner, drawn as cells; NaN: none
     caption: str = ""  # text below the map
     points: Array = np.zeros((0, 2))  # pixels that are marked by dots
 

@@ -90,7 +90,7 @@ class Folder:
         """Return the path that an export is written to; create its folder.
 
         Args:
-            target: name of the file, with the suffix ``.json`` or ``.yaml``.
+            target: name of the file, with one of the suffixes in _SUFFIXES.
 
         Raises:
             CalibrationError: ``BAD_NAME``.

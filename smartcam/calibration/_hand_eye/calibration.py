@@ -612,7 +612,7 @@ def _build_calibration(
         camera=camera,
         target_scale=observations.scale(solution.change),
         method=best.name,
-        candidates={
+        candidate_errors={
             candidate.name: candidate.held_out if math.isfinite(candidate.held_out) else None
             for candidate in all_candidates
         },

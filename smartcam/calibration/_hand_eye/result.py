@@ -15,9 +15,9 @@ from smartcam.calibration._lens.poses import CAMERA, TARGET, PoseInCamera, check
 from smartcam.calibration._targets import resized
 from smartcam.calibration._verdict import (
     VIEW_CURES,
+    AdvisedVerdict,
     Allowed,
     CalibrationVerdict,
-    Judgement,
     judge,
 )
 from smartcam.calibration._views import TargetView
@@ -46,7 +46,7 @@ def _frames(context: storage.Context, subject: str) -> tuple[str, str]:
 FlangePose = Annotated[Transform, storage.motion(lambda known: _frames(known, "flange"))]
 CameraPlace = Annotated[Transform, storage.motion(lambda known: _frames(known, CAMERA))]
 TargetPlace = Annotated[Transform, storage.motion(lambda known: _frames(known, TARGET))]
-NullableNumbers = Annotated[Array, storage.rows(storage.Number | None, least=3, nulls=True)]
+NullableNumbers = Annotated[Array, storage.rows(storage.Number | None, min_length=3, nulls=True)]
 FrameNames = Annotated[tuple[str, str], storage.row(tuple[str, str])]
 SIGMAS_FORM = storage.row(tuple[storage.Number, storage.Number], RobotSigmas._make)
 COVARIANCE_FORM = storage.Form(
@@ -73,8 +73,8 @@ class HandEyeCalibration(storage.SavedCalibration):
             lengths of the robot or of the lens are off by this factor.
         method: name of the chosen candidate: ``robot`` or ``reprojection``, or a closed form; after
             a comma, the adjusted values.
-        candidates: RMS held-out error of each candidate on the target, metres; None for a candidate
-            without one.
+        candidate_errors: RMS held-out error of each candidate on the target, metres; None for a
+            candidate without one.
         errors: (V,), RMS error of each pose on the target, metres, with the solution from all used
             poses; NaN for a bad pose in which the target would be behind the camera.
         mean_error: mean error over all points of the used poses, metres, which others publish as 3D
@@ -102,6 +102,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     kind: ClassVar[str] = KIND
     _label: ClassVar[str] = "hand-eye calibration"
+    _keys: ClassVar[storage.Keys] = {"candidate_errors": "candidates"}
     _extra_keys: ClassVar[storage.ExtraKeys] = {
         "frames": (
             FrameNames,
@@ -121,7 +122,7 @@ class HandEyeCalibration(storage.SavedCalibration):
     camera: CameraModel | None
     target_scale: storage.Positive
     method: str
-    candidates: dict[str, storage.Number | None]
+    candidate_errors: dict[str, storage.Number | None]
     errors: NullableNumbers
     mean_error: storage.NonNegative
     leave_one_out: NullableNumbers
@@ -139,17 +140,17 @@ class HandEyeCalibration(storage.SavedCalibration):
         for array in (self.errors, self.leave_one_out, self.covariance):
             array.flags.writeable = False
 
-    def _check(self, fields: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], label: str) -> None:
         count = len(self.robot_poses)
         names = ("errors", "leave_one_out", "used", "target_poses")
-        storage.check_counts(fields, names, count, called)
+        storage.check_counts(fields, names, count, label)
         if self.views and (fields["target"] is None or len(self.views) != count):
             raise storage.invalid_data_error(
-                called, f"views: expected {count}, and their target", len(self.views)
+                label, f"views: expected {count}, and their target", len(self.views)
             )
         if self.covariance.shape != (12, 12):
             rows = len(self.covariance)
-            raise storage.invalid_data_error(called, "covariance: expected 12 rows of 12", rows)
+            raise storage.invalid_data_error(label, "covariance: expected 12 rows of 12", rows)
 
     @property
     def target(self) -> Target | None:
@@ -167,7 +168,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         distances = [float(np.linalg.norm(pose.translation)) for pose in self.target_poses]
         return Allowed.of(self.allowed_error, self.target_scale * float(np.median(distances)))
 
-    def judged(self) -> Judgement:
+    def judged(self) -> AdvisedVerdict:
         """Return the verdict and the advice; unknown with few poses, whose error says nothing."""
         held_out, codes = self.held_out_error, {warning.code for warning in self.warnings}
         unused = [str(number) for number, used in enumerate(self.used, 1) if not used]
@@ -192,7 +193,7 @@ class HandEyeCalibration(storage.SavedCalibration):
                 "Not known how good: the last view does not fit, and may show that something "
                 "moved: take more views"
             )
-            return Judgement(CalibrationVerdict("unknown", text), option="more")
+            return AdvisedVerdict(CalibrationVerdict("unknown", text), option="more")
         position_error = 1e3 * self.translation_error
         if position_error > self.allowed.error:
             text = (

@@ -313,7 +313,7 @@ def leave_out(adjusted: AdjustedBundle, observations: Sequence[Observation]) -> 
         refitted = bundle.with_steps(shared, pose_constant - pose_by_shared @ shared)
         squares = (
             pose_normal.cost
-            - float((pose_normal.pose_right * pose_constant).sum())
+            - float((pose_normal.pose_right_sides * pose_constant).sum())
             - 2.0 * pose_right @ shared
         )
         squares += float(shared @ pose_matrix @ shared)
@@ -435,7 +435,7 @@ class BundleEquations:
         normal.pose_blocks[self._is_unseen_pose] = np.eye(
             6
         )  # poses without an observation stay as they are
-        matrix, right = normal.shared, normal.shared_right
+        matrix, right = normal.shared, normal.shared_right_side
         for group in self._groups:
             columns, jacobian, by_points = self._derivatives(bundle, group)
             for pose, rows_of_pose in zip(group.poses, group.rows, strict=True):
@@ -444,7 +444,7 @@ class BundleEquations:
                 # derivatives by the pose, by the shared unknowns, and the residuals
                 product = flat_rows.T @ flat_rows
                 normal.pose_blocks[pose] += product[:6, :6]
-                normal.pose_right[pose] += product[:6, -1]
+                normal.pose_right_sides[pose] += product[:6, -1]
                 normal.coupling[pose][:, columns] += product[:6, 6:-1]
                 matrix[np.ix_(columns, columns)] += product[6:-1, 6:-1]
                 right[columns] += product[6:-1, -1]

@@ -231,13 +231,13 @@ class IntrinsicCalibration(storage.SavedCalibration):
         bundle = Bundle.single(self.camera, pose, points=points)
         return adjust(bundle, [Observation(0, 0, view)], self.sigma**2).residuals[0]
 
-    def _check(self, fields: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], label: str) -> None:
         count = 4 + len(self.camera.distortion)
-        storage.check_shape(self.covariance, (count, count), called, "covariance")
+        storage.check_shape(self.covariance, (count, count), label, "covariance")
         for fit in self.views:
-            storage.check_shape(fit.residuals, fit.view.points.shape, called, "residuals")
+            storage.check_shape(fit.residuals, fit.view.points.shape, label, "residuals")
         if self.sheet is not None:
-            storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
+            storage.check_shape(self.sheet, fields["target"].points.shape, label, "sheet")
 
 
 @check_arguments(

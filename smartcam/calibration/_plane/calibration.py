@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from smartcam.calibration._verdict import CalibrationVerdict, Judgement
+    from smartcam.calibration._verdict import AdvisedVerdict, CalibrationVerdict
 
 KIND = "plane"
 
@@ -87,7 +87,7 @@ MIN_DIRECTION_LENGTH = 1e-9
 """A vector shorter than this has no direction."""
 
 STALE_LEVEL = 0.01
-"""Default of the probability with which a calibration that still holds may be called stale."""
+"""Default of the probability with which a calibration that still holds may be label stale."""
 
 
 class Drift(NamedTuple):
@@ -121,7 +121,7 @@ class PlaneCalibration(storage.SavedCalibration):
         robot_points: (N, 3), as given, metres.
         weights: (N,), as given, or ones; 0 for a point that ``robust`` left out.
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres.
-        place: centre and size of the points, in both spaces.
+        normalization: centre and size of the points, in both spaces.
         unit_covariance: (12, 12), of the elements of the matrix between the centred and scaled
             points, row by row, for touches with a variance of 1 m^2.
         residuals: (N, 3), robot minus mapped, metres. They are smaller than the true errors, except
@@ -134,39 +134,43 @@ class PlaneCalibration(storage.SavedCalibration):
             or, if ``sigma_given`` is false, estimated from the residuals; None if it cannot be
             estimated.
         sigma_given: whether ``touch_sigma`` was given.
-        candidates: RMS held-out error of each compared model, metres; None for a model without one.
+        candidate_errors: RMS held-out error of each compared model, metres; None for a model
+            without one.
         nominal_scale: expected metres per unit of the camera's points.
         tool_z: (3,), direction of the tool's axis into the plane; None if it is not known.
         height: height of the plane over the touched one, metres; see :meth:`at_height`.
         robot_frame: name of the frame that poses are given in.
         camera_frame: name of the frame that localizations must come in; None for any.
-        y_down: whether the camera's y axis pointed down and was turned up before the points came,
-            as :func:`smartcam.connect` does with ``y_down``; None: not known.
-        allowed_error: the largest error of 95 of 100 points that the user allows, metres; None:
-            :attr:`verdict` takes a hundredth of the touched field.
+        y_down: whether the camera's own y axis points down; the points here have the opposite y, as
+            :func:`smartcam.connect` gives them with ``y_down``; None: not known.
+        allowed_error: error that 95 of 100 points may have at most, as the user wants, metres;
+            None: :attr:`verdict` takes a hundredth of the touched field.
         warnings: remarks to read before using the calibration; they number the points from 1, as
             pictures and wizards do.
     """
 
     kind: ClassVar[str] = KIND
     _label: ClassVar[str] = "plane calibration"
+    _keys: ClassVar[storage.Keys] = {"normalization": "place", "candidate_errors": "candidates"}
     _optional_keys: ClassVar[frozenset[str]] = frozenset(
         {"tool_z", "height", "camera_frame", "y_down", "allowed_error"}
     )
 
     model: ModelName | Literal["touches"]
-    camera_points: Annotated[Array, storage.rows(storage.Pair, 2, least=3)]
-    robot_points: Annotated[Array, storage.rows(storage.Triple, 3, least=3)]
-    weights: Annotated[Array, storage.rows(storage.NonNegative, least=3)]
+    camera_points: Annotated[Array, storage.rows(storage.Pair, 2, min_length=3)]
+    robot_points: Annotated[Array, storage.rows(storage.Triple, 3, min_length=3)]
+    weights: Annotated[Array, storage.rows(storage.NonNegative, min_length=3)]
     matrix: storage.Matrix43
-    place: Normalization
+    normalization: Normalization
     unit_covariance: Annotated[Array, storage.matrix(12)]
-    residuals: Annotated[Array, storage.rows(storage.Triple, 3, least=3)]
-    leave_one_out: Annotated[Array, storage.rows(storage.NullableTriple, 3, least=3, nulls=True)]
+    residuals: Annotated[Array, storage.rows(storage.Triple, 3, min_length=3)]
+    leave_one_out: Annotated[
+        Array, storage.rows(storage.NullableTriple, 3, min_length=3, nulls=True)
+    ]
     freedom: storage.Count
     touch_sigma: storage.NonNegative | None
     sigma_given: bool
-    candidates: dict[str, storage.Number | None]
+    candidate_errors: dict[str, storage.Number | None]
     nominal_scale: storage.Positive | None = None
     tool_z: storage.Vector3 | None = None
     height: storage.Number = 0.0
@@ -178,18 +182,18 @@ class PlaneCalibration(storage.SavedCalibration):
 
     def __post_init__(self) -> None:
         fields = [getattr(self, field.name) for field in dataclasses.fields(self)]
-        for array in (*fields, self.place.camera, self.place.robot):
+        for array in (*fields, self.normalization.camera_centre, self.normalization.robot_centre):
             if isinstance(array, np.ndarray):
                 array.flags.writeable = False
 
     @cached_property
     def _map(self) -> PlaneMap:
-        return PlaneMap(self.matrix, self.place.camera)
+        return PlaneMap(self.matrix, self.normalization.camera_centre)
 
     @cached_property
     def _local_matrix(self) -> Array:
         """The matrix between centred and scaled points (4, 3)."""
-        return self.place.to_normalized(self.matrix)
+        return self.normalization.to_normalized(self.matrix)
 
     @property
     def rotation(self) -> Array:
@@ -236,10 +240,10 @@ class PlaneCalibration(storage.SavedCalibration):
 
     @property
     def verdict(self) -> CalibrationVerdict:
-        """Verdict on the calibration's quality, the millimetres it is good for, and the cure."""
+        """Verdict on the calibration: its quality, the error to expect, and what to do about it."""
         return self.judged().verdict
 
-    def judged(self, predicted: float | None = None, where: str = "") -> Judgement:
+    def judged(self, predicted: float | None = None, where: str = "") -> AdvisedVerdict:
         """Return the verdict and the advice.
 
         ``predicted``: RMS error to expect, metres; None: that at the touched points. ``where``: the
@@ -349,7 +353,7 @@ class PlaneCalibration(storage.SavedCalibration):
                 self.normal,
                 self._parameter_derivatives,
                 self._touch_variance * self.unit_covariance,
-                self.place.camera_size,
+                self.normalization.camera_size,
                 flip=flip,
             )
             for n, sigma in zip(with_sigma, sigmas, strict=True):
@@ -388,8 +392,10 @@ class PlaneCalibration(storage.SavedCalibration):
 
     def _parameter_derivatives(self, camera_array: Array) -> Array:
         """Return the derivatives of mapped points by the fit's matrix, (K, 3, 12), metres."""
-        normalized = (camera_array - self.place.camera) / self.place.camera_size
-        derivatives: Array = self.place.robot_size * element_derivatives(
+        normalized = (
+            camera_array - self.normalization.camera_centre
+        ) / self.normalization.camera_size
+        derivatives: Array = self.normalization.robot_size * element_derivatives(
             self._local_matrix, normalized
         )
         return derivatives
@@ -433,7 +439,7 @@ class PlaneCalibration(storage.SavedCalibration):
             camera_points: (K, 2), or one point (2,).
             robot_points: (K, 3) or (3,), where the robot touches them, metres.
             level: probability, between 0 and 1, with which a calibration that still holds may be
-                called stale.
+                label stale.
 
         Raises:
             CalibrationError: as :meth:`covariance_at`; NOT_FINITE: the level is not valid.
@@ -465,7 +471,7 @@ class PlaneCalibration(storage.SavedCalibration):
             weighted_sum @ np.linalg.solve(shift_basis.T @ weighted, weighted_sum)
         )
         noise = Noise(
-            max(variance, (ROUNDING_RATIO * self.place.robot_size) ** 2),
+            max(variance, (ROUNDING_RATIO * self.normalization.robot_size) ** 2),
             None if self.sigma_given else self.freedom,
         )
         chance = noise.chance(all_squares, len(derivatives))
@@ -497,22 +503,24 @@ class PlaneCalibration(storage.SavedCalibration):
         share = height / distance
         matrix = self.matrix.copy()
         matrix[:3] = (1 - share) * matrix[:3] + share * np.outer(camera_centre, matrix[3])
-        place = dataclasses.replace(
-            self.place,
-            robot=(1 - share) * self.place.robot + share * camera_centre,
-            robot_size=(1 - share) * self.place.robot_size,
+        normalization = dataclasses.replace(
+            self.normalization,
+            robot_centre=(1 - share) * self.normalization.robot_centre + share * camera_centre,
+            robot_size=(1 - share) * self.normalization.robot_size,
         )
-        return dataclasses.replace(self, matrix=matrix, place=place, height=self.height + height)
+        return dataclasses.replace(
+            self, matrix=matrix, normalization=normalization, height=self.height + height
+        )
 
-    def _check(self, fields: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], label: str) -> None:
         names = ("robot_points", "weights", "residuals", "leave_one_out")
-        storage.check_counts(fields, names, len(self.camera_points), called)
+        storage.check_counts(fields, names, len(self.camera_points), label)
         if np.count_nonzero(self.weights) < 3:
             raise storage.invalid_data_error(
-                called, "weights: expected 3 that are not 0", self.weights.tolist()
+                label, "weights: expected 3 that are not 0", self.weights.tolist()
             )
         if self.unit_covariance.shape != (12, 12):
-            raise storage.invalid_data_error(called, "unit_covariance: expected rows of 12", None)
+            raise storage.invalid_data_error(label, "unit_covariance: expected rows of 12", None)
         _ = self._map  # an invalid matrix raises here, not only when the first part is mapped
 
 
@@ -550,8 +558,8 @@ def fit_plane(
             ``nominal_scale`` is given.
         touch_sigma: standard deviation of one coordinate of a touch, robot and camera together,
             metres; None: estimated from the residuals. If these have fewer than 6 degrees of
-            freedom, 0.2 mm are assumed for the missing ones. An estimate above 0.5 mm and a
-            thousandth of the field (squares added) is reported as POOR_FIT, since mistakes may
+            freedom, 0.2 mm are assumed for the missing ones. An estimate above
+            ``sqrt((0.5 mm)^2 + (field / 1000)^2)`` is reported as POOR_FIT, since mistakes may
             cause it.
         weights: (N,), one over the relative variance of each touch.
         nominal_scale: expected metres per unit of the camera's points.
@@ -568,11 +576,11 @@ def fit_plane(
         y_down: whether the camera's y axis points down and was turned up before the points came;
             None: not known. The value is stored, and compared when the calibration is used; nothing
             is turned here.
-        allowed_error: the largest error of 95 of 100 points that is good enough, metres; None: a
-            hundredth of the touched field. See :attr:`PlaneCalibration.verdict`.
+        allowed_error: error that 95 of 100 points may have at most, metres; None: a hundredth of
+            the touched field. See :attr:`PlaneCalibration.verdict`.
 
-    Repeated touches of one camera point, or touches at one pose of the robot close to each other,
-    count as a single point, their mean: an error of the point is in all of them.
+    Repeated touches of one camera point, or touches whose robot positions are nearly equal, count
+    as a single point, their mean: an error of the point is in all of them.
 
     Raises:
         CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
@@ -592,32 +600,36 @@ def fit_plane(
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
     check_positive(allowed_error, "allowed_error", "metres")
     merged = merge_repeated(camera, robot, point_weights)
-    marks, touches = merged.camera, merged.robot
-    inliers = np.arange(len(marks))
+    merged_camera, merged_robot = merged.camera, merged.robot
+    inliers = np.arange(len(merged_camera))
     min_points = MODELS["similarity" if model == "auto" else model].min_points
     # the message about equal points must name the points as given
-    if len(marks) < len(camera):
+    if len(merged_camera) < len(camera):
         check_samples(camera, robot, min_points, touch_sigma, allow_strays=robust)
     if robust:
-        inliers = np.flatnonzero(find_agreeing(marks, touches, merged.weights, touch_sigma))
-    check_samples(marks[inliers], touches[inliers], min_points, touch_sigma)
-    max_sigma = MAX_SIGMA.of(extent(touches[inliers])) if touch_sigma is None else touch_sigma
+        inliers = np.flatnonzero(
+            find_agreeing(merged_camera, merged_robot, merged.weights, touch_sigma)
+        )
+    check_samples(merged_camera[inliers], merged_robot[inliers], min_points, touch_sigma)
+    max_sigma = MAX_SIGMA.of(extent(merged_robot[inliers])) if touch_sigma is None else touch_sigma
     # all points are used, since points in a wrong order may also agree with one another
-    reordered = find_better_order(marks, touches, max_sigma)
+    reordered = find_better_order(merged_camera, merged_robot, max_sigma)
     if reordered is not None and set(reordered.moved).isdisjoint(inliers):
         reordered = None
     tool_axis = None if tool_z is None else mean_axis(tool_z, len(camera))
-    place, pairs = normalize(marks[inliers], touches[inliers], merged.weights[inliers])
-    sigma = None if touch_sigma is None else touch_sigma / place.robot_size
-    scale_ratio = place.camera_size / place.robot_size
+    normalization, pairs = normalize(
+        merged_camera[inliers], merged_robot[inliers], merged.weights[inliers]
+    )
+    sigma = None if touch_sigma is None else touch_sigma / normalization.robot_size
+    scale_ratio = normalization.camera_size / normalization.robot_size
     expected_scale = 1.0 if nominal_scale is None and model == "rigid" else nominal_scale
     candidates = Candidates(pairs, None if expected_scale is None else expected_scale * scale_ratio)
     start_model: ModelName = candidates.simplest_model() if model == "auto" else model
     preferred = candidates.choose(sigma, start_model)
     fitted = candidates.require(preferred if model == "auto" else model)
     held_out = candidates.held_out(fitted)
-    matrix = place.to_original(fitted.matrix)
-    plane = PlaneMap(matrix, place.camera)
+    matrix = normalization.to_original(fitted.matrix)
+    plane = PlaneMap(matrix, normalization.camera_centre)
     evidence = Evidence(
         pairs=pairs,
         fitted=fitted,
@@ -626,19 +638,21 @@ def fit_plane(
         is_model_given=model != "auto",
         held_out=held_out,
         sigma=sigma,
-        max_sigma=max_sigma / place.robot_size,
-        place=place,
+        max_sigma=max_sigma / normalization.robot_size,
+        normalization=normalization,
         nominal_scale=expected_scale,
         tool_cosine=None if tool_axis is None else check_side(plane.frame[:, 2], tool_axis),
         point_numbers=1 + merged.first_index[inliers],
     )
-    estimate = _estimate_touch_sigma(fitted, pairs.weights, TYPICAL_SIGMA_M / place.robot_size)
+    estimate = _estimate_touch_sigma(
+        fitted, pairs.weights, TYPICAL_SIGMA_M / normalization.robot_size
+    )
     if robust and touch_sigma is None and estimate is not None:
-        check_lever(lever(touches[inliers]), place.robot_size * estimate)
-    left_out = np.setdiff1d(np.arange(len(marks)), inliers)
-    stray_offsets = np.zeros_like(touches)
-    stray_offsets[left_out] = touches[left_out] - plane.transform(marks[left_out])
-    touch_offsets = robot - touches[merged.point_index]
+        check_lever(lever(merged_robot[inliers]), normalization.robot_size * estimate)
+    left_out = np.setdiff1d(np.arange(len(merged_camera)), inliers)
+    stray_offsets = np.zeros_like(merged_robot)
+    stray_offsets[left_out] = merged_robot[left_out] - plane.transform(merged_camera[left_out])
+    touch_offsets = robot - merged_robot[merged.point_index]
     compared_models: list[ModelName] = [*candidates.names] if model == "auto" else [fitted.model]
     calibration = PlaneCalibration(
         model=fitted.model,
@@ -646,23 +660,23 @@ def fit_plane(
         robot_points=robot,
         weights=np.where(np.isin(merged.point_index, inliers), point_weights, 0.0),
         matrix=matrix,
-        place=place,
-        unit_covariance=fitted.unit_covariance / place.robot_size**2,
-        residuals=_with_rows(stray_offsets, inliers, place.robot_size * fitted.residuals)[
+        normalization=normalization,
+        unit_covariance=fitted.unit_covariance / normalization.robot_size**2,
+        residuals=_with_rows(stray_offsets, inliers, normalization.robot_size * fitted.residuals)[
             merged.point_index
         ]
         + touch_offsets,
-        leave_one_out=_with_rows(stray_offsets, inliers, place.robot_size * held_out)[
+        leave_one_out=_with_rows(stray_offsets, inliers, normalization.robot_size * held_out)[
             merged.point_index
         ]
         + touch_offsets,
         freedom=fitted.freedom,
         touch_sigma=touch_sigma
         if estimate is None or touch_sigma is not None
-        else place.robot_size * estimate,
+        else normalization.robot_size * estimate,
         sigma_given=touch_sigma is not None,
-        candidates={
-            name: None if math.isnan(error) else place.robot_size * error
+        candidate_errors={
+            name: None if math.isnan(error) else normalization.robot_size * error
             for name, error in candidates.errors(compared_models).items()
         },
         nominal_scale=nominal_scale,
@@ -706,7 +720,7 @@ def _move_remarks(offsets: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]
         yield Code.POOR_FIT.remark(
             f"points {', '.join(map(str, numbers.tolist()))} are left out, and all lie "
             f"{1e3 * float(np.linalg.norm(shift)):.3g} mm off to one side: the sheet or the tip "
-            "moved between the touches, and which of both holds now, they cannot tell"
+            "moved between the touches; touch all points again"
         )
 
 
@@ -719,7 +733,7 @@ def _left_out_remark(calibration: PlaneCalibration, index: int, weight: float) -
     )
     return Code.OUTLIER.remark(
         f"point {1 + index} is left out: it lies {1e3 * distance:.3g} mm from where the others "
-        f"say, where touching explains {1e3 * math.sqrt(variance):.3g} mm rms"
+        f"predict it; touching errors alone would give {1e3 * math.sqrt(variance):.3g} mm rms"
     )
 
 

@@ -30,11 +30,11 @@ SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may cause a warning."""
 
 SCALE_TOLERANCE = 0.005
-"""A scale may differ from the nominal one by this part: printers, and the heights of parts, change
-the scale by as much."""
+"""A scale may differ from the nominal one by this fraction: printers, and the heights of
+workpieces, change the scale by as much."""
 
 MAX_SCALE_ERROR = 0.1
-"""If a scale differs from the nominal one by more than this part, the units or the sheet are
+"""If a scale differs from the nominal one by more than this fraction, the units or the sheet are
 wrong."""
 
 MIN_TOOL_COSINE = 0.17
@@ -50,7 +50,7 @@ MIN_POINTS_LEFT = 3
 similarity."""
 
 MIN_DEGREES_OF_FREEDOM = 6
-"""An estimated sigma with fewer degrees of freedom is off by 30 percent and more (derived)."""
+"""An estimated sigma with fewer degrees of freedom is off by 30 percent and more."""
 
 TYPICAL_SIGMA_M = 0.0002
 """Sigma of a careful touch, metres, assumed for the degrees of freedom that an estimate lacks."""
@@ -82,10 +82,11 @@ class Evidence(NamedTuple):
     candidates: Candidates  # the fits of the other models
     preferred: ModelName  # the model that the points justify
     is_model_given: bool  # whether the user chose the model
-    held_out: Array  # (N, 3), residuals of the chosen fit
+    # (N, 3), residual of each point with the fit to the other points; NaN if there is none
+    held_out: Array
     sigma: float | None  # standard deviation of a touch's coordinate; None if it was not given
     max_sigma: float  # the sigma that the user gave, else the largest plausible one
-    place: Normalization  # centre and size of the points
+    normalization: Normalization  # centre and size of the points
     nominal_scale: float | None  # metres per unit of the camera's points; None if it was not given
     # cosine between tool and normal; None if the tool's axis was not given
     tool_cosine: float | None
@@ -150,9 +151,9 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
 
 def _test_planarity(evidence: Evidence) -> Iterator[Remark]:
     """Compare the residuals along the normal with the given noise, or with those in the plane."""
-    affine, weights, count = evidence.candidates.get("affine"), evidence.pairs.weights, -3
-    count += len(weights)
-    if affine is None or not count:
+    affine, weights = evidence.candidates.get("affine"), evidence.pairs.weights
+    freedom = len(weights) - 3
+    if affine is None or not freedom:
         return
     normal = np.cross(*affine.matrix[:3, :2].T)
     normal /= np.linalg.norm(normal)
@@ -160,12 +161,13 @@ def _test_planarity(evidence: Evidence) -> Iterator[Remark]:
     squares_of_heights = float((weights * heights**2).sum())
     fitted = evidence.fitted.residuals
     squares_in_plane = sum_of_squares(fitted - np.outer(fitted @ normal, normal), weights)
-    noise = touch_noise(evidence.sigma, squares_in_plane, evidence.fitted.freedom - count)
-    if noise is not None and noise.chance(squares_of_heights, count) < SIGNIFICANCE_LEVEL:
-        worst, mm = int(np.argmax(weights * heights**2)), 1e3 * evidence.place.robot_size
+    noise = touch_noise(evidence.sigma, squares_in_plane, evidence.fitted.freedom - freedom)
+    if noise is not None and noise.chance(squares_of_heights, freedom) < SIGNIFICANCE_LEVEL:
+        worst, mm = int(np.argmax(weights * heights**2)), 1e3 * evidence.normalization.robot_size
         yield Code.NOT_PLANAR.remark(
-            f"the touched points lie {mm * math.sqrt(squares_of_heights / count):.3g} mm rms "
-            f"out of a plane, where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
+            f"the touched points lie {mm * math.sqrt(squares_of_heights / freedom):.3g} mm rms "
+            f"out of a plane, touching errors alone would give {mm * math.sqrt(noise.variance):.3g}"
+            " mm; "
             f"point {evidence.point_numbers[worst]} is the furthest, "
             f"{mm * abs(float(heights[worst])):.3g} mm"
         )
@@ -180,7 +182,9 @@ def _test_residuals(evidence: Evidence) -> Iterator[Remark]:
     ]
     worst = int(np.argmin(chances))
     if chances[worst] * len(chances) < SIGNIFICANCE_LEVEL:
-        residual = 1e3 * evidence.place.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
+        residual = (
+            1e3 * evidence.normalization.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
+        )
         yield Code.OUTLIER.remark(
             f"point {evidence.point_numbers[worst]} fits far worse than the others: its residual "
             f"of {residual:.3g} mm comes by chance once in {1 / max(chances[worst], 1e-12):.3g} "
@@ -189,7 +193,7 @@ def _test_residuals(evidence: Evidence) -> Iterator[Remark]:
         return
     max_sigma = max(evidence.max_sigma, ROUNDING_RATIO)
     if fitted.freedom and Noise(max_sigma**2).chance(total, fitted.freedom) < SIGNIFICANCE_LEVEL:
-        mm = 1e3 * evidence.place.robot_size
+        mm = 1e3 * evidence.normalization.robot_size
         how = "was given" if evidence.sigma is not None else "is the most that is taken for noise"
         yield Code.POOR_FIT.remark(
             "the residuals speak of touches with a sigma of "
@@ -227,8 +231,8 @@ def _test_wrong_touches(evidence: Evidence) -> Iterator[Remark]:
     if removed and chance > SIGNIFICANCE_LEVEL:
         points = " and ".join(str(evidence.point_numbers[i]) for i in removed)
         yield Code.OUTLIER.remark(
-            f"point{'s' * (len(removed) > 1)} {points} may be wrong: without, one scale fits all "
-            f"others as well as the model {fitted.model} does with them"
+            f"point{'s' * (len(removed) > 1)} {points} may be wrong: without them, one scale fits "
+            f"the rest as well as the model {fitted.model} fits all points"
         )
 
 
@@ -242,7 +246,7 @@ def _residual_chance(evidence: Evidence, squared: float, total: float) -> float:
 
 def _studentized_squares(fitted: Fit) -> Array:
     """Return each residual's square over its variance (N,); 0 where the variance is 0."""
-    values, vectors = np.linalg.eigh(fitted.blocks)
+    values, vectors = np.linalg.eigh(fitted.residual_covariances)
     components = np.einsum("nij,ni->nj", vectors, fitted.residuals)
     is_determined = values > MIN_VARIANCE_RATIO * values.max()
     squares: Array = np.where(
@@ -258,7 +262,7 @@ def _test_model(evidence: Evidence) -> Iterator[Remark]:
         return
     simple_model: ModelName = used if evidence.is_model_given else "similarity"
     errors = [
-        1e3 * evidence.place.robot_size * evidence.candidates.error(name)
+        1e3 * evidence.normalization.robot_size * evidence.candidates.error(name)
         for name in (simple_model, preferred)
     ]
     text = (
@@ -274,7 +278,7 @@ def _test_scale(evidence: Evidence) -> Iterator[Remark]:
     similarity = evidence.candidates.get("similarity")
     if evidence.nominal_scale is None or similarity is None:
         return
-    unit = evidence.place.robot_size / evidence.place.camera_size
+    unit = evidence.normalization.robot_size / evidence.normalization.camera_size
     measured = unit * float(np.linalg.norm(similarity.matrix[:3, 0]))
     total = sum_of_squares(similarity.residuals, evidence.pairs.weights)
     noise = touch_noise(evidence.sigma, total, similarity.freedom)
@@ -290,8 +294,8 @@ def _test_held_out(evidence: Evidence) -> Iterator[Remark]:
     missing = np.flatnonzero(np.isnan(evidence.held_out).any(axis=1))
     if len(missing) == len(evidence.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{len(missing)} points are no more than {evidence.fitted.model} has need of: none can "
-            "be left out to see how good the calibration is, and the residuals do not tell"
+            f"{len(missing)} points are just enough for the model {evidence.fitted.model}: none "
+            "can be left out to see how good the calibration is, and the residuals do not tell"
         )
     elif len(missing):
         yield Code.NOT_HELD_OUT.remark(

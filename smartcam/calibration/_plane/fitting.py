@@ -6,15 +6,15 @@ degrees of freedom. The models are special cases: affine (9) has ``w = 1``, simi
 of equal length at right angles, rigid (6) has a scale that is known beforehand.
 
 All four are fitted by least squares in the robot's space, which is the most likely map if the noise
-of the touches is independent and equal on each axis; noise of the camera counts as noise of the
-touch. Points are centred and scaled first. The covariance is that of the matrix' 12 elements,
-for every model.
+of the touches (the robot's points, touched with its tip) is independent and equal on each axis;
+noise of the camera counts as noise of the touch. Points are centred and scaled first. The
+covariance is that of the matrix' 12 elements, for every model.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
@@ -57,10 +57,12 @@ square."""
 class Normalization(storage.Stored):
     """Centres and sizes of the points; for a fit, points are centred and divided by their size."""
 
-    camera: storage.Vector2  # centre of the camera's points (2,)
+    _keys: ClassVar[storage.Keys] = {"camera_centre": "camera", "robot_centre": "robot"}
+
+    camera_centre: storage.Vector2  # of the camera's points (2,)
     # RMS distance of the camera's points from their centre, in the camera's unit
     camera_size: storage.Positive
-    robot: storage.Vector3  # centre of the robot's points (3,), metres
+    robot_centre: storage.Vector3  # of the robot's points (3,), metres
     robot_size: storage.Positive  # RMS distance of the robot's points from their centre, metres
 
     def to_original(self, matrix: Array) -> Array:
@@ -68,18 +70,18 @@ class Normalization(storage.Stored):
         result = (
             np.concatenate([self.robot_size * matrix[:3], matrix[3:]]) @ self._normalizing_matrix()
         )
-        result[:3] += np.outer(self.robot, result[3])
+        result[:3] += np.outer(self.robot_centre, result[3])
         return result
 
     def to_normalized(self, matrix: Array) -> Array:
         """Return the matrix (4, 3) between normalized points from that between original points."""
         result = matrix.copy()
-        result[:3] = (result[:3] - np.outer(self.robot, result[3])) / self.robot_size
+        result[:3] = (result[:3] - np.outer(self.robot_centre, result[3])) / self.robot_size
         return result @ np.linalg.inv(self._normalizing_matrix())
 
     def _normalizing_matrix(self) -> Array:
         matrix = np.diag([1.0 / self.camera_size, 1.0 / self.camera_size, 1.0])
-        matrix[:2, 2] = -self.camera / self.camera_size
+        matrix[:2, 2] = -self.camera_centre / self.camera_size
         return matrix
 
 
@@ -111,7 +113,7 @@ class Fit:
     residuals: Array  # (N, 3), robot minus mapped
     # (12, 12), of the matrix' elements row by row, for a touch variance of 1
     unit_covariance: Array
-    blocks: Array  # (N, 3, 3), variance of each residual for a touch variance of 1
+    residual_covariances: Array  # (N, 3, 3), for a touch variance of 1
     freedom: int  # number of coordinates minus number of parameters
 
 
@@ -130,9 +132,9 @@ class Model:
 def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
     """Return the most likely map of one model; raise COLLINEAR if the points do not determine it.
 
-    There must be as many ``pairs`` as the model needs, in both spaces neither all the same nor all
-    in a line. ``scale`` is the ratio of a length in the robot's unit to that in the camera's, for
-    ``rigid`` only.
+    ``pairs``: at least as many as the model needs; neither the camera's nor the robot's points may
+    all be the same, or all in a line. ``scale``: ratio of a length in the robot's unit to that in
+    the camera's, for ``rigid`` only.
     """
     model = MODELS[name]
     matrix = model.solve(pairs, scale)
@@ -198,7 +200,7 @@ def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
 def _held_out_by_leverage(fitted: Fit, pairs: Pairs) -> Array:
     # Without point i the residual there is (I - H_ii)^-1 e_i, exactly so in a linear fit.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
-    weighted_blocks = fitted.blocks * pairs.weights[:, None, None]
+    weighted_blocks = fitted.residual_covariances * pairs.weights[:, None, None]
     smallest = np.linalg.eigvalsh(weighted_blocks)[:, 0]
     result = np.full_like(pairs.robot, np.nan)
     is_determined = smallest > MIN_CONDITION**2

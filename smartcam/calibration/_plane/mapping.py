@@ -59,7 +59,7 @@ class PlaneMap:
         self.matrix: Array = matrix
         """As given."""
         self._depth: tuple[float, float, float] = tuple(matrix[3].tolist())
-        self._max_sum = 3.0 * float(np.abs(matrix).max())
+        self._max_row_sum = 3.0 * float(np.abs(matrix).max())
         self.projective: bool = bool(matrix[3, :2].any())
         """True if parallel lines may meet, as under a homography."""
         with np.errstate(all="ignore"):
@@ -113,7 +113,8 @@ class PlaneMap:
                 self._check_horizon(block)
             self._map_block(blocks.block(begin), result[begin : begin + POINTS_PER_BLOCK])
             if not (
-                least_depth > 0 and self._max_sum * max(largest, 1.0) / least_depth < MAX_COORDINATE
+                least_depth > 0
+                and self._max_row_sum * max(largest, 1.0) / least_depth < MAX_COORDINATE
             ):
                 _check_mapped(block, result[begin : begin + POINTS_PER_BLOCK])
         return result
@@ -247,7 +248,7 @@ class _HomogeneousBlocks:
 
 
 def _check_mapped(points: Array, result: Array) -> None:
-    """Raise NOT_FINITE if a finite point has no finite result; set results of NaN to NaN."""
+    """Raise NOT_FINITE if a finite point has no finite result; map other points to NaN."""
     is_finite = np.isfinite(points).all(axis=1)
     result[~is_finite] = np.nan
     is_wrong = is_finite & ~np.isfinite(result).all(axis=1)

@@ -2,7 +2,7 @@
 
 The calibration holds for the robot's pose at which it was made, ``T_cal``. At another pose,
 ``T_now``, the camera and everything that it sees have moved by the rigid motion ``T_now T_cal^-1``
-in the robot's frame. So this motion is applied *after* the static chain (derived). The thesis with
+in the robot's frame. So this motion is applied *after* the static chain. The thesis with
 which smartcam began, 3.2.5.2, applies the motion before the chain. That would be right only if the
 camera's place on the robot were known, which a plane's calibration does not determine.
 
@@ -55,7 +55,7 @@ class MovingCamera:
         tolerance: largest distance that the plane may move out of itself at any point of the field,
             metres. A touch by hand is accurate to a fifth of a millimetre.
         max_lag: longest time between a pose of the robot and the image, seconds. At 250 mm/s the
-            robot moves 5 mm in 20 ms, a quarter of a millimetre in one.
+            robot moves 5 mm in 20 ms, 0.25 mm in 1 ms.
 
     Raises:
         CalibrationError: ``SHAPE``, ``NOT_FINITE``, ``TOO_FEW`` or ``COLLINEAR`` points of the
@@ -92,7 +92,7 @@ class MovingCamera:
         heights = (points - self._centre) @ self._normal
         self._field = points - np.outer(heights, self._normal)  # without the touches' noise
 
-    def now(self, pose: Transform, image_at: datetime | None = None) -> Chain:
+    def at_pose(self, pose: Transform, image_at: datetime | None = None) -> Chain:
         """Return the chain of solvers for an image that was taken at a pose.
 
         Args:
@@ -154,7 +154,7 @@ class MovingCamera:
             )
 
     def _check_plane(self, motion: Transform) -> None:
-        """Raise PLANE_MOVED if a motion shifts, tilts or turns over the plane."""
+        """Raise PLANE_MOVED if a motion shifts, tilts or flips the plane."""
         distance = float(np.abs((motion.apply(self._field) - self._centre) @ self._normal).max())
         cosine = float((motion.rotation @ self._normal) @ self._normal)
         if distance <= self._tolerance and cosine > 0:

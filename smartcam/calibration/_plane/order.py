@@ -75,9 +75,9 @@ class Reordered(NamedTuple):
         problem = "exchanged" if len(moved) == 2 else "in the wrong order"
         note = "" if self.sure else "; more than one order does as well: touch them again"
         return Code.WRONG_ORDER.remark(
-            f"the touches of points {points_text} look {problem}: as given they speak of a touch "
-            f"with a sigma of {1e3 * self.before:.3g} mm, put right of "
-            f"{1e3 * self.after:.3g} mm{note}"
+            f"the touches of points {points_text} look {problem}: their sigma is "
+            f"{1e3 * self.before:.3g} mm in the given order, and {1e3 * self.after:.3g} mm in the "
+            f"corrected order{note}"
         )
 
 

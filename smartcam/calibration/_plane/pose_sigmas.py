@@ -23,7 +23,7 @@ def robot_sigmas(
     localizations: list[Localization],
     transform: Callable[[Array], Array],
     normal: Array,
-    by_matrix: Callable[[Array], Array],
+    jacobian: Callable[[Array], Array],
     covariance: Array,
     size: float,
     *,
@@ -35,7 +35,8 @@ def robot_sigmas(
         localizations: localizations of the camera, whose poses have sigmas.
         transform: function that maps points of the camera (N, 2) to the robot's space.
         normal: the plane's normal (3,).
-        by_matrix: derivatives of mapped points by the calibration's parameters, (N, 3, K).
+        jacobian: function that returns the derivatives (N, 3, K) of mapped points with respect to
+            the calibration's parameters.
         covariance: covariance of these parameters, (K, K).
         size: size of the touched field, in the camera's unit.
         flip: whether the poses are turned about their x axis.
@@ -75,7 +76,7 @@ def robot_sigmas(
     covariances = np.array(
         [_pose_covariance(localization.pose.sigma) for localization in localizations]
     )
-    rows_at_points, rows_ahead = by_matrix(points), by_matrix(points_ahead(points, angles))
+    rows_at_points, rows_ahead = jacobian(points), jacobian(points_ahead(points, angles))
     angle_rows = (
         np.einsum("ni,nik->nk", left_normals, rows_ahead - rows_at_points) / lengths[:, None]
     )

@@ -75,7 +75,7 @@ SEED = 7
 """Subsets are drawn by random numbers from this seed, so that results repeat."""
 
 MEDIAN_SQUARE = 2.366
-"""Median of the squared length of a residual in three dimensions with a variance of 1 (derived)."""
+"""Median of the squared length of a residual in three dimensions with a variance of 1."""
 
 MIN_TRIANGLE_RATIO = 0.02
 """The smallest triangle of a subset must be larger than this part of its largest one: otherwise its

@@ -2,7 +2,7 @@
 
 A wrong tip moves every touch by the same vector *in the flange's frame*. This error cancels only if
 the flange has the same orientation at all touches: between two touches that are half a turn apart,
-an error of 1 mm becomes 2 mm (derived).
+an error of 1 mm becomes 2 mm.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_ORIENTATION_SPREAD: Final = 0.17
-"""Least singular value of the differences of rotations; two touches 20 degrees apart have it."""
+"""Singular values of the differences of rotations count only above this; two touches 20 degrees
+apart reach it."""
 
 
 class ToolTip(NamedTuple):

@@ -91,9 +91,9 @@ def fit_touches(
         tool_z: (3,), direction of the tool's axis, into the plane, when it touched.
         robot_frame: name of the frame that poses will be given in.
         camera_frame: name of the frame that localizations must come in; None for any.
-        y_down: whether the camera's y axis points down and was turned up before the origin came;
-            None: not known. The value is stored, and compared when the calibration is used; nothing
-            is turned here.
+        y_down: whether the camera's own y axis points down; ``origin`` has the opposite y. None:
+            not known. The value is stored, and compared when the calibration is used; nothing is
+            turned here.
 
     Returns:
         A calibration with the model ``touches``. Its camera points are the places of the touches on
@@ -102,7 +102,7 @@ def fit_touches(
     Raises:
         CalibrationError: SHAPE, NOT_FINITE, TOO_FEW, COINCIDENT: A or B lies on the origin;
             COLLINEAR: the rays are less than 10 degrees apart; SHORT_LEVER; MIRRORED; UNIT_UNKNOWN:
-            they are farther apart than 20 m.
+            the touches are farther apart than 20 m.
 
     Source: the thesis' procedure, sections 3.2.3 and 3.2.4, with its mathematics corrected.
     """
@@ -132,7 +132,7 @@ def fit_touches(
     centre = np.array([origin.pose.position.x, origin.pose.position.y])
     theta = origin.pose.orientation.theta
     size = math.sqrt(float(np.mean(np.square(levers))))
-    place = Normalization(centre, size / nominal_scale, sheet.origin, size)
+    normalization = Normalization(centre, size / nominal_scale, sheet.origin, size)
     normalized_matrix = np.zeros((4, 3))
     normalized_matrix[:3, :2] = rotate_ccw(sheet.frame[:, :2], theta)
     normalized_matrix[3, 2] = 1.0
@@ -149,15 +149,15 @@ def fit_touches(
         camera_points=centre + rotate_ccw(places, theta),
         robot_points=all_touches,
         weights=np.ones(len(all_touches)),
-        matrix=place.to_original(normalized_matrix),
-        place=place,
+        matrix=normalization.to_original(normalized_matrix),
+        normalization=normalization,
         unit_covariance=covariance,
         residuals=sheet.residuals,
         leave_one_out=np.full_like(all_touches, np.nan),
         freedom=freedom,
         touch_sigma=sigma if touch_sigma is None else touch_sigma,
         sigma_given=touch_sigma is not None,
-        candidates={},
+        candidate_errors={},
         nominal_scale=nominal_scale,
         tool_z=tool_axis,
         robot_frame=robot_frame,
@@ -207,11 +207,12 @@ def _linearize(
     offsets = touches - origin
     positions = (offsets * directions).sum(axis=1)
     projections = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    by_turn = np.cross(np.eye(3)[None], directions[:, None], axis=2).swapaxes(1, 2)
-    by_sheet = np.concatenate(
-        [np.broadcast_to(np.eye(3), by_turn.shape), positions[:, None, None] * by_turn], axis=2
+    turn_jacobian = np.cross(np.eye(3)[None], directions[:, None], axis=2).swapaxes(1, 2)
+    sheet_jacobian = np.concatenate(
+        [np.broadcast_to(np.eye(3), turn_jacobian.shape), positions[:, None, None] * turn_jacobian],
+        axis=2,
     )
-    jacobian = (projections @ by_sheet).reshape(-1, 6)
+    jacobian = (projections @ sheet_jacobian).reshape(-1, 6)
     return positions, (projections @ offsets[..., None])[..., 0], jacobian
 
 

@@ -19,17 +19,16 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_EXTENT_IN_SIGMAS = 20.0
-"""Least extent of the touched points across their longest direction, in sigmas of a touch."""
+"""Least width of the touched points, at right angles to their longest direction, in sigmas."""
 
 MIN_WIDTH_RATIO = 0.1
-"""Least ratio of the extent across the longest direction to the extent along it, both RMS.
+"""Least ratio of the width to the extent along the longest direction, both RMS.
 
-Three points whose legs are 10 degrees apart have 0.15.
+Three points that form an angle of 10 degrees have 0.15.
 """
 
 MAX_THICKNESS_RATIO = 0.2
-"""Largest ratio of the extent out of the plane to the extent across the longest direction, both
-RMS."""
+"""Largest ratio of the extent out of the plane to the width, both RMS."""
 
 SAME_MARK_RATIO = 0.01
 """Camera points with the same touch are taken as one mark if they are closer together than this
@@ -114,7 +113,7 @@ def merge_repeated(camera: Array, robot: Array, weights: Array) -> DistinctPoint
 
 
 def check_positive(value: float | None, name: str, unit: str) -> None:
-    """Raise NOT_FINITE if an option is neither None nor a positive number."""
+    """Raise NOT_FINITE if an option is neither None nor a positive, finite number."""
     if value is None:
         return
     number: object = as_plain_value(value)
@@ -176,7 +175,7 @@ def check_field(robot: Array) -> None:
 
 
 def lever(robot: Array) -> float:
-    """Return the extent of touched points (N, 3) across their longest direction, metres."""
+    """Return the extent of touched points (N, 3) at right angles to the longest one, metres."""
     return float(np.ptp(_in_principal_axes(robot)[:, 1]))
 
 

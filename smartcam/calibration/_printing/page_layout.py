@@ -1,7 +1,8 @@
 """Place a target, its rays, rulers and texts on a page; all lengths are millimetres.
 
-The target is at the lower left, so that the rays A and B are as long as the page allows. Rulers are
-to its left and below it; texts are above it, to the right of the ray B.
+The rays A and B are printed lines from the target's origin, along its x and y axes. The target is
+at the lower left, so that they are as long as the page allows. Rulers are to its left and below it;
+texts are above it, to the right of the ray B.
 """
 
 from __future__ import annotations
@@ -62,10 +63,11 @@ LETTER_WIDTH_RATIO: Final = 0.6
 Arial."""
 
 AREA_REACH_SQUARES: Final = AREA_DISTANCE_SQUARES + AREA_DIAMETER_SQUARES / 2
-"""Distance from a checkerboard's outer corners to the round areas' outer ends, in squares."""
+"""Distance from a checkerboard's outer corners to the outer rims of the origin's dot and of the
+round white areas at the other corners, in squares."""
 
 AREA_GAP_MM: Final = 1.0
-"""Distance between a white area outside of a checkerboard and the next printed part, mm."""
+"""Distance between such an area and the next printed part, mm."""
 
 
 class PageLayout:
@@ -74,8 +76,8 @@ class PageLayout:
     Args:
         box: rectangle around the target's pattern.
         pitch: a square's side, or the distance of two dots.
-        area_reach: distance that the areas with and without an origin mark reach beyond the
-            pattern's corners; 0 without a mark.
+        area_reach: distance by which the origin's dot and the white areas at the other corners
+            reach beyond the pattern's corners; 0 without a mark.
         texts: lines of text to print.
         width: width of the page.
         height: height of the page.
@@ -109,9 +111,7 @@ class PageLayout:
             int((width - BORDER_MM - x - TEXT_LEFT_MM) / (LETTER_WIDTH_RATIO * TEXT_MM)),
             MIN_LETTERS_PER_LINE,
         )
-        self._lines = [
-            line for text_space in texts for line in textwrap.wrap(text_space, letters_per_line)
-        ]
+        self._lines = [line for text in texts for line in textwrap.wrap(text, letters_per_line)]
         self._text_width = max(map(len, self._lines)) * LETTER_WIDTH_RATIO * TEXT_MM
         text_space = self._distance_from_target(
             TEXT_LEFT_MM + self._text_width, box.right

@@ -8,7 +8,7 @@
     ...
     target = scale_target(sheet.target, (99.2, 99.3))  # measured lengths of the rulers, mm
 
-A description is printed on each sheet; both files carry the target's description, as
+A title is printed on each sheet. The SVG and the PDF also hold the target's description as JSON, as
 :func:`~smartcam.calibration.target_from_data` reads it.
 """
 
@@ -297,13 +297,13 @@ def _title(target: Target | Rays) -> str:
     match target:
         case Checkerboard():
             mark_text = ", marked origin" if target.origin_mark else ""
-            description = (
+            summary = (
                 f"checkerboard, {target.columns} x {target.rows} corners, "
                 f"squares of {_mm(target.square)}{mark_text}"
             )
         case Charuco():
             legacy_text = ", legacy pattern" if target.legacy_pattern else ""
-            description = (
+            summary = (
                 f"ChArUco, {target.columns} x {target.rows} squares of {_mm(target.square)}, "
                 f"markers of {_mm(target.marker)}, {target.dictionary}{legacy_text}"
             )
@@ -311,19 +311,19 @@ def _title(target: Target | Rays) -> str:
             kind = "asymmetric circles" if target.asymmetric else "circles"
             origin = target.origin_diameter
             origin_text = "" if origin is None else f", origin {_mm(origin)}"
-            description = (
+            summary = (
                 f"{kind}, {target.columns} x {target.rows}, {_mm(target.spacing)} apart, "
                 f"diameter {_mm(target.diameter)}{origin_text}"
             )
         case MarkerGrid():
             kind = "AprilGrid of Kalibr" if target.kalibr else "grid of markers"
-            description = (
+            summary = (
                 f"{kind}, {target.columns} x {target.rows} of {_mm(target.marker)}, "
                 f"{_mm(target.gap)} apart, {target.dictionary} from {target.first_id}"
             )
         case Rays():
-            description = f"rays A and B, origin mark of {_mm(target.diameter)}"
-    return f"smartcam sheet {_sheet_id(target)}: {description}"
+            summary = f"rays A and B, origin mark of {_mm(target.diameter)}"
+    return f"smartcam sheet {_sheet_id(target)}: {summary}"
 
 
 ORIGINS: Final[Mapping[type[Target | Rays], str]] = {

@@ -9,7 +9,8 @@
     )
     calibration.transform([[412.5, 300.0]])         # pixels, v down: metres of the robot
 
-The robot touches corners of the sheet, or its rays; the camera need not see the touched points.
+The robot touches points of the printed target, or the lines ("rays") that are printed along its x
+and y axes; the camera need not see the touched points.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._plane.pose_sigmas import robot_sigmas
 from smartcam.calibration._sheet.plane import SheetPlane, fit_sheet_view
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
-from smartcam.calibration._verdict import CalibrationVerdict, Judgement
+from smartcam.calibration._verdict import AdvisedVerdict, CalibrationVerdict
 from smartcam.calibration._views import TargetView
 from smartcam.geometry import CameraModel
 from smartcam.geometry._inside import Array, Code, Remark, check_finite
@@ -62,7 +63,7 @@ the limit allows for errors of print, edges and lens; without a lens the limit i
 distortion."""
 
 ONE_SCALE_MODELS = frozenset({"rigid", "similarity", "touches"})
-"""Models of a plane that keep the shape of a sheet."""
+"""Models of a plane that keep the shape of a sheet; ``touches`` is that of :func:`fit_touches`."""
 
 
 PLANE_FORM = storage.Form(
@@ -76,9 +77,9 @@ PLANE_FORM = storage.Form(
 class SheetCalibration(storage.SavedCalibration):
     """The result of :func:`calibrate_sheet`; immutable.
 
-    Localizations must be in pixels with the y axis turned up (y is -v), as :func:`smartcam.connect`
-    gives them with ``y_down=True``; others are refused. Plain pixels, as in :meth:`transform`, have
-    v down.
+    Localizations must be in pixels with the y axis up (y is -v), as :func:`smartcam.connect` gives
+    them with ``y_down=True``, for a camera whose own y axis points down; others are refused. Plain
+    pixels, as in :meth:`transform`, have v down.
 
     Attributes:
         view: view of the target by the camera.
@@ -119,17 +120,17 @@ class SheetCalibration(storage.SavedCalibration):
         matrix, covariance = fields["matrix"], fields["covariance"]
         if covariance.shape != (9, 9):
             raise storage.invalid_data_error(
-                context["called"], "covariance: expected 9 rows of 9", len(covariance)
+                context["label"], "covariance: expected 9 rows of 9", len(covariance)
             )
         if abs(np.linalg.det(matrix)) == 0.0:
             text = "matrix: expected one that can be inverted"
-            raise storage.invalid_data_error(context["called"], text, matrix.tolist())
+            raise storage.invalid_data_error(context["label"], text, matrix.tolist())
         fields["sheet"] = SheetPlane(fields["view"].size, matrix, covariance, fields["camera"])
         return super()._read(fields, context)
 
-    def _check(self, fields: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], label: str) -> None:
         if self.lens_covariance is not None:
-            _check_lens(self.lens_covariance, self.camera, called)
+            _check_lens(self.lens_covariance, self.camera, label)
 
     @property
     def camera(self) -> CameraModel | None:
@@ -156,12 +157,12 @@ class SheetCalibration(storage.SavedCalibration):
         """Verdict on the calibration's quality, the millimetres it is good for, and the cure."""
         return self.judged().verdict
 
-    def judged(self) -> Judgement:
+    def judged(self) -> AdvisedVerdict:
         """Return the verdict for the area that the target covers in the image, and the advice."""
         if any(remark.code == Code.POOR_FIT for remark in self.remarks):
-            lens = "another lens" if self.camera else "a lens: --lens"
+            lens = "this camera's own lens calibration" if self.camera else "a lens: --lens"
             text = f"Not good enough: the picture needs {lens}, or a flat sheet"
-            return Judgement(CalibrationVerdict("poor", text), option="more")
+            return AdvisedVerdict(CalibrationVerdict("poor", text), option="more")
         predicted = None
         if self.plane.touch_sigma is not None:
             errors = self.predicted_error(self.view.points)
@@ -249,7 +250,7 @@ class SheetCalibration(storage.SavedCalibration):
 
     def _map_localizations(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
-        on_sheet = self.sheet.solve(Poses.of(parts)).put(parts)
+        on_sheet = self.sheet.solve(Poses.of(parts)).replace_poses_of(parts)
         rows = [index for index, part in enumerate(parts) if part.pose.sigma is not None]
         if rows and self.plane.touch_sigma is not None:
             for index, sigma in zip(
@@ -265,22 +266,24 @@ class SheetCalibration(storage.SavedCalibration):
         lenses = self.lens_planes
         y_up = np.array([1.0, -1.0])
 
-        def on_sheet(points: Array) -> Array:
-            flat = self.sheet.near_sheet(points * y_up)
+        def points_on_sheet(points: Array) -> Array:
+            flat = self.sheet.on_sheet_unchecked(points * y_up)
             return np.column_stack([flat, np.zeros(len(flat))])
 
         def parameter_slopes(points: Array) -> Array:
-            flat = self.sheet.near_sheet(points * y_up)
+            flat = self.sheet.on_sheet_unchecked(points * y_up)
             slopes = np.zeros((len(flat), 3, 9 + len(lenses)))
             slopes[:, :2, :9] = self.sheet.element_slopes(flat)
             for column, lens in enumerate(lenses, start=9):
-                slopes[:, :2, column] = lens.near_sheet(points * y_up) - flat
+                slopes[:, :2, column] = lens.on_sheet_unchecked(points * y_up) - flat
             return slopes
 
         covariance = np.eye(9 + len(lenses))
         covariance[:9, :9] = self.sheet.covariance
         normal, size = np.array([0.0, 0.0, 1.0]), float(max(self.sheet.size))
-        return robot_sigmas(parts, on_sheet, normal, parameter_slopes, covariance, size, flip=False)
+        return robot_sigmas(
+            parts, points_on_sheet, normal, parameter_slopes, covariance, size, flip=False
+        )
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
         """Return the covariance of mapped pixels that the noise of view, touches and lens causes.
@@ -317,11 +320,11 @@ class SheetCalibration(storage.SavedCalibration):
         return error
 
 
-def _check_lens(covariance: Array, camera: CameraModel | None, called: str) -> None:
+def _check_lens(covariance: Array, camera: CameraModel | None, label: str) -> None:
     """Raise SHAPE or NOT_FINITE if a covariance cannot be that of the lens' values."""
     count = 0 if camera is None else 4 + len(camera.distortion)
-    storage.check_shape(covariance, (count, count), called, "lens_covariance")
-    check_finite(covariance, f"{called}: lens_covariance")
+    storage.check_shape(covariance, (count, count), label, "lens_covariance")
+    check_finite(covariance, f"{label}: lens_covariance")
 
 
 @check_arguments(
@@ -368,11 +371,12 @@ def calibrate_sheet(
             )
         )
     if fit.unexplained > MAX_UNEXPLAINED_PX[camera is not None]:
-        cause = "the lens distorts" if camera is None else "the lens is another one"
+        cause = "the lens distorts" if camera is None else "the given lens is not this camera's"
         remarks.append(
             Code.POOR_FIT.remark(
-                f"the target's points lie {fit.rms:.2g} px beside a plane, of which noise does "
-                f"not explain {fit.unexplained:.2g} px: {cause}, or the sheet is not flat"
+                f"the target's points differ by {fit.rms:.2g} px rms from the fit of a flat sheet, "
+                f"of which noise does not explain {fit.unexplained:.2g} px: {cause}, or the sheet "
+                "is not flat"
             )
         )
     return SheetCalibration(

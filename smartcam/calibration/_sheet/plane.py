@@ -2,8 +2,8 @@
 
 With a lens, pixels are corrected for its distortion, and their rays are intersected with the plane
 in which the target was located. Without a lens, a homography is fitted to all points of the target:
-it is right for any tilt, but does not correct distortion, whose error is least between the points
-and larger outside of them.
+it is right for any tilt, but does not correct distortion: the error that remains is smallest
+between the points, and larger outside of them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from smartcam.calibration._homography import (
     element_derivatives,
     fit_homography,
 )
-from smartcam.calibration._least_squares import inverse_scaled, unit_diagonal
+from smartcam.calibration._least_squares import diagonal_scale, inverse_scaled
 from smartcam.calibration._lens.poses import check_view, locate
 from smartcam.calibration._lens.projection import excess_variance, whitening
 from smartcam.calibration._solvers import Poses
@@ -60,7 +60,8 @@ class SheetPlane:
     Args:
         size: width and height of the camera's images, pixels.
         matrix: (3, 3), ``w (p, 1) = matrix (x, y, 1)`` from the sheet, metres, to pixels or, with a
-            lens, to directions (x/z, y/z) of the camera's frame; ``w`` is positive in its field.
+            lens, to directions (x/z, y/z) of the camera's frame; ``w`` is positive for points in
+            front of the camera.
         covariance: (9, 9), of the matrix' elements, row by row.
         camera: the lens; None: pixels are taken as they are.
 
@@ -125,7 +126,7 @@ class SheetPlane:
         slopes = np.linalg.solve(derivatives(self.matrix, sheet_points), by_elements)
         return np.asarray(-slopes, dtype=np.float64)
 
-    def near_sheet(self, pixels: Array) -> Array:
+    def on_sheet_unchecked(self, pixels: Array) -> Array:
         """Map pixels (N, 2), v down, as :meth:`on_sheet`, but also pixels outside of the image."""
         return self._map_to_sheet(self._undistort(pixels), pixels)
 
@@ -228,8 +229,8 @@ def fit_sheet_view(view: TargetView, camera: CameraModel | None = None) -> Plane
     extra_variance = excess_variance(pose.residuals, view.covariance, 2 * len(sheet_points) - 6)
     rotation, shift = pose.transform.rotation, pose.transform.translation
     first, second = rotation[:, 0], rotation[:, 1]
-    # The matrix is (r1 r2 t) of T_camera_target. Its columns move with the pose's turn w by
-    # w x r = -[r]x w, and with its shift by d.
+    # The matrix is (r1 r2 t) of T_camera_target. Its columns move with the pose's turn q by
+    # q x r = -[r]x q, and with its shift by d.
     by_pose = np.zeros((3, 3, 6))  # derivatives of rows, columns of the matrix, by turn and shift
     by_pose[:, 0, :3], by_pose[:, 1, :3] = -cross_matrix(first), -cross_matrix(second)
     by_pose[:, 2, 3:] = np.eye(3)
@@ -282,7 +283,7 @@ def _fit_homography(
         normal = jacobian.T @ jacobian
         step = np.linalg.solve(normal, jacobian.T @ residuals.ravel())
         matrix = matrix + np.append(step, 0.0).reshape(3, 3)
-        if (np.abs(step) * unit_diagonal(normal)).max() < MAX_FINAL_STEP_SIGMAS:
+        if (np.abs(step) * diagonal_scale(normal)).max() < MAX_FINAL_STEP_SIGMAS:
             break
     covariance = np.zeros((9, 9))
     covariance[:8, :8] = inverse_scaled(normal)
@@ -301,6 +302,7 @@ def _normalizing_matrix(points: Array) -> Array:
 
 def _no_fit_error(view: TargetView) -> CalibrationError:
     return Code.POOR_FIT.error(
-        f"sheet: expected a plane that shows its {len(view.ids)} points where they are, got none",
+        f"sheet: expected a plane in front of the camera that fits the {len(view.ids)} points of "
+        "the view, got none",
         "a plane in front of the camera",
     )

@@ -78,8 +78,8 @@ class PairFit(storage.Stored):
         held_out: RMS error of the distances between neighbouring points, as triangulated by cameras
             that were fitted without this pair, metres; NaN if a view is missing or bad, or if there
             are too few pairs.
-        epipolar: RMS distance of the points from their epipolar lines, pixels, for the same cameras
-            as ``held_out``; NaN if ``held_out`` is.
+        epipolar: RMS distance of the points from their epipolar lines, pixels, by cameras that were
+            fitted without this pair, as for ``held_out``; NaN if ``held_out`` is.
     """
 
     _keys: ClassVar[storage.Keys] = {"transform": "pose"}
@@ -196,7 +196,7 @@ class StereoCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
         """
-        all_points = as_points(points, 3, "points before the cameras")
+        all_points = as_points(points, 3, "points in front of the cameras")
         sigma = self.rms if pixel_sigma is None else pixel_sigma
         projected = (
             self.left.project(all_points),
@@ -234,8 +234,8 @@ class StereoCalibration(storage.SavedCalibration):
     ) -> tuple[PairErrors, ...]:
         """Return the errors of the cameras at any pairs of views.
 
-        Pairs that the cameras were not fitted to show how good they are. The target does not have
-        to be the same.
+        To see how good the cameras are, give pairs that were not used in the fit. The target does
+        not have to be the same.
 
         Args:
             left_views: a view for each moment; None if the left camera does not see the target.
@@ -292,10 +292,10 @@ class StereoCalibration(storage.SavedCalibration):
             )
         return first, second
 
-    def _check(self, fields: Mapping[str, Any], called: str) -> None:
-        storage.check_shape(self.covariance, (6, 6), called, "covariance")
+    def _check(self, fields: Mapping[str, Any], label: str) -> None:
+        storage.check_shape(self.covariance, (6, 6), label, "covariance")
         if self.sheet is not None:
-            storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
+            storage.check_shape(self.sheet, fields["target"].points.shape, label, "sheet")
 
 
 def _first_target(calibration: StereoCalibration) -> Target:
@@ -390,7 +390,8 @@ def calibrate_stereo(
         adjusted = adjust_weighted(bundle, observations)
         if not math.isfinite(adjusted.weighted_squares):
             raise Code.POOR_FIT.error(
-                "stereo: expected cameras that show the pairs as they are, got points behind one"
+                "stereo: expected cameras that fit the pairs of views, got points of the target "
+                "behind a camera"
             )
         worst, ratio = worst_view([observation.view for observation in observations], adjusted)
         if ratio <= BAD_VIEW_RATIO:

@@ -122,14 +122,14 @@ def check_cameras_apart(transform: Transform, covariance: Array) -> None:
 
     ``covariance`` (6, 6) is that of ``T_right_left``.
     """
-    # only the variance along the shift is used: few views determine this variance, though not the
-    # whole covariance
+    # only the variance along the shift is used: even a few views are enough to determine it, but
+    # not the whole covariance
     shift, shift_covariance = transform.translation, covariance[3:, 3:]
     if float(shift @ shift) ** 2 <= MIN_APART_CHI2 * float(shift @ shift_covariance @ shift):
         raise Code.COINCIDENT.error(
             "stereo: expected two cameras that stand apart, got one "
-            f"{1e3 * float(np.linalg.norm(shift)):.2g} mm from the other, which may be nothing: "
-            "are the images of both sides those of one camera?",
+            f"{1e3 * float(np.linalg.norm(shift)):.2g} mm from the other, a distance that may be "
+            "zero within its uncertainty: are the images of both sides those of one camera?",
             "two places",
             float(np.linalg.norm(shift)),
         )
@@ -252,7 +252,7 @@ def check_fit(rms: float, observations: Sequence[Observation], bad: Sequence[Obs
         for observation in bad
     )
     raise Code.POOR_FIT.error(
-        "stereo: expected cameras that show the pairs as they are, got residuals of "
+        "stereo: expected cameras that fit the pairs of views, got residuals of "
         f"{rms:.3g} pixels rms, {max_rms:.3g} at most expected: were the views of each pair taken "
         f"at the same moment, and are they in the same order? Those that fit worst: "
         f"{names or 'all alike'}",

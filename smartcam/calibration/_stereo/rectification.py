@@ -42,19 +42,19 @@ class Rectification:
         alpha: 0: all pixels of the output are valid; 1: all source pixels are kept.
         rotations: (3, 3) each, from each camera's frame into its rectified one.
         projections: (3, 4) each, from the left rectified frame, metres, into each rectified image.
-        depth: (4, 4), the matrix Q, which maps (u, v, disparity, 1) to the homogeneous point in the
-            left rectified frame, metres.
+        disparity_to_point: (4, 4), the matrix Q, which maps (u, v, disparity, 1) to the homogeneous
+            point in the left rectified frame, metres.
         maps: (H, W, 2) each, float32: source of each output pixel, for ``cv2.remap``.
         masks: (H, W) each, True for output pixels that have a source.
-        kept: part of the source pixels of each image that are in the output.
-        invalid: part of the output pixels of each image that have no source.
+        kept: share, 0 to 1, of the source pixels of each image that are in the output.
+        invalid: share, 0 to 1, of the output pixels of each image that have no source.
     """
 
     size: tuple[int, int]
     alpha: float
     rotations: tuple[Array, Array]
     projections: tuple[Array, Array]
-    depth: Array
+    disparity_to_point: Array
     maps: tuple[NDArray[np.float32], NDArray[np.float32]]
     masks: tuple[NDArray[np.bool_], NDArray[np.bool_]]
     kept: tuple[float, float]
@@ -62,7 +62,7 @@ class Rectification:
 
     @property
     def lost(self) -> tuple[float, float]:
-        """Part of the source pixels of each image that are not in the output."""
+        """Share, 0 to 1, of the source pixels of each image that are not in the output."""
         return 1.0 - self.kept[0], 1.0 - self.kept[1]
 
     def apply(self, left: Image, right: Image) -> tuple[Image, Image]:
@@ -99,7 +99,9 @@ def rectify(
             one is upside down.
     """
     output_size = _check_arguments(left, right, alpha, size)
-    turns, projections, depth = _parallel_cameras(left, right, transform, alpha, output_size)
+    turns, projections, disparity_to_point = _parallel_cameras(
+        left, right, transform, alpha, output_size
+    )
     cameras = (left, right)
     maps = tuple(
         _source_map(camera, turn, projection, output_size)
@@ -125,7 +127,7 @@ def rectify(
         alpha=alpha,
         rotations=turns,
         projections=projections,
-        depth=depth,
+        disparity_to_point=disparity_to_point,
         maps=(maps[0], maps[1]),
         masks=(masks[0], masks[1]),
         kept=(kept_shares[0], kept_shares[1]),
@@ -138,9 +140,9 @@ def _check_arguments(
 ) -> tuple[int, int]:
     """Return the size of the output; raise the errors of :func:`rectify` about its arguments."""
     if not (math.isfinite(alpha) and 0.0 <= alpha <= 1.0):
-        raise _shape_error("alpha", "0 to 1", alpha)
+        raise _argument_error("alpha", "0 to 1", alpha)
     if left.distortion_model != right.distortion_model:
-        raise _shape_error("lenses", f"two of {left.distortion_model}", right.distortion_model)
+        raise _argument_error("lenses", f"two of {left.distortion_model}", right.distortion_model)
     if tuple(left.size) != tuple(right.size):
         raise Code.WRONG_SIZE.error(
             f"rectify: expected images of one size, {left.size[0]} x {left.size[1]}, got "
@@ -150,11 +152,11 @@ def _check_arguments(
         )
     width, height = size or left.size
     if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
-        raise _shape_error("size", f"1 to {MAX_PIXELS} pixels", (width, height))
+        raise _argument_error("size", f"1 to {MAX_PIXELS} pixels", (width, height))
     return int(width), int(height)
 
 
-def _shape_error(label: str, expected: str, actual: object) -> CalibrationError:
+def _argument_error(label: str, expected: str, actual: object) -> CalibrationError:
     return Code.SHAPE.error_with_value(f"rectify: {label}: expected {expected}", expected, actual)
 
 
@@ -189,10 +191,10 @@ def _parallel_cameras(
         rectified = cv2.stereoRectify(
             *arguments, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output_size
         )
-    first, second, first_projection, second_projection, depth = (
+    first, second, first_projection, second_projection, disparity_to_point = (
         np.array(values, dtype=np.float64) for values in rectified[:5]
     )
-    return (first, second), (first_projection, second_projection), depth
+    return (first, second), (first_projection, second_projection), disparity_to_point
 
 
 def _source_map(

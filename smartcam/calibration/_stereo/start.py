@@ -66,8 +66,9 @@ def as_view_pairs(
 ) -> list[ViewPair]:
     """Return the views as pairs.
 
-    Raises ``SHAPE``: the lists have different lengths; ``DIFFERENT_TARGETS`` or ``WRONG_SIZE``:
-    views do not belong together; ``TOO_FEW``, ``COLLINEAR`` or ``NOT_FINITE``: a view is unusable.
+    Raises errors with these codes: ``SHAPE``: the lists have different lengths;
+    ``DIFFERENT_TARGETS`` or ``WRONG_SIZE``: views do not belong together; ``TOO_FEW``,
+    ``COLLINEAR`` or ``NOT_FINITE``: a view is unusable.
     """
     left_views, right_views = (
         as_list(views, (TargetView, type(None)), f"{side} view")
@@ -95,12 +96,14 @@ def as_view_pairs(
 
 
 class FirstGuess(NamedTuple):
-    """A first guess of lenses, transform and poses, with the views numbered alike."""
+    """A first guess of lenses, transform and poses."""
 
-    view_pairs: list[ViewPair]  # the right views numbered as the left ones are
+    # points of the right views are numbered from the same end of the target as in the left ones
+    view_pairs: list[ViewPair]
     bundle: Bundle  # lenses, transform and poses
-    # moments whose views do not belong together, with the distance, pixels, of the right view from
-    # its prediction by the left view and the other pairs; infinite behind the camera
+    # indices of pairs whose views do not belong together, with the mean distance, pixels, of the
+    # right view's points from where the left view and the other pairs predict them; infinite if
+    # that is behind the camera
     mismatched: dict[int, float]
 
 
@@ -119,13 +122,13 @@ def guess_start(view_pairs: list[ViewPair], lenses: Lenses) -> FirstGuess:
     if target.half_turn_symmetric:
         turns.append(half_turn(target))
     rig, mismatched, renumbered = _guess_rig(view_pairs, poses, right, turns)
-    for moment_index in renumbered:
+    for pair_index in renumbered:
         (left_pose, right_pose), (left_view, right_view) = (
-            poses[moment_index],
-            view_pairs[moment_index],
+            poses[pair_index],
+            view_pairs[pair_index],
         )
         if right_pose is not None and right_view is not None:
-            view_pairs[moment_index], poses[moment_index] = (
+            view_pairs[pair_index], poses[pair_index] = (
                 (left_view, half_turned(right_view)),
                 (left_pose, right_pose @ turns[1]),
             )
@@ -146,7 +149,7 @@ def _fit_side(
     view_pairs: list[ViewPair], side: int, lenses: Lenses
 ) -> tuple[CameraModel, list[Rigid | None]]:
     """Return one side's lens, and the target's pose at each moment."""
-    moment_indices = [
+    pair_indices = [
         index for index, view_pair in enumerate(view_pairs) if view_pair[side] is not None
     ]
     views = [view for view_pair in view_pairs if (view := view_pair[side]) is not None]
@@ -159,7 +162,7 @@ def _fit_side(
         observations = [Observation(0, index, view) for index, view in enumerate(views)]
         adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), observations, 0.0)
     poses: list[Rigid | None] = [None] * len(view_pairs)
-    for pose_index, index in enumerate(moment_indices):
+    for pose_index, index in enumerate(pair_indices):
         poses[index] = adjusted.bundle.poses.subset(pose_index)
     return adjusted.bundle.cameras[0], poses
 
@@ -169,13 +172,13 @@ def _guess_rig(
 ) -> tuple[Rigid, dict[int, float], list[int]]:
     """Return the transform that fits most of the pairs, and the distances of pairs that do not fit.
 
-    The third result are the moments whose right view is numbered from the other end. ``turns``:
-    turns of the target after which it looks the same. All pairs together decide which numbering
-    fits, since a camera may be upside down. Raises ``POOR_FIT``.
+    The third result are the indices of pairs whose right view is numbered from the target's other
+    end. ``turns``: turns of the target after which it looks the same. All pairs together decide
+    which numbering fits, since a camera may be upside down. Raises ``POOR_FIT``.
     """
     pairs = [
-        (number, in_left, in_right, view_pair[1])
-        for number, ((in_left, in_right), view_pair) in enumerate(
+        (pair_index, in_left, in_right, view_pair[1])
+        for pair_index, ((in_left, in_right), view_pair) in enumerate(
             zip(poses, view_pairs, strict=True)
         )
         if in_left is not None and in_right is not None and view_pair[1] is not None
@@ -199,15 +202,15 @@ def _guess_rig(
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )
     limit = max(MIN_MISMATCH_RATIO * least_median, MIN_MISMATCH_SHARE * max(right.size))
-    numbers, nearest = [number for number, *_ in pairs], distances.min(axis=1).tolist()
+    pair_indices, nearest = [index for index, *_ in pairs], distances.min(axis=1).tolist()
     mismatched = {
-        number: distance
-        for number, distance in zip(numbers, nearest, strict=True)
+        index: distance
+        for index, distance in zip(pair_indices, nearest, strict=True)
         if distance > limit
     }
     renumbered = [
-        number
-        for number, distances_by_turn in zip(numbers, distances, strict=True)
+        index
+        for index, distances_by_turn in zip(pair_indices, distances, strict=True)
         if distances_by_turn[0] > distances_by_turn[-1]
     ]
     return best_guess, mismatched, renumbered

@@ -60,7 +60,7 @@ def triangulate(
             break
     is_behind = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
     points[is_behind] = np.nan
-    points[~np.isfinite(points).all(axis=1)] = np.nan  # all weights are finite
+    points[~np.isfinite(points).all(axis=1)] = np.nan  # a point without a solution
     # The covariance of least squares with residuals of variance 1 is (J^T J)^-1.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2.
     inverse = np.full_like(normal, np.nan)

@@ -46,7 +46,7 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
     inner = axes.T @ axes
     square = 0.5 * float(np.trace(inner))
     shear = float(np.abs(inner - square * np.eye(2)).max()) / square
-    bend = float(np.abs(matrix[3, :2]).max()) * calibration.place.camera_size
+    bend = float(np.abs(matrix[3, :2]).max()) * calibration.normalization.camera_size
     if max(shear, bend) > _MAX_SIMILAR_DEVIATION:
         raise Code.NOT_SIMILAR.error(
             f"{calibration.model}: expected one scale for the whole plane, got axes that differ by "

@@ -22,7 +22,7 @@ from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
 from smartcam.calibration._hand_eye.closed_forms import MIN_POSES
 from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
 from smartcam.calibration._lens.poses import CAMERA, TARGET, locate
-from smartcam.calibration._verdict import VIEW_CURES, Judgement, poor_judgement
+from smartcam.calibration._verdict import VIEW_CURES, AdvisedVerdict, poor_judgement
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
 from smartcam.calibration.wizards._pictures import (
@@ -360,7 +360,7 @@ class _HandEyeRun:
         svg = self._samples[-1].get("preview") if self._samples else None
         return {"svg": svg} if svg else None
 
-    async def _calculate(self) -> tuple[HandEyeCalibration | None, tuple[str, ...], Judgement]:
+    async def _calculate(self) -> tuple[HandEyeCalibration | None, tuple[str, ...], AdvisedVerdict]:
         step = Step(
             id="calculate",
             title="Calculate",
@@ -400,7 +400,7 @@ class _HandEyeRun:
         self,
         calibration: HandEyeCalibration | None,
         notes: tuple[str, ...],
-        judgement: Judgement,
+        judgement: AdvisedVerdict,
     ) -> Step:
         options = {
             "accept": accept_option_text(judgement),

@@ -25,7 +25,7 @@ from smartcam.calibration._plane.order import Reordered, find_better_order
 from smartcam.calibration._plane.robust import MIN_POINTS
 from smartcam.calibration._plane.touches import fit_touches
 from smartcam.calibration._plane.validation import extent
-from smartcam.calibration._verdict import CURES, Judgement, poor_judgement
+from smartcam.calibration._verdict import CURES, AdvisedVerdict, poor_judgement
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, number_input
 from smartcam.calibration.wizards._touch_previews import compare_touches, touch_points
@@ -62,7 +62,7 @@ class CalibrationOutcome(NamedTuple):
     calibration: AnyCalibration | HandEyeCalibration
     figures: dict[str, Any]  # facts for the wizard's result, as JSON takes them
     notes: tuple[str, ...]  # notes for people, a line each
-    judgement: Judgement
+    judgement: AdvisedVerdict
 
 
 class PointSource(Touches, ABC):
@@ -229,7 +229,7 @@ class PointSource(Touches, ABC):
 
     def _try_fit(
         self, *, robust: bool
-    ) -> tuple[PlaneCalibration | None, tuple[str, ...], Judgement]:
+    ) -> tuple[PlaneCalibration | None, tuple[str, ...], AdvisedVerdict]:
         try:
             fitted = self.fit(robust=robust and len(self.touches) >= MIN_POINTS)
             plane = self._with_allowed_error(fitted)
@@ -250,7 +250,7 @@ class PointSource(Touches, ABC):
         marks = np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
         return find_better_order(marks, touched, sigma)
 
-    def _judge_error(self, error: CalibrationError) -> Judgement:
+    def _judge_error(self, error: CalibrationError) -> AdvisedVerdict:
         """Return the judgement of a failed fit; it names a wrong or exchanged touch if possible."""
         if (order := self._better_order()) is not None:
             numbers = np.arange(1, 1 + len(self.touches))
@@ -280,7 +280,7 @@ class PointSource(Touches, ABC):
         self,
         plane: PlaneCalibration | None,
         notes: tuple[str, ...],
-        judgement: Judgement,
+        judgement: AdvisedVerdict,
         order: Reordered | None,
         *,
         robust: bool,
@@ -341,8 +341,8 @@ class PointSource(Touches, ABC):
 
 
 def _avoid_repeated_advice(
-    judgement: Judgement, retouched: Collection[int], count: int
-) -> Judgement:
+    judgement: AdvisedVerdict, retouched: Collection[int], count: int
+) -> AdvisedVerdict:
     """Return other advice if a judgement asks for a touch that was repeated already.
 
     ``retouched``: numbers of the points that were touched again. ``count``: number of all points.
@@ -398,7 +398,7 @@ def about_step(
     return step.with_defaults(parameters)
 
 
-def accept_option_text(judgement: Judgement) -> str:
+def accept_option_text(judgement: AdvisedVerdict) -> str:
     """Return the text of the option that accepts the calibration."""
     if judgement.verdict.level == "good":
         return "accept it"
@@ -409,7 +409,7 @@ def review_step(
     options: Mapping[str, str],
     number: Input,
     notes: tuple[str, ...],
-    judgement: Judgement,
+    judgement: AdvisedVerdict,
     preview: Mapping[str, Any] | None = None,
 ) -> Step:
     """Return the step that shows the result and asks what to do ``next``.

@@ -160,9 +160,11 @@ def _remark(calibration: Any, plane: Any) -> str:
 def _plane_variants(plane: Any) -> list[Any]:
     if plane.touch_sigma is None:
         return []
-    matrix = plane.place.to_normalized(plane.matrix)
+    matrix = plane.normalization.to_normalized(plane.matrix)
     return [
-        dataclasses.replace(plane, matrix=plane.place.to_original(matrix + part.reshape(4, 3)))
+        dataclasses.replace(
+            plane, matrix=plane.normalization.to_original(matrix + part.reshape(4, 3))
+        )
         for part in independent_parts(plane.unit_covariance * plane.touch_sigma**2)
     ]
 

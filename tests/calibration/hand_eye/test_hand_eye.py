@@ -104,8 +104,8 @@ def test_hand_eye_with_noise_takes_the_method_that_accounts_for_it(
     assert noisy.robot_sigmas is not None
     assert noisy.robot_sigmas.rotation == pytest.approx(NOISE.rotation, rel=0.6)
     assert noisy.robot_sigmas.translation == pytest.approx(NOISE.translation, rel=0.6)
-    assert noisy.held_out_error == noisy.candidates[noisy.method]
-    assert {"robot", "reprojection", "robot, scale"} <= set(noisy.candidates)
+    assert noisy.held_out_error == noisy.candidate_errors[noisy.method]
+    assert {"robot", "reprojection", "robot, scale"} <= set(noisy.candidate_errors)
 
 
 def test_hand_eye_held_out_errors_are_larger_than_errors(noisy: HandEyeCalibration) -> None:

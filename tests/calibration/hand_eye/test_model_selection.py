@@ -44,7 +44,7 @@ def test_calibration_of_a_robot_that_errs_by_more_than_noise_takes_its_poses_as_
     assert auto.method == "reprojection"
     assert held_out["auto"] < 0.9 * held_out["robot"]
     assert held_out["auto"] < held_out["park"]
-    assert auto.candidates["robot"] == pytest.approx(held_out["robot"], rel=1e-6)
+    assert auto.candidate_errors["robot"] == pytest.approx(held_out["robot"], rel=1e-6)
     assert np.isfinite(auto.covariance).all()
 
 

@@ -80,7 +80,7 @@ def test_hand_eye_of_shuffled_poses_is_refused(setup: Setup) -> None:
 def test_hand_eye_of_transposed_rotations_is_refused(setup: Setup) -> None:
     poses, views = measured(setup)
     turned = [dataclasses.replace(one, rotation=one.rotation.T) for one in poses]
-    with refused("WRONG_FRAME", "mm when read with rotations transposed"):
+    with refused("WRONG_FRAME", "mm off if read with rotations transposed"):
         calibrated(turned, views, setup)
 
 
@@ -88,7 +88,7 @@ def test_hand_eye_of_transposed_rotations_is_refused(setup: Setup) -> None:
 def test_hand_eye_of_poses_in_millimetres_is_refused() -> None:
     poses, views = measured("eye-in-hand")
     wrong = [dataclasses.replace(one, translation=1e3 * one.translation) for one in poses]
-    with refused("POOR_FIT", "mm when read as millimetres: expected metres"):
+    with refused("POOR_FIT", "mm off if read as millimetres: expected metres"):
         calibrated(wrong, views)
     truth = scene("eye-in-hand", poses=10)
     seen = [truth.target_in_camera(one) for one in truth.robot_poses]

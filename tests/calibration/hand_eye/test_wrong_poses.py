@@ -59,7 +59,7 @@ def test_hand_eye_of_a_left_handed_base_is_refused(setup: Setup, mirror: Any) ->
         Transform(one.target, one.source, mirror @ one.rotation @ mirror, mirror @ one.translation)
         for one in truth.robot_poses
     ]
-    with refused("MIRRORED", "when read in a left-handed base"):
+    with refused("MIRRORED", "if read in a left-handed base"):
         calibrate_hand_eye_from_poses(robot, seen, setup=setup)
 
 
@@ -150,7 +150,7 @@ def test_hand_eye_names_points_that_are_off_and_leaves_them_out() -> None:
     [
         (lambda: ROBOT[0] @ matrix(ROBOT[0]), "expected a Transform, which knows its frames"),
         (lambda: ROBOT[0].apply(np.eye(4)), r"expected shape (..., 3), got (4, 4)"),
-        (lambda: ROBOT[0].turn([0.0, 1.0]), r"expected shape (..., 4), got (2,)"),
+        (lambda: ROBOT[0].apply_to_orientations([0.0, 1.0]), r"expected shape (..., 4), got (2,)"),
         (lambda: Transform.from_pose(matrix(ROBOT[0]), "flange"), "expected a Pose, got ndarray"),
         (lambda: fit_tool_tip([matrix(one) for one in ROBOT]), "tool tip: pose 0: expected a Tra"),
         (lambda: fit_tool_tip(matrix(ROBOT[0])), "tool tip: pose: expected a list"),

@@ -97,7 +97,7 @@ def hand(setup: Setup, *, count: int = 8, views: bool = True) -> HandEyeCalibrat
         camera=truth.camera if views else None,
         target_scale=1.0,
         method="closed form",
-        candidates={"closed form": 1e-4},
+        candidate_errors={"closed form": 1e-4},
         errors=np.linspace(1e-4, 2e-4, count),
         mean_error=1.5e-4,
         leave_one_out=np.linspace(2e-4, 3e-4, count),
@@ -243,7 +243,7 @@ def test_map_has_its_figures_and_marks_places_without_a_value() -> None:
     covariance[0, 0] = np.nan
     svg = draw_uncertainty(dataclasses.replace(found, covariance=covariance))
     assert "beyond the lens model" in svg
-    assert "the model of the lens ends before 0.1% of the image" in svg
+    assert "the lens model does not reach 0.1% of the image" in svg
 
 
 def test_map_of_a_calibration_shows_the_points_that_were_seen() -> None:

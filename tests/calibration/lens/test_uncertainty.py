@@ -118,7 +118,7 @@ def test_lens_model_that_ends_before_the_image_has_a_remark_and_figures() -> Non
     views = lenskit.seen(lenskit.FISHEYE, lenskit.poses(10, distance=0.2), seed=1)
     found = calibrate_intrinsics(views, sheet="exact")
     (remark,) = [one for one in found.warnings if one.code == Code.OUT_OF_FIELD]
-    assert "the model plumb_bob ends before the image does" in remark.text
+    assert "the model plumb_bob is not valid in" in remark.text
     known = found.uncertainty(distance=0.2).figures
     assert math.isfinite(known.worst)
     assert math.isfinite(known.rms)

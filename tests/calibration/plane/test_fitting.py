@@ -172,6 +172,8 @@ def test_frame_outward_and_inward_undo_each_other() -> None:
     frame = Normalization(np.array([320.0, 240.0]), 150.0, np.array([1.0, -2.0, 0.5]), 0.2)
     matrix = fit("homography", tilted()).matrix
     outward = frame.to_original(matrix)
-    mapped = apply_homography(outward, frame.camera + frame.camera_size * GRID)
-    assert mapped == pytest.approx(frame.robot + frame.robot_size * apply_homography(matrix, GRID))
+    mapped = apply_homography(outward, frame.camera_centre + frame.camera_size * GRID)
+    assert mapped == pytest.approx(
+        frame.robot_centre + frame.robot_size * apply_homography(matrix, GRID)
+    )
     assert frame.to_normalized(outward) == pytest.approx(matrix, abs=1e-12)

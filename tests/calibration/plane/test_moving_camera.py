@@ -52,7 +52,7 @@ def test_moving_camera_is_the_static_one_calibrated_at_the_new_pose(
     table: Transform, flange: Transform, turn: float, x: float, y: float
 ) -> None:
     motion = in_plane(turn, x, y)
-    chain = camera(table, flange).now(carried(table, motion, flange))
+    chain = camera(table, flange).at_pose(carried(table, motion, flange))
     anew = table @ motion
     static = RealWorldPosition(anew.translation, anew.rotation)
     found = chain.solve(Poses.planar(SEEN, [0.1, 0.2, 0.3, 0.4]))
@@ -75,7 +75,7 @@ FLANGE = Transform(
 
 
 def test_moving_camera_that_stayed_is_the_static_one() -> None:
-    chain = camera(TABLE_POSE, FLANGE).now(FLANGE, NOON)
+    chain = camera(TABLE_POSE, FLANGE).at_pose(FLANGE, NOON)
     (part,) = chain.to_robot([localization(0.15, 0.05)])
     expected = TABLE_POSE.apply([0.15, 0.05, 0])
     np.testing.assert_allclose(part.pose.position, expected, atol=1e-15)
@@ -105,31 +105,31 @@ def test_moving_camera_whose_plane_moves_is_refused(
     motion = Transform("table", "table", rotation, np.array(shift))
     pose = carried(TABLE_POSE, motion, FLANGE)
     with refused("PLANE_MOVED", "within 0.2 mm", *texts):
-        camera(TABLE_POSE, FLANGE).now(pose)
+        camera(TABLE_POSE, FLANGE).at_pose(pose)
 
 
 def test_moving_camera_tolerance_is_checked_in_the_field() -> None:
     tilt = Transform("table", "table", rotation_about(np.array([0, 1e-3, 1.0]), 0), np.zeros(3))
     pose = carried(TABLE_POSE, tilt, FLANGE)
-    camera(TABLE_POSE, FLANGE, tolerance=2e-4).now(pose)
+    camera(TABLE_POSE, FLANGE, tolerance=2e-4).at_pose(pose)
     with refused("PLANE_MOVED", "within 0.1 mm"):
-        camera(TABLE_POSE, FLANGE, tolerance=1e-4).now(pose)
+        camera(TABLE_POSE, FLANGE, tolerance=1e-4).at_pose(pose)
 
 
 def test_moving_camera_noise_of_the_touches_is_no_motion() -> None:
     touched = TABLE_POSE.apply(TABLE + np.outer([5e-4, -5e-4, 5e-4, -5e-4], [0, 0, 1]))
     static = RealWorldPosition(TABLE_POSE.translation, TABLE_POSE.rotation)
-    MovingCamera(static, FLANGE, field=touched, tolerance=1e-6).now(FLANGE)
+    MovingCamera(static, FLANGE, field=touched, tolerance=1e-6).at_pose(FLANGE)
 
 
 def test_moving_camera_image_and_pose_must_belong_together() -> None:
     one = camera(TABLE_POSE, FLANGE)
-    one.now(FLANGE, after(0.001))
+    one.at_pose(FLANGE, after(0.001))
     with refused("NOT_SIMULTANEOUS", "within 1 ms of the image, got one 20 ms from it"):
-        one.now(FLANGE, after(-0.02))
+        one.at_pose(FLANGE, after(-0.02))
     with refused("NOT_SIMULTANEOUS", "the time of T_base_flange"):
-        one.now(FLANGE.undated(), NOON)
-    one.now(FLANGE.undated())
+        one.at_pose(FLANGE.undated(), NOON)
+    one.at_pose(FLANGE.undated())
 
 
 def test_moving_camera_takes_the_pose_at_the_image_from_a_history() -> None:
@@ -140,29 +140,29 @@ def test_moving_camera_takes_the_pose_at_the_image_from_a_history() -> None:
         place = FLANGE.translation + 0.25 * seconds * along
         flange.add(Transform("base", "flange", FLANGE.rotation, place, after(seconds)))
     image_at = after(0.02)
-    chain = camera(TABLE_POSE, FLANGE).now(flange.at(image_at), image_at)
+    chain = camera(TABLE_POSE, FLANGE).at_pose(flange.at(image_at), image_at)
     expected = TABLE_POSE.apply([0.15 + 0.005, 0.05, 0])
     np.testing.assert_allclose(chain.transform([(0.15, 0.05)])[0], expected, atol=1e-12)
 
 
 def test_moving_camera_pose_of_other_frames_is_refused() -> None:
     with refused("WRONG_FRAME", "expected T_base_flange", "got T_flange_base"):
-        camera(TABLE_POSE, FLANGE).now(FLANGE.inverse())
+        camera(TABLE_POSE, FLANGE).at_pose(FLANGE.inverse())
 
 
 def test_moving_camera_takes_the_poses_of_its_own_camera_only() -> None:
     static = Chain([], camera_frame="left")
     one = MovingCamera(static, FLANGE, field=TABLE_POSE.apply(TABLE))
     with refused("WRONG_FRAME", "the frame 'left'"):
-        one.now(FLANGE).to_robot([localization(0, 0)])
+        one.at_pose(FLANGE).to_robot([localization(0, 0)])
 
 
 def test_moving_camera_knows_the_y_down_of_its_chain() -> None:
     field = TABLE_POSE.apply(TABLE)
     static = Chain([], y_down=True)
-    assert MovingCamera(static, FLANGE, field=field).now(FLANGE).y_down is True
+    assert MovingCamera(static, FLANGE, field=field).at_pose(FLANGE).y_down is True
     alone = MovingCamera(RigidMotion(FLANGE), FLANGE, field=field)
-    assert (alone.now(FLANGE).y_down, alone.now(FLANGE).camera_frame) == (None, None)
+    assert (alone.at_pose(FLANGE).y_down, alone.at_pose(FLANGE).camera_frame) == (None, None)
 
 
 def test_moving_camera_field_that_is_no_plane_is_refused() -> None:
@@ -227,7 +227,7 @@ def test_moving_pinhole_maps_parts_to_their_true_places(turn: float, x: float, y
     motion = in_plane(turn, x, y)
     flange = flange_at(motion @ VIEW)
     parts = TABLE_POSE.apply(motion.apply(GRID * 0.8))
-    found = calibrated().now(flange).transform(pixels(flange @ HAND_EYE, parts))
+    found = calibrated().at_pose(flange).transform(pixels(flange @ HAND_EYE, parts))
     np.testing.assert_allclose(found, parts, rtol=0, atol=1e-9)
 
 
@@ -235,12 +235,12 @@ def test_raised_moving_pinhole_is_refused_with_its_error() -> None:
     lift = Transform("table", "table", np.eye(3), np.array([0, 0, 0.01]))
     flange = flange_at(lift @ VIEW)
     with refused("PLANE_MOVED", "10.00 mm"):
-        calibrated().now(flange)
+        calibrated().at_pose(flange)
     one = MovingCamera(
         calibrated()._static, flange_at(VIEW), field=TABLE_POSE.apply(GRID), tolerance=1
     )
     parts = TABLE_POSE.apply(GRID)
-    found = one.now(flange).transform(pixels(flange @ HAND_EYE, parts))
+    found = one.at_pose(flange).transform(pixels(flange @ HAND_EYE, parts))
     errors = 1e3 * np.linalg.norm(found - parts, axis=1)
     assert 10 < np.sqrt(np.mean(errors**2)) < 10.6
 
@@ -249,7 +249,7 @@ def test_image_time_without_a_time_zone_is_refused() -> None:
     table = Transform("base", "table", np.eye(3), np.zeros(3))
     flange = Transform("base", "flange", np.eye(3), np.zeros(3), NOON)
     with refused("BAD_TIME", "expected an image's time with its time zone"):
-        camera(table, flange).now(flange, NOON.replace(tzinfo=None))
+        camera(table, flange).at_pose(flange, NOON.replace(tzinfo=None))
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,8 @@ def test_fit_plane_healthy_points_choose_similarity_without_warnings() -> None:
     found = healthy()
     assert found.model == "similarity"
     assert found.warnings == ()
-    assert set(found.candidates) == {"similarity", "affine", "homography"}
-    assert found.candidates["similarity"] == pytest.approx(found.held_out_error)
+    assert set(found.candidate_errors) == {"similarity", "affine", "homography"}
+    assert found.candidate_errors["similarity"] == pytest.approx(found.held_out_error)
     assert found.scale == pytest.approx(1.0, abs=0.005)
 
 
@@ -85,7 +85,7 @@ def test_fit_plane_auto_leaves_out_a_model_that_is_not_determined() -> None:
     marks = np.array([[0.0, 0.0], [0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [0.1, 0.2]])
     found = fit_plane(marks, SCENE.touched(marks, 1), tool_z=DOWN, touch_sigma=SIGMA)
     assert found.model == "similarity"
-    assert found.candidates["homography"] is None
+    assert found.candidate_errors["homography"] is None
     assert "without point 5 the others give no" in said(found, "NOT_HELD_OUT")
 
 

@@ -272,7 +272,7 @@ def test_plane_p15_moving_camera_is_the_static_one_calibrated_anew(
     there = calibrated(scene)
     carried = MovingCamera(chain_of(there), flange @ mounted, field=there.robot_points)
     seen = scene.camera(np.array([place]))[0]
-    one = carried.now(now @ mounted).to_robot([part(seen[0], seen[1], theta)])[0].pose
+    one = carried.at_pose(now @ mounted).to_robot([part(seen[0], seen[1], theta)])[0].pose
     other = anew.to_robot(part(seen[0], seen[1], theta)).pose
     assert one.position == pytest.approx(other.position, abs=CLOSE)
     assert abs(np.dot(one.orientation, other.orientation)) == pytest.approx(1.0)

@@ -68,8 +68,8 @@ def test_fit_plane_robust_names_left_out_points_first() -> None:
     assert [one.code for one in found.warnings] == ["OUTLIER", "OUTLIER"]
     distance = 1e3 * float(np.linalg.norm(touches[7] - found.transform(GRID[7:8])[0]))
     assert found.warnings[1].text == (
-        f"point 8 is left out: it lies {distance:.3g} mm from where the others say, "
-        "where touching explains 0.396 mm rms"
+        f"point 8 is left out: it lies {distance:.3g} mm from where the others predict it; "
+        "touching errors alone would give 0.396 mm rms"
     )
 
 

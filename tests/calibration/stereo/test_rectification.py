@@ -33,7 +33,7 @@ def test_rectify_puts_partners_into_one_row(left: CameraModel, right: CameraMode
     one, two = _rectified(found, 0, POINTS), _rectified(found, 1, POINTS)
     np.testing.assert_allclose(one[:, 1], two[:, 1], atol=1e-6)
     disparity = one[:, 0] - two[:, 0]
-    back = np.column_stack([one, disparity, np.ones(3)]) @ found.depth.T
+    back = np.column_stack([one, disparity, np.ones(3)]) @ found.disparity_to_point.T
     np.testing.assert_allclose(back[:, :3] / back[:, 3:] @ found.rotations[0], POINTS, atol=1e-9)
 
 
