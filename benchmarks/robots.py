@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from smartcam.calibration._targets import Checkerboard, resized
-from smartcam.calibration.simulation._scenes import around, view
+from smartcam.calibration.simulation._scenes import poses_around, view
 from smartcam.geometry import CameraModel, Transform
 from smartcam.geometry._inside import Rigid, exp_rotation
 
@@ -148,7 +148,9 @@ def _planned(
     hand = Rigid(
         exp_rotation(random.uniform(-0.5, 0.5, size=3)), random.uniform(-0.06, 0.06, size=3)
     )
-    looks = [one.rigid for one in around(SHEET, count, tilt=cone, distance=DISTANCE, random=random)]
+    looks = [
+        one.rigid for one in poses_around(SHEET, count, tilt=cone, distance=DISTANCE, random=random)
+    ]
     looks = [looks[i] for i in random.permutation(count)]
     spot = np.array([0.4, 0.0, 0.15]) + random.uniform(-0.05, 0.05, size=3)
     if setup == "eye-in-hand":

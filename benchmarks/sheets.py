@@ -72,7 +72,7 @@ class Rig:
     def poses(self, count: int, seed: int) -> list[Transform]:
         """Return poses of a sheet that is all over the field."""
         random, found = np.random.default_rng(seed), list[Transform]()
-        around = scenes.around(self.board, count, tilt=0.6, distance=0.35, random=random)
+        around = scenes.poses_around(self.board, count, tilt=0.6, distance=0.35, random=random)
         for one in around:
             back, aside = one.inverse(), random.uniform([-0.08, -0.06, 0], [0.08, 0.06, 0])
             found.append(Transform("left", "target", back.rotation, back.translation + aside))

@@ -228,7 +228,7 @@ def _peer(
 def _poses(seed: int, count: int) -> list[Transform]:
     """Return poses of a sheet before the left camera that both cameras see whole."""
     random, found = np.random.default_rng(seed), list[Transform]()
-    around = scenes.around(BOARD, 4 * count, tilt=0.6, distance=0.42, random=random)
+    around = scenes.poses_around(BOARD, 4 * count, tilt=0.6, distance=0.42, random=random)
     for one in around:
         back = one.inverse()
         pose = Transform("left", "target", back.rotation, back.translation)

@@ -57,7 +57,7 @@ def poses(
     count: int, *, seed: int = 0, tilt: float = 0.6, distance: float = 0.35, name: str = "camera"
 ) -> list[Transform]:
     """Return poses of a target in front of a camera."""
-    around = scenes.around(
+    around = scenes.poses_around(
         BOARD, count, tilt=tilt, distance=distance, random=np.random.default_rng(seed)
     )
     found = [one.inverse() for one in around]

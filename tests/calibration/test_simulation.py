@@ -15,7 +15,7 @@ from smartcam.calibration import (
     RobotSigmas,
     Transform,
 )
-from smartcam.calibration.simulation import around, render, view
+from smartcam.calibration.simulation import poses_around, render, view
 from smartcam.geometry._inside import Code
 from tests.calibration.inside import Setup, charuco_board
 from tests.calibration.scenes import BENT, CAMERA, FACING, SHEET, STRAIGHT, facing, refused, scene
@@ -63,7 +63,9 @@ def test_view_of_a_sheet_behind_the_camera_is_refused() -> None:
 
 
 def test_around_looks_at_the_centre_from_within_the_cone() -> None:
-    looks = around(SHEET, 20, tilt=math.radians(30), distance=0.5, random=np.random.default_rng(3))
+    looks = poses_around(
+        SHEET, 20, tilt=math.radians(30), distance=0.5, random=np.random.default_rng(3)
+    )
     centre = SHEET.points.max(axis=0) / 2
     for look in looks:
         seen = look.inverse().apply(centre)

@@ -144,7 +144,7 @@ def test_calibrate_resumed_with_another_y_down_takes_no_picture(url: str, tmp_pa
     done = calibrating(url, tmp_path, as_lines({}), "--json", "--y-down")
     assert [line["step"] for line in done.lines] == ["picture", "picture"]
     assert done.lines[1]["errors"]["base"].startswith(
-        "the picture before was taken with y_down=False, now it is True"
+        "the previous picture has y_down=False, now it is True"
     )
 
 

@@ -21,7 +21,7 @@ from smartcam.calibration import (
     target_to_data,
 )
 from smartcam.calibration.formats import read_cameras
-from smartcam.calibration.simulation import around, render
+from smartcam.calibration.simulation import poses_around, render
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameSink, StreamFormat, find_format
 from smartcam.registry import FRAMES
@@ -40,7 +40,7 @@ def images() -> list[Any]:
     random = np.random.default_rng(7)
     return [
         render(BOARD, LENS, pose.inverse(), noise=1.0, random=random)
-        for pose in around(BOARD, 5, tilt=0.5, distance=0.6, random=random)
+        for pose in poses_around(BOARD, 5, tilt=0.5, distance=0.6, random=random)
     ]
 
 

@@ -183,7 +183,7 @@ async def test_a_cut_picture_is_refused_and_the_next_pair_is_matched() -> None:
     async with cameras:
         waiting = await streaming(cameras, left, right)
         give((pictures[0][:120], pictures[1]), 1, left, right)
-        with pytest.raises(FrameFormatError, match=r"calibrated with, 240x160 .* got 240x120"):
+        with pytest.raises(FrameFormatError, match=r"ratio of 240x160, with .* got 240x120"):
             await waiting
         give(pictures, 2, left, right)
         assert (await anext(cameras)).left.shape == (160, 240)

@@ -435,7 +435,7 @@ async def test_page_shows_the_sheet_in_the_cameras_picture(page: Page, site: Wiz
 async def test_page_says_which_file_it_waits_for(page: Page, tmp_path: Path) -> None:
     inbox, folder = tmp_path / "ftp", Folder(tmp_path / "kept")
     inbox.mkdir()
-    pictures = PictureFolder(inbox, deadline=60.0)
+    pictures = PictureFolder(inbox, timeout=60.0)
     wizard = sheet_wizard(
         take_picture=pictures.take,
         save_to=folder.calibration,

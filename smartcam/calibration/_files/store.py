@@ -167,8 +167,8 @@ def read_document(path: StrPath) -> Document:
         raise _broken_file_error(path, f"{exc!r}") from exc
 
 
-def _broken_file_error(path: StrPath, why: str) -> CalibrationError:
-    return Code.BROKEN_FILE.error(f"{path}: {why}; expected a calibration as smartcam writes it")
+def _broken_file_error(path: StrPath, reason: str) -> CalibrationError:
+    return Code.BROKEN_FILE.error(f"{path}: {reason}; expected a calibration as smartcam writes it")
 
 
 def _version(path: StrPath, text: object) -> tuple[int, int]:

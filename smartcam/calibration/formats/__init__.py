@@ -88,9 +88,7 @@ def _handeye_formats(
     """Return a program's two formats: one for a fixed camera, one for a camera on the robot."""
     compose_in_hand = partial(compose, in_hand=True)
     return {
-        name: Format(
-            f"{name}, {program}: a camera that stands", suffix, ignore_names(parse), compose
-        ),
+        name: Format(f"{name}, {program}: a fixed camera", suffix, ignore_names(parse), compose),
         f"{name}_in_hand": Format(
             f"{name}, {program}: a camera that the robot carries",
             suffix,
@@ -102,18 +100,21 @@ def _handeye_formats(
 
 TRANSFORMS: Mapping[str, Format[Transform]] = {
     "tf": _arguments_format(
-        "arguments of ROS 1, tf: quaternion, period", ros.compose_positions, period=True
+        "arguments of ROS 1, tf: quaternion, period", ros.compose_positional, period=True
     ),
     "tf_ypr": _arguments_format(
-        "the same with yaw, pitch and roll", ros.compose_positions, angles=True, period=True
+        "arguments of ROS 1, tf: yaw, pitch and roll, period",
+        ros.compose_positional,
+        angles=True,
+        period=True,
     ),
-    "tf2": _arguments_format("arguments of ROS 1, tf2_ros: quaternion", ros.compose_positions),
+    "tf2": _arguments_format("arguments of ROS 1, tf2_ros: quaternion", ros.compose_positional),
     "tf2_ypr": _arguments_format(
-        "the same with yaw, pitch and roll", ros.compose_positions, angles=True
+        "arguments of ROS 1, tf2_ros: yaw, pitch and roll", ros.compose_positional, angles=True
     ),
     "ros2": _arguments_format("arguments of ROS 2, tf2_ros: quaternion", ros.compose_options),
     "ros2_ypr": _arguments_format(
-        "the same with yaw, pitch and roll", ros.compose_options, angles=True
+        "arguments of ROS 2, tf2_ros: yaw, pitch and roll", ros.compose_options, angles=True
     ),
     "ros_industrial": Format(
         "pose of ROS-Industrial's calibration, without names of frames",
@@ -297,8 +298,10 @@ def read_matrix(path: str | os.PathLike[str]) -> PlaneMatrix:
     return _MATRIX.read(path)
 
 
-def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = None) -> str:
-    """Return the text of a file with a plane calibration's frame; a comment has the scale.
+def compose_plane_frame(
+    form: str, calibration: PlaneCalibration, *, suffix: str | None = None
+) -> str:
+    """Return the text of a file with a plane calibration's frame, and its scale in a comment.
 
     Args:
         form: name of the format, such as ``tf2``.

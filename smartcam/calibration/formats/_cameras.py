@@ -1,6 +1,6 @@
 """Read and write files of lenses and camera pairs: ROS' ``camera_info``, Kalibr's, OpenCV's.
 
-Formats that can only be read are in ``_foreign.py``.
+Parsers of Kalibr's files, and of formats that can only be read, are in ``_foreign.py``.
 
 ::
 
@@ -63,7 +63,7 @@ MAX_FILE_BYTES: Final = 1 << 20
 """Largest number of bytes of a file; a chain of eight cameras has four thousand."""
 
 _KALIBR: Final[dict[DistortionModel, str]] = {"plumb_bob": "radtan", "equidistant": "equidistant"}
-_RADTAN: Final = 4
+_RADTAN_COUNT: Final = 4
 """Number of Kalibr's coefficients: k1, k2, p1, p2; there is no k3."""
 
 _MATRICES: Final = (("M1", "D1"), ("M2", "D2"))
@@ -303,11 +303,11 @@ def _kalibr_coefficients(camera: CameraModel) -> Array:
     """Return the coefficients of a lens in Kalibr's model."""
     if camera.distortion_model not in _KALIBR:
         raise _unsupported_error("kalibr", " or ".join(_KALIBR), camera.distortion_model)
-    if camera.distortion[_RADTAN:].any():
+    if camera.distortion[_RADTAN_COUNT:].any():
         raise _unsupported_error(
             "kalibr", "k3 = 0 (calibrate with fixed=['k3'])", f"{camera.distortion[4]:g}"
         )
-    return camera.distortion[:_RADTAN]
+    return camera.distortion[:_RADTAN_COUNT]
 
 
 # ---------------------------------------------------------------------- OpenCV
@@ -487,7 +487,7 @@ def _foreign_format(
             raise malformed_error("file", "one camera, since it has no poses", str(len(lenses)))
         cameras = []
         for lens in lenses:
-            matrix, size = lens_matrix(*lens.focal), _choose_size(lens.size or [], given_size)
+            matrix, size = lens_matrix(*lens.intrinsics), _choose_size(lens.size or [], given_size)
             cameras.append(_make_camera(size, matrix, np.array(lens.coefficients), lens.model))
         names = tuple(lens.name for lens in lenses)
         chain = CameraChain(cameras=tuple(cameras), transforms=tuple(transforms), names=names)
@@ -514,7 +514,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
 
 def _unsupported_error(form: str, expected: str, actual: str) -> CalibrationError:
     return Code.SHAPE.error_with_value(
-        f"{form}: expected {expected}, which is all it can hold", expected, actual
+        f"{form}: expected {expected}, since the format can hold no more", expected, actual
     )
 
 

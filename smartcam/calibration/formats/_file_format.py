@@ -47,9 +47,9 @@ class Format(Generic[T]):
 
     title: str  # description for people
     suffix: str  # suffix of the files' names
-    # function that parses a text to a value; further arguments: the size for cameras, else the
-    # names of target and source if the format has none. It returns an UnscaledValue if
-    # lengths may be in any unit, else metres; errors are those of
+    # function that parses a text to a value. Further arguments: for cameras the image size, else
+    # the names of target and source if the format does not name them. It returns an UnscaledValue
+    # if lengths may be in any unit, else metres; errors are those of
     # :func:`~smartcam.calibration.formats.read_transform`
     parse: Callable[..., T | UnscaledValue[T]]
     # function that returns a value as text without ``head``; None: the format is only read.
@@ -87,7 +87,7 @@ class Format(Generic[T]):
         has_any_unit = isinstance(parsed, UnscaledValue)
         stated_unit = cast("UnscaledValue[T]", parsed).unit if has_any_unit else "m"
         value = cast("UnscaledValue[T]", parsed).value if has_any_unit else cast("T", parsed)
-        motions = _find_motions(value)
+        motions = _find_transforms(value)
         if not motions:
             return value
         if unit is None and stated_unit is None:
@@ -113,13 +113,13 @@ class Format(Generic[T]):
         return self.compose(value)
 
 
-def _find_motions(value: Any) -> list[Transform]:
-    """Return all motions in a file's value: a motion, nested lists of motions, or a chain."""
+def _find_transforms(value: Any) -> list[Transform]:
+    """Return all transforms in a file's value: a transform, nested lists of them, or a chain."""
     if isinstance(value, Transform):
         return [value]
     if isinstance(value, (list, tuple)):
-        return [motion for item in value for motion in _find_motions(item)]
-    return _find_motions(getattr(value, "transforms", ()))
+        return [transform for item in value for transform in _find_transforms(item)]
+    return _find_transforms(getattr(value, "transforms", ()))
 
 
 def _scale_translations(value: Any, factor: float) -> Any:

@@ -48,7 +48,7 @@ class ForeignLens(NamedTuple):
 
     name: str
     size: Sequence[Plain] | None  # width and height, pixels; None: the file has no size
-    focal: Sequence[float]  # fx, fy, cx, cy, pixels
+    intrinsics: Sequence[float]  # fx, fy, cx, cy, pixels
     model: DistortionModel
     coefficients: Sequence[float]
 
@@ -56,7 +56,7 @@ class ForeignLens(NamedTuple):
 class _LensParameters(NamedTuple):
     """A program's lens model: the names of its parameters, in their order."""
 
-    focal: str  # names of fx, fy, cx and cy among the parameters, in their order
+    intrinsics: str  # names of fx, fy, cx and cy among the parameters, in their order
     model: DistortionModel = "plumb_bob"
     coefficients: str = ""  # names of the coefficients, in the order of the parameters
 
@@ -121,7 +121,7 @@ def _make_lens(
     if not (isinstance(name, str) and name in models):
         raise malformed_error(f"{where}: lens model", f"one of {', '.join(models)}", name)
     parameters = models[name]
-    names = [*parameters.focal.split(), *parameters.coefficients.split()]
+    names = [*parameters.intrinsics.split(), *parameters.coefficients.split()]
     if len(values) != len(names):
         expected = f"{len(names)} parameters of {name} ({', '.join(names)})"
         raise malformed_error(where, expected, f"{len(values)}")
@@ -203,8 +203,8 @@ def parse_colmap(text: str) -> FoundLenses:
             raise malformed_error("camera", "an id, a model, width, height and parameters", line)
         values = [as_number(word, f"camera {words[0]}") for word in words[4:]]
         lens = _make_lens("colmap", words[1], values, f"camera {words[0]}", words[2:4])
-        fx, fy, cx, cy = lens.focal
-        cameras.append(lens._replace(focal=(fx, fy, cx - 0.5, cy - 0.5)))
+        fx, fy, cx, cy = lens.intrinsics
+        cameras.append(lens._replace(intrinsics=(fx, fy, cx - 0.5, cy - 0.5)))
     return cameras, [], None
 
 
@@ -246,17 +246,21 @@ def parse_ros_ini(text: str) -> FoundLenses:
     coefficients = as_numbers(data["distortion"], "distortion")
     model: DistortionModel = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
     size = [*data["width"], *data["height"]]
-    return [ForeignLens(section, size, _focal_parameters(matrix), model, coefficients)], [], None
+    return (
+        [ForeignLens(section, size, _intrinsic_parameters(matrix), model, coefficients)],
+        [],
+        None,
+    )
 
 
-def _focal_parameters(matrix: np.ndarray[Any, Any]) -> list[float]:
+def _intrinsic_parameters(matrix: np.ndarray[Any, Any]) -> list[float]:
     """Return fx, fy, cx and cy of a (3, 3) matrix; raise MALFORMED if a lens has no such matrix."""
-    focal = [float(matrix[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    if (matrix != lens_matrix(*focal)).any():
+    intrinsics = [float(matrix[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    if (matrix != lens_matrix(*intrinsics)).any():
         raise malformed_error(
             "camera matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", matrix.tolist()
         )
-    return focal
+    return intrinsics
 
 
 def parse_euroc(text: str) -> FoundLenses:
@@ -278,7 +282,7 @@ def parse_basalt(text: str) -> FoundLenses:
         where = f"cam{index}"
         part = as_mapping(camera, where, ["camera_type", "intrinsics"])
         parameters = MODELS["basalt"].get(str(part["camera_type"]), _LensParameters(_TWO_FOCALS))
-        names = [*parameters.focal.split(), *parameters.coefficients.split()]
+        names = [*parameters.intrinsics.split(), *parameters.coefficients.split()]
         given = as_mapping(part["intrinsics"], where, names)
         values = [as_number(given[name], f"{where}.{name}") for name in names]
         size = as_list(sizes[index], f"{where}: resolution", 2) if sizes else None
@@ -316,7 +320,11 @@ def parse_multical(text: str) -> FoundLenses:
         )
         lenses.append(
             _make_lens(
-                "multical", part["model"], [*_focal_parameters(matrix), *coefficients], name, size
+                "multical",
+                part["model"],
+                [*_intrinsic_parameters(matrix), *coefficients],
+                name,
+                size,
             )
         )
     if len(lenses) < 2:

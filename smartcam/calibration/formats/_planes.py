@@ -50,8 +50,8 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
     if max(shear, bend) > _MAX_SIMILAR_DEVIATION:
         raise Code.NOT_SIMILAR.error(
             f"{calibration.model}: expected one scale for the whole plane, got axes that differ by "
-            f"{shear:.2g} and a scale that changes by {bend:.2g} over the points: no rigid frame "
-            "says this; export the matrix, or fit a similarity",
+            f"{shear:.2g} and a scale that changes by {bend:.2g} over the points: a rigid frame "
+            "cannot express this; export the matrix, or fit a similarity",
             "similarity",
             calibration.model,
         )

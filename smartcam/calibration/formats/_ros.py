@@ -220,8 +220,8 @@ def _make_transform(
     return Transform(frame, child, rotation_zyx(*rotation), np.array(position))
 
 
-def compose_positions(transform: Transform, *, angles: bool = False, period: bool = False) -> str:
-    """Return the arguments of ``tf`` (with a period) and ``tf2_ros`` (without), one line.
+def compose_positional(transform: Transform, *, angles: bool = False, period: bool = False) -> str:
+    """Return the command line of ``tf``'s program (with a period) or ``tf2_ros``' (without).
 
     ``angles``: yaw, pitch and roll instead of a quaternion. ``period``: whether :data:`PERIOD_MS`
     follows at the end.

@@ -99,7 +99,7 @@ def parse_csv(
 
 def _no_header_error(line: str) -> CalibrationError:
     expected = f"{_ASL_HEAD.strip()} or {_EUROC_HEAD.strip()}"
-    return malformed_error("header", f"{expected}, the unit of time among them", line)
+    return malformed_error("header", f"{expected}, with the unit of time in brackets", line)
 
 
 def _parse_header(line: str) -> _Columns | None:

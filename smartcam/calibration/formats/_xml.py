@@ -23,7 +23,7 @@ class _BoundedBuilder(ElementTree.TreeBuilder):
         self._count, self._depth = self._count + 1, self._depth + 1
         if self._count > MAX_XML_ELEMENTS or self._depth > MAX_DEPTH:
             raise malformed_error(
-                "file", f"{MAX_XML_ELEMENTS} elements at most, {MAX_DEPTH} in each other"
+                "file", f"{MAX_XML_ELEMENTS} elements at most, nested {MAX_DEPTH} deep at most"
             )
         return super().start(tag.rpartition("}")[2], attributes)
 

@@ -8,11 +8,11 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.calibration.simulation._images import render
-    from smartcam.calibration.simulation._scenes import around, hand_eye_scene, view
+    from smartcam.calibration.simulation._scenes import hand_eye_scene, poses_around, view
 
 __all__ = [
-    "around",
     "hand_eye_scene",
+    "poses_around",
     "render",
     "view",
 ]
@@ -22,6 +22,6 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_images": "render",
-            "_scenes": "around hand_eye_scene view",
+            "_scenes": "poses_around hand_eye_scene view",
         },
     )

@@ -51,7 +51,8 @@ def render(
         target: the printed target.
         camera: lens that sees the target; its image size is that of the result.
         T_camera_target: pose of the target in the camera's frame.
-        blur: standard deviation of the lens' blur, pixels; the square of each pixel adds to it.
+        blur: standard deviation of the lens' blur, pixels; averaging over a pixel's area adds to
+            it.
         noise: standard deviation of each pixel, grey levels of 255.
         black: grey level of the print.
         white: grey level of the paper.

@@ -89,10 +89,10 @@ def view(
     )
 
 
-def around(
+def poses_around(
     target: Target, count: int, *, tilt: float, distance: float, random: np.random.Generator
 ) -> list[Transform]:
-    """Return poses of a camera that looks at a target's centre from points on a cone above it.
+    """Return poses of a camera that looks at a target's centre from points in a cone above it.
 
     Args:
         target: target that the camera looks at.
@@ -160,8 +160,9 @@ class HandEyeScene:
 
     def target_in_camera(self, robot_pose: Transform) -> Transform:
         """Return ``T_camera_target`` at a pose of the robot."""
-        carrier_motion = robot_pose.inverse() if self.setup == "eye-in-hand" else robot_pose
-        return self.camera_pose.inverse() @ carrier_motion @ self.target_pose
+        # T_flange_base, or T_base_flange: from the target's carrier to the camera's
+        carrier_pose = robot_pose.inverse() if self.setup == "eye-in-hand" else robot_pose
+        return self.camera_pose.inverse() @ carrier_pose @ self.target_pose
 
     def simulate_measurements(
         self, *, pixel_sigma: float, robot_sigmas: RobotSigmas, random: np.random.Generator
@@ -252,13 +253,13 @@ def hand_eye_scene(
         distance: mean distance of camera and target, metres; distances vary by up to a fifth.
         random: source of the poses, and of the places of camera and target.
     """
-    view_poses = around(target, poses, tilt=tilt, distance=distance, random=random)
+    view_poses = poses_around(target, poses, tilt=tilt, distance=distance, random=random)
     tool_rotation = exp_rotation(random.uniform(-1.5, 1.5, size=3))
-    tool_position, hand_source = random.uniform(-0.1, 0.1, size=3), "camera"
+    tool_position = random.uniform(-0.1, 0.1, size=3)
     world_rotation = exp_rotation(random.uniform(-1.5, 1.5, size=3))
     world_position = random.uniform(-0.6, 0.6, size=3)
     if setup == "eye-in-hand":
-        camera_pose = Transform("flange", hand_source, tool_rotation, tool_position)
+        camera_pose = Transform("flange", "camera", tool_rotation, tool_position)
         target_pose = Transform("base", "target", world_rotation, world_position)
         robot = [target_pose @ view_pose @ camera_pose.inverse() for view_pose in view_poses]
     else:

@@ -129,11 +129,11 @@ def hand_eye_wizard(
             sheet_target = await ask_target(
                 suggested, known=parameters.get("target"), square=parameters.get("square")
             )
-        views = _HandEyeRun(
+        run = _HandEyeRun(
             sheet_target, setup, picture_taker(take_picture), read_robot or robot, camera, awaited
         )
-        views.allowed = allowed
-        calibration = await views.run()
+        run.allowed = allowed
+        calibration = await run.run()
         name = str(parameters.get("name", KIND))
         preview = {"svg": draw_scene(calibration, title="Where camera and sheet were")}
         result = await ask_to_save(name, save_to, KIND, _calibration_outcome(calibration), preview)
@@ -258,7 +258,7 @@ class _HandEyeRun:
         image = await self._take_picture()
         view = await asyncio.to_thread(find_target, image, self._target)
         if lens is None:
-            raise TypeError("views give a lens")
+            raise TypeError("the calibration has no lens")
         return motion_to_data(locate(view, lens).transform)
 
     async def _take_view(self) -> bool:
@@ -328,7 +328,7 @@ class _HandEyeRun:
 
     async def _read_flange(self) -> Transform:
         if isinstance(self._robot, str):
-            raise TypeError("the robot is not read")
+            raise TypeError("there is no function that reads the robot")
         pose = await self._robot()
         return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
 
@@ -364,7 +364,7 @@ class _HandEyeRun:
         step = Step(
             id="calculate",
             title="Calculate",
-            description="Several ways are compared by the poses that each has not seen.",
+            description="Several methods are compared, each at poses that it did not use.",
             button="Calculate",
             notes=(f"{len(self._samples)} views",),
             timeout=CALCULATION_TIMEOUT,
@@ -413,7 +413,7 @@ class _HandEyeRun:
             del options["accept"], options["verify"]
         else:
             worst = 1 + calibration.worst
-        label = "View to remove; the worst one stands there"
+        label = "View to remove; the worst one is filled in"
         view = number_input("view", label, len(self._samples), worst)
         preview = self.preview()
         if calibration is not None:

@@ -149,5 +149,5 @@ class Journal:
         self._stream.truncate(self._size)
         self._stream.seek(self._size)
 
-    def _broken_journal_error(self, why: str) -> CalibrationError:
-        return Code.BROKEN_FILE.error(f"{self.path}: {why}; expected the journal of a sequence")
+    def _broken_journal_error(self, reason: str) -> CalibrationError:
+        return Code.BROKEN_FILE.error(f"{self.path}: {reason}; expected the journal of a sequence")

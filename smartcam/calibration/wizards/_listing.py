@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._files.directory import Folder
 
 MAX_CALIBRATIONS: Final = 200
-"""Largest number of calibrations that are listed; of more, the first by name."""
+"""Largest number of calibrations that are listed, those whose names are first in order."""
 
 
 def list_calibrations(folder: Folder) -> list[dict[str, Any]]:

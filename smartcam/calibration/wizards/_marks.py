@@ -37,7 +37,7 @@ class Mark:
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> Mark:
-        """Return the mark of a row from :meth:`MarkCamera.take_picture`."""
+        """Return the mark of a row from :meth:`MarkCamera.take_marks`."""
         return cls(row["feature_id"], row["x"], row["y"], row["theta"])
 
     def text(self, unit: str) -> str:
@@ -51,10 +51,10 @@ class Mark:
 class Touch:
     """A touch of a point by the robot's tip."""
 
-    mark: Mark  # mark that the camera sees at the point; for a ray, its origin
+    mark: Mark  # mark that the camera sees at the point; for a point on a ray, the rays' origin
     robot: Vector  # position of the tip in the robot's base, metres
     tool_z: Vector | None  # direction of the tool's axis; None if it is not known
-    label: str = "mark"  # ``mark``; for touches of the rays O, A or B
+    label: str = "mark"  # or ``O``, ``A``, ``B``: the sheet's origin, or a point on its ray A or B
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,19 +63,19 @@ class MarkCamera:
 
     localize: Localize
     feature: str = ""  # only localizations with this name are marks; empty for all
-    # whether the camera's y axis points down, so that ``localize`` turns it up; None: not known
+    # whether the camera's own y axis points down; ``localize`` then reverses y; None: not known
     y_down: bool | None = None
 
-    async def take_picture(self, _answers: Answers) -> list[dict[str, Any]]:
-        """Take a picture, as the action of a step.
+    async def take_marks(self, _answers: Answers) -> list[dict[str, Any]]:
+        """Take a picture and return its marks, as the action of a step.
 
         Returns:
             A row for each mark: ``feature_id, quality, photo_index, frame_id, x, y, theta,
             y_down``.
 
         Raises:
-            CalibrationError: TOO_FEW: there is no mark; SHAPE: there are more than
-                :data:`MAX_MARKS`.
+            CalibrationError: TOO_FEW: there is no mark; SHAPE, the code of wrong arguments: there
+                are more than :data:`MAX_MARKS`.
 
         Cancellation: as that of ``localize``.
         """
@@ -110,7 +110,7 @@ class MarkCamera:
         """
         if None not in {earlier, self.y_down} and earlier != self.y_down:
             raise Code.MIRRORED.error(
-                f"{label} with y_down={earlier}, now it is {self.y_down}, and everything would be "
+                f"{label} has y_down={earlier}, now it is {self.y_down}, and everything would be "
                 f"mirrored; expected y_down={earlier}",
                 earlier,
                 self.y_down,

@@ -38,10 +38,9 @@ class Pictures(Protocol):
 def picture_taker(pictures: TakePicture | Pictures) -> TakePicture:
     """Return a function that takes a picture.
 
-    For a source of frames, the function returns the first frame that is exposed after the call.
-
-    The picture is then the frame's brightness. Errors of the source are passed on, such as a
-    missing device or no frame in time.
+    For a source of frames, the function returns the brightness of the first frame that is exposed
+    after the call. Errors of the source are passed on, such as a missing device or no frame in
+    time.
     """
     if callable(pictures):
         return pictures
@@ -67,7 +66,7 @@ MAX_PICTURE_BYTES: Final = 1 << 26
 MAX_FILES: Final = 10_000
 """Largest number of entries of a folder of pictures, which is listed several times per second."""
 
-PICTURE_DEADLINE: Final = 25.0
+FOLDER_TIMEOUT: Final = 25.0
 """Longest time, seconds, to wait for a picture in a folder."""
 
 LISTING_PERIOD: Final = 0.2
@@ -119,19 +118,19 @@ class PictureFolder:
 
     Args:
         path: the folder.
-        deadline: time for which :meth:`take` waits, seconds.
+        timeout: time for which :meth:`take` waits, seconds.
 
     Attributes:
         path: the folder.
-        deadline: time for which :meth:`take` waits, seconds.
+        timeout: time for which :meth:`take` waits, seconds.
 
     Raises:
         CalibrationError: NO_PICTURE: the path is no folder.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, deadline: float = PICTURE_DEADLINE) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, timeout: float = FOLDER_TIMEOUT) -> None:
         self.path: Path = Path(path)
-        self.deadline: float = deadline
+        self.timeout: float = timeout
         self._scan_folder()
 
     @property
@@ -139,7 +138,7 @@ class PictureFolder:
         """Text, for people, that describes the picture that :meth:`take` waits for."""
         return (
             f"the first file written to {self.path} from now on counts, if its name ends in "
-            f"{', '.join(sorted(SUFFIXES))}. The step waits {self.deadline:g} s for it"
+            f"{', '.join(sorted(SUFFIXES))}. The step waits {self.timeout:g} s for it"
         )
 
     async def take(self) -> NDArray[Any]:
@@ -157,7 +156,7 @@ class PictureFolder:
         before, other_names = self._scan_folder(), self._other_names()
         last: dict[str, tuple[int, int]] = before
         try:
-            async with asyncio.timeout(self.deadline):
+            async with asyncio.timeout(self.timeout):
                 while True:
                     await asyncio.sleep(LISTING_PERIOD)
                     now = self._scan_folder()
@@ -172,7 +171,7 @@ class PictureFolder:
                     last = now
         except TimeoutError as exc:
             raise Code.NO_PICTURE.error(
-                f"no picture came into {self.path} within {self.deadline:g} s"
+                f"no picture came into {self.path} within {self.timeout:g} s"
                 f"{self._describe_other_files(before, other_names)}; expected a file that ends in "
                 f"one of {', '.join(sorted(SUFFIXES))}, written after the button was pressed",
                 sorted(SUFFIXES),
@@ -189,11 +188,11 @@ class PictureFolder:
         self, before: dict[str, tuple[int, int]], other_names: set[str]
     ) -> str:
         """Return a note on new files that are no pictures, and on pictures from before."""
-        notes = [f"there before: {len(before)}"] if before else []
+        notes = [f"pictures from before: {len(before)}"] if before else []
         new_names = sorted(self._other_names() - other_names)
         if new_names:
             more = f" and {len(new_names) - 3} more" if len(new_names) > 3 else ""
-            notes.insert(0, f"came, but no picture: {', '.join(new_names[:3])}{more}")
+            notes.insert(0, f"new files that are not pictures: {', '.join(new_names[:3])}{more}")
         return f" ({'; '.join(notes)})" if notes else ""
 
     def _scan_folder(self) -> dict[str, tuple[int, int]]:

@@ -72,7 +72,7 @@ def plane_wizard(
         step = about_step(
             "The camera is fixed, and sees the plane that the robot works on. All touches are made "
             "with one tool, held the same way: then the error of its tip is the same in all "
-            "of them, and cancels out as long as parts are taken like that.",
+            "of them, and cancels out as long as the robot picks with the tool held like that.",
             {
                 "marks": "each mark that the camera sees; 9 over the whole field are good",
                 "rays": "the origin mark and a point on each of the rays A and B of its sheet",
@@ -159,8 +159,8 @@ class _MarkSource(PointSource):
         step = Step(
             id="scale",
             title="Was the sheet printed true to size?",
-            description="Printers scale. The camera took its metres from the sheet as it should "
-            "be, so the ruler measures the scale.",
+            description="Printers often change the size. The camera's metres assume that the sheet "
+            "has its nominal size; the printed ruler shows the true one.",
             inputs=(ruler_input("ruler"),),
         )
         return float((await ask(step))["ruler"]) / RULER_MM
@@ -175,8 +175,8 @@ class _MarkSource(PointSource):
         return rows
 
     async def _take_checked_picture(self, answers: Answers) -> list[dict[str, Any]]:
-        self._camera.check_y_down(self.y_down, "the picture before was taken")
-        return await self._camera.take_picture(answers)
+        self._camera.check_y_down(self.y_down, "the previous picture")
+        return await self._camera.take_marks(answers)
 
     def fit(self, *, robust: bool) -> PlaneCalibration:
         return fit_plane(

@@ -74,7 +74,8 @@ class PointSource(Touches, ABC):
     Attributes:
         connect: arguments of :func:`smartcam.connect` for the camera; None: it is not known.
         camera_frame: name of the only frame that localizations may come in; None: any.
-        y_down: whether the camera's y axis was turned up; None: not known.
+        y_down: whether the camera's own y axis points down, so that y was reversed; None: not
+            known.
     """
 
     KIND: ClassVar[str]
@@ -308,7 +309,7 @@ class PointSource(Touches, ABC):
             options["all"] = "count all points, also those that do not agree with the others"
         elif len(self.touches) >= MIN_POINTS and doubtful:
             options["robust"] = "leave out the points that do not agree with the others"
-        label = "Point, to touch again or to remove; the worst one stands there"
+        label = "Point, to touch again or to remove; the worst one is filled in"
         advised = judgement.number or worst
         count = len(self.touches)
         point = number_input("point", label, count, advised if advised <= count else worst)
@@ -325,7 +326,7 @@ class PointSource(Touches, ABC):
             plane.residuals,
             plane.leave_one_out,
             worst=plane.worst,
-            left_out=plane.outliers,
+            excluded=plane.outliers,
         )
         return {**comparison, **self.PREVIEW_EXTRAS, "choices": self._choices(comparison["points"])}
 
@@ -486,8 +487,8 @@ def plane_outcome(
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
     x, y, z = calibration.rotation[:, 0] if direction is None else direction
     notes.append(
-        f"{label} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
-        "does, for points in a regular grid fit as well when touched from another corner on"
+        f"{label} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: check this; a regular grid "
+        "fits just as well if the touches began at the wrong corner"
     )
     notes += [f"{warning.code}: {warning.text}" for warning in calibration.warnings]
     judgement = calibration.judged()

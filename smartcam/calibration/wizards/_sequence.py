@@ -199,7 +199,7 @@ class WizardSession:
 
     Attributes:
         wizard: the wizard.
-        flow: name of this run, which its tokens begin with.
+        run_id: name of this run, which its tokens begin with.
         parameters: the parameters with which the wizard was started.
         resumed: facts about a resumed journal: ``since`` and ``last``, the times at which it was
             begun and last written, ``done``, its answers, and its ``parameters``. None for a new
@@ -224,7 +224,7 @@ class WizardSession:
         header = self._make_header(parameters or {})
         self._all_entries: list[dict[str, Any]] = [] if journal is None else list(journal.entries)
         try:
-            self.flow: str = str(header["flow"])
+            self.run_id: str = str(header["run_id"])
             self.parameters: dict[str, Any] = dict(header["parameters"])
             self._log = functools.reduce(_SequenceLog.with_entry, self._all_entries, _SequenceLog())
         except (KeyError, IndexError, TypeError, ValueError) as exc:
@@ -242,7 +242,7 @@ class WizardSession:
     def _resumed_facts(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return facts about the resumed journal; None if there is nothing to resume.
 
-        Front-ends show these facts, since touched marks may have moved in the meantime.
+        Front-ends show these facts, since marks that the robot touched may have moved meanwhile.
         """
         if self.state != "asking" or not self._log.entries:
             return None
@@ -279,7 +279,7 @@ class WizardSession:
             return journal.header
         return {
             **expected,
-            "flow": secrets.token_hex(8),
+            "run_id": secrets.token_hex(8),
             "started_at": datetime.now(UTC).isoformat(),
             "parameters": _as_stored(dict(parameters), "the parameters"),
         }
@@ -319,15 +319,15 @@ class WizardSession:
     @property
     def token(self) -> str:
         """Text that a call must send back, so that no call counts twice; each entry changes it."""
-        return f"{self.flow}.{len(self._all_entries)}"
+        return f"{self.run_id}.{len(self._all_entries)}"
 
     @property
     def current(self) -> dict[str, Any]:
         """The current step as JSON data, for a front-end to show.
 
         Returns:
-            A dict with ``flow``, ``wizard``, ``token``, ``type``, ``number`` (of the step, from 1),
-            ``of`` (about how many steps; None: not known), ``step`` (its id), ``title``,
+            A dict with ``run_id``, ``wizard``, ``token``, ``type``, ``number`` (of the step, from
+            1), ``of`` (about how many steps; None: not known), ``step`` (its id), ``title``,
             ``description``, ``button``, ``notes``, ``verdict`` (``level``, ``text``), ``preview``,
             ``waiting``, ``schema``, ``defaults``, ``errors`` (a text for each input, ``base`` for
             other errors), ``can`` (the possible calls among ``undo``, ``repeat``, ``abort``) and
@@ -336,7 +336,7 @@ class WizardSession:
             preview of the last step) or ``abort``.
         """
         view: dict[str, Any] = {
-            "flow": self.flow,
+            "run_id": self.run_id,
             "wizard": self.wizard.name,
             "token": self.token,
             "type": {"ended": "result", "aborted": "abort"}.get(self.state, "confirm"),

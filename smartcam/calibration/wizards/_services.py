@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 from smartcam.calibration._files.directory import EXPORTS, Folder
 from smartcam.calibration._files.load import calibration_from_document
 from smartcam.calibration._files.store import keep_backup, read_document, replace_file
-from smartcam.calibration._plane.calibration import KIND, PlaneCalibration
+from smartcam.calibration._plane.calibration import KIND as PLANE_KIND
+from smartcam.calibration._plane.calibration import PlaneCalibration
 from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._listing import list_calibrations
 from smartcam.calibration.wizards._sequence import WizardSession
@@ -93,7 +94,7 @@ class CalibrationService:
 
     @property
     def session(self) -> WizardSession:
-        """The running sequence, or the last one that ended.
+        """The session of the running wizard, or of the last one that ended.
 
         Raises:
             CalibrationError: ``NO_SEQUENCE``.
@@ -105,7 +106,7 @@ class CalibrationService:
     def start(
         self,
         name: str,
-        wizard: str = KIND,
+        wizard: str = PLANE_KIND,
         parameters: Mapping[str, Any] | None = None,
         *,
         fresh: bool = False,
@@ -128,7 +129,7 @@ class CalibrationService:
                 ``WRONG_JOURNAL``, ``BROKEN_FILE``, ``NOT_POSSIBLE`` while an action is under way.
             OSError: the journal cannot be opened or written.
         """
-        path = self.folder.journal(name, "" if wizard == KIND else wizard)
+        path = self.folder.journal(name, "" if wizard == PLANE_KIND else wizard)
         if wizard not in self._wizards:
             raise Code.NOT_FOUND.error(
                 f"no wizard is called {wizard!r}; expected one of {', '.join(self._wizards)}",
@@ -168,7 +169,7 @@ class CalibrationService:
                 ``.yaml`` file holds the matrix, which PyYAML, ``cv2.FileStorage`` and
                 :func:`~smartcam.calibration.formats.read_matrix` read.
             form: format, such as ``tf2``, in which the frame of the calibration's plane is written
-                instead of the matrix; a comment has the scale.
+                instead of the matrix; the scale is written into a comment.
 
         Returns:
             The file's path in the folder.
@@ -180,7 +181,7 @@ class CalibrationService:
                 :func:`~smartcam.calibration.formats.plane_frame`; ``NOT_WRITTEN``: the file cannot
                 be written.
         """
-        from smartcam.calibration.formats import compose
+        from smartcam.calibration.formats import compose_plane_frame
         from smartcam.calibration.formats._opencv import PlaneMatrix, compose_matrix
 
         source = self.folder.find(name)
@@ -196,9 +197,11 @@ class CalibrationService:
                 path.suffix,
             )
         else:
-            calibration = PlaneCalibration.from_data(_data_of_kind(document, KIND, source.name))
+            calibration = PlaneCalibration.from_data(
+                _data_of_kind(document, PLANE_KIND, source.name)
+            )
             if form is not None:
-                body = compose(form, calibration, suffix=path.suffix).encode()
+                body = compose_plane_frame(form, calibration, suffix=path.suffix).encode()
             else:
                 unit = str(document.context.get("camera_unit", "unknown unit"))
                 body = compose_matrix(PlaneMatrix.of(calibration), unit).encode()
@@ -206,7 +209,7 @@ class CalibrationService:
         return f"{EXPORTS}/{path.name}"
 
     def load(self, name_or_path: str) -> AnyCalibration:
-        """Load a calibration of a plane or by a sheet, for :meth:`transform` to use.
+        """Load a calibration of a plane or with a printed sheet, for :meth:`transform` to use.
 
         Args:
             name_or_path: name of the calibration; or, with a ``/``, path in the folder of an
@@ -258,7 +261,7 @@ def _move_aside(path: Path) -> None:
     if not path.exists():
         return
     try:
-        Journal(path).close()  # no other process writes this file
+        Journal(path).close()  # fails if another process has this journal open
     except CalibrationError as exc:
         if exc.code != Code.BROKEN_FILE:
             raise

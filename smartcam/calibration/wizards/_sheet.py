@@ -117,7 +117,8 @@ def sheet_wizard(
             suggested, known=parameters.get("target"), square=parameters.get("square")
         )
         source = _SheetSource(about, read_robot, target)
-        # v of pixels points down, but the calibration maps localizations whose y points up
+        # The pixels' v points down: y_down makes localizations from this camera have y up, as the
+        # calibration expects.
         source.connect = None if connect is None else {**connect, "y_down": True}
         await source.ask_picture(picture_taker(take_picture), camera, lens_covariance, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
@@ -296,7 +297,7 @@ class _SheetSource(PointSource):
         seen_count, predicted = len(self._view.ids), None
         notes = [
             *of_touches.notes,
-            f"{seen_count} points seen, {calibration.rms:.2g} px beside their plane",
+            f"{seen_count} points seen, {calibration.rms:.2g} px rms from their fit",
         ]
         if plane.touch_sigma is not None:
             errors = calibration.predicted_error(self._view.points)

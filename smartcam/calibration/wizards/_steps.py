@@ -4,7 +4,8 @@ A step is data with a JSON Schema of its answers, and it checks answers by the s
 front-ends need no code for particular wizards.
 
 Source: the thesis with which smartcam began, 2.2.1 and Figure 2.9 (published), for a step's parts
-and for the three lists of numbers, texts and options of :func:`as_lists` and :func:`from_lists`.
+and for the lists of numbers, texts and options of :func:`as_lists` (six) and :func:`from_lists`
+(three).
 """
 
 from __future__ import annotations
@@ -279,7 +280,9 @@ class Step:
                 errors[input_field.name] = str(exc)
         if given:
             names = ", ".join(input_field.name for input_field in self.inputs) or "nothing"
-            errors["base"] = f"{_short_repr(next(iter(given)))} is not asked for, but {names}"
+            errors["base"] = (
+                f"{_short_repr(next(iter(given)))}: no such input; this step asks for {names}"
+            )
         if errors:
             raise _wrong_answers_error(errors)
         return values

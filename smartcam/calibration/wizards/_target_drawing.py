@@ -87,7 +87,7 @@ def draw_preview(
     ``axes`` (4, 2): the target's origin and the ends of its x, y and z, pixels. ``suggested`` (M,
     2): outline of the target in the suggested next view, pixels. ``title``: a line on top.
 
-    The SVG document has a fixed size and loads no other files; lines end with a line feed. Raises
+    The SVG document has a fixed size and loads no other files; its text has line feeds. Raises
     SHAPE if there is no image, the view has another size, or an array another shape; NOT_FINITE.
     """
     grey = grey_image(image)

@@ -85,8 +85,8 @@ async def ask_target(
     step = Step(
         id="rulers",
         title="Was the sheet printed true to size?",
-        description=f"Printers scale. Measure both rulers; leave {RULER_MM:g} mm if the lengths "
-        "that you gave were measured on the paper.",
+        description="Printers often change the size. Measure both rulers; leave "
+        f"{RULER_MM:g} mm if the lengths that you gave were measured on the paper.",
         inputs=tuple(ruler_input(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
     )
     measured = await ask(step)
@@ -98,7 +98,7 @@ async def _which_target(suggested: Target | None, square: float | None) -> Targe
         name="kind",
         label="What is printed on the sheet",
         options={
-            "described": "the target of the description",
+            "described": "the target that is described below",
             "checkerboard": "a checkerboard",
             "charuco": "a ChArUco board: markers in the white squares",
             "circles": "dots in rows and columns",

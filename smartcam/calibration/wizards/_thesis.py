@@ -68,7 +68,7 @@ class CalibrationCamera(Protocol):
 
     Attributes:
         name: name of the camera.
-        y_down: whether the y axis of the camera's localizations was turned up.
+        y_down: whether the camera's own y axis points down, so that y was reversed.
         unit: unit of the camera's positions, ``m`` or ``px``.
     """
 
@@ -90,7 +90,7 @@ class CalibrationCamera(Protocol):
         ...
 
 
-class RobotGraph(Protocol):
+class RosAccess(Protocol):
     """Access to the rest of ROS: pictures on topics, lenses, and the frames of TF."""
 
     def check_topic(self, topic: str) -> None:
@@ -104,7 +104,7 @@ class RobotGraph(Protocol):
         ...
 
     async def lens(self, topic: str) -> CameraModel | None:
-        """Return the lens of the camera whose pictures are on a topic; None if unknown."""
+        """Return the lens calibration of the camera with pictures on a topic; None if unknown."""
         ...
 
     async def pose(self, frame: str, base: str, utc: float | None) -> Transform:
@@ -174,15 +174,15 @@ class PixelPoseRequest(NamedTuple):
 
 
 @dataclass(eq=False)
-class _Sequence:
+class _RunningCalibration:
     """A running calibration: the first step, then the wizard.
 
     Attributes:
-        start_request: request that started the sequence; the robot's base is filled in.
+        start_request: request that started the wizard; the robot's base is filled in.
         first_step: step before the wizard.
         service: service that runs the wizard; None: no wizard was chosen yet.
         was_returned: whether a step was returned to a client.
-        is_aborted: whether a call has aborted the sequence.
+        is_aborted: whether a call has aborted the running.
         picture_time: time of the last picture, UTC; None: not known.
     """
 
@@ -195,12 +195,12 @@ class _Sequence:
 
     @property
     def session(self) -> WizardSession | None:
-        """The wizard's sequence; None: no wizard was chosen yet."""
+        """The session of the running wizard; None: no wizard was chosen yet."""
         return None if self.service is None else self.service.session
 
     @property
     def step(self) -> Step | None:
-        """Current step, with answers that were undone as defaults; None at the end."""
+        """Current step; answers that the user took back are its defaults. None at the end."""
         session = self.session
         if session is None:
             return self.first_step
@@ -234,8 +234,8 @@ class ThesisCalibration:
     ) -> None:
         self._files = CalibrationService(Folder(folder))
         self._name, self._abandon_timeout = name, abandon_timeout
-        self.graph: RobotGraph | None = None
-        self._sequence: _Sequence | None = None
+        self.graph: RosAccess | None = None
+        self._running: _RunningCalibration | None = None
         self._loaded: AnyCalibration | None = None
         self._camera: CalibrationCamera | None = None
         self._busy = False
@@ -262,11 +262,11 @@ class ThesisCalibration:
                 base = await graph.root(request.tf_frame_robot_tcp)
             self._check_free()
         request = request._replace(tf_frame_robot_base=base)
-        self._sequence = _Sequence(request, _first_step(request, self._name))
+        self._running = _RunningCalibration(request, _first_step(request, self._name))
         self._restart_timer()
 
     def _check_free(self) -> None:
-        if self._sequence is not None:
+        if self._running is not None:
             since = asyncio.get_running_loop().time() - self._last_call_at
             raise Code.IN_USE.error(
                 f"{self._name}: a calibration is under way, whose last call came {since:.0f} s ago;"
@@ -279,8 +279,8 @@ class ThesisCalibration:
         named = [*topics, *((frame,) if frame else ())]
         if named and self.graph is None:
             raise Code.NOT_POSSIBLE.error(
-                f"{self._name}: {', '.join(named)}: this camera is not seen in ROS; expected "
-                f"{SMARTCAMERA} or no topic, and no frames, or ros2: in the fleet file",
+                f"{self._name}: {', '.join(named)}: this camera is not seen in ROS; use "
+                f"{SMARTCAMERA} or no topic and name no frames, or add ros2: to the fleet file",
                 got=named,
             )
         for topic in topics:
@@ -301,22 +301,22 @@ class ThesisCalibration:
 
         Cancellation: a running action is cancelled, and the step stays.
         """
-        sequence = self._sequence
-        if sequence is None:
+        running = self._running
+        if running is None:
             raise Code.NO_SEQUENCE.error(
                 f"{self._name}: no calibration is under way ({self._last_end}); expected "
                 "StartCalibration first"
             )
         if request.abort:
-            return await self._abort(sequence)
+            return await self._abort(running)
         with self._refuse_concurrent("PerformCurrentAndGetNextStep"):
             self._camera = camera
-            errors = await self._carry_out(sequence, request)
-        if sequence.is_aborted:
+            errors = await self._carry_out(running, request)
+        if running.is_aborted:
             return _reply_fields(
                 _ABORTED, f"{self._name}: another call has aborted the calibration"
             )
-        return self._reply(sequence, errors)
+        return self._reply(running, errors)
 
     @contextlib.contextmanager
     def _refuse_concurrent(self, label: str) -> Iterator[None]:
@@ -334,62 +334,66 @@ class ThesisCalibration:
             self._busy = False
             self._restart_timer()
 
-    async def _carry_out(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
+    async def _carry_out(
+        self, running: _RunningCalibration, request: StepRequest
+    ) -> Mapping[str, str]:
         """Carry out a request; return errors by the names of inputs."""
-        is_first_call, sequence.was_returned = not sequence.was_returned, True
+        is_first_call, running.was_returned = not running.was_returned, True
         try:
-            if self.graph is not None and sequence.start_request.tf_frame_robot_tcp:
+            if self.graph is not None and running.start_request.tf_frame_robot_tcp:
                 self.graph.listen()  # so the robot's pose at a picture will be known
             if request.repeat_last_step:
-                return await self._go_back(sequence)
+                return await self._go_back(running)
             if is_first_call:
                 return _check_no_inputs(request)
-            return await self._submit_answers(sequence, request)
+            return await self._submit_answers(running, request)
         except SmartCamError as exc:
             return {"base": str(exc)}
         except OSError as exc:
             return {"base": f"the journal: {exc.strerror or exc}"}
 
-    async def _submit_answers(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
-        step, session = sequence.step, sequence.session
+    async def _submit_answers(
+        self, running: _RunningCalibration, request: StepRequest
+    ) -> Mapping[str, str]:
+        step, session = running.step, running.session
         if step is None:
             return {}
         answers = from_lists(step, request.value_inputs, request.text_inputs, request.option_inputs)
         if session is None:
-            await self._start_wizard(sequence, step.checked(answers))
+            await self._start_wizard(running, step.checked(answers))
             return {}
         view = await session.submit(session.token, answers)
         errors: Mapping[str, str] = view["errors"]
         return errors
 
-    async def _go_back(self, sequence: _Sequence) -> Mapping[str, str]:
+    async def _go_back(self, running: _RunningCalibration) -> Mapping[str, str]:
         """Go back to the previous step."""
-        session = sequence.session
+        session = running.session
         if session is None:
             return {"base": "repeat_last_step: there is no step before this one"}
         if "undo" in session.current["can"]:
             await session.undo(session.token)
         else:
-            sequence.close()
+            running.close()
         return {}
 
-    async def _abort(self, sequence: _Sequence) -> dict[str, Any]:
-        sequence.is_aborted = True
-        session = sequence.session
+    async def _abort(self, running: _RunningCalibration) -> dict[str, Any]:
+        running.is_aborted = True
+        session = running.session
         if session is not None and session.state == "asking":
             await session.abort(session.token)
-        self._end_sequence(sequence, "the last one was aborted")
+        self._end_running(running, "the last one was aborted")
         return _reply_fields(_ABORTED, "")
 
     # ------------------------------------------------------------------ the wizard
 
-    async def _start_wizard(self, sequence: _Sequence, answers: Answers) -> None:
+    async def _start_wizard(self, running: _RunningCalibration, answers: Answers) -> None:
         """Start the wizard that the answers of the first step choose.
 
         Raises:
             CalibrationError: as :meth:`CalibrationService.start`.
         """
-        request, name = sequence.start_request, answers["name"]
+        request, name = running.start_request, answers["name"]
         self._files.folder.calibration(name)  # a wrong name is refused before anything is measured
         fixed = request.fixed_camera or answers["fixed_camera"]
         source = request._replace(fixed_camera=fixed).source or answers["pictures"]
@@ -398,34 +402,34 @@ class ThesisCalibration:
         lens = None
         if self.graph is not None and source != SMARTCAMERA:
             lens = await self.graph.lens(source)
-            if sequence.is_aborted:
+            if running.is_aborted:
                 return
-        wizard = self._make_wizard(sequence, fixed == "True", source, lens)
+        wizard = self._make_wizard(running, fixed == "True", source, lens)
         parameters = {**_parameters(request, self._camera), "asked": [fixed, source, *request]}
         service = CalibrationService(self._files.folder, [wizard])
         _start_or_resume(service, name, wizard.name, parameters)
-        sequence.service = service
-        sequence.first_step = sequence.first_step.with_defaults(answers)
+        running.service = service
+        running.first_step = running.first_step.with_defaults(answers)
 
     def _make_wizard(
-        self, sequence: _Sequence, fixed: bool, source: str, lens: CameraModel | None
+        self, running: _RunningCalibration, fixed: bool, source: str, lens: CameraModel | None
     ) -> Wizard:
         """Return the wizard for the camera's place and the source of pictures.
 
         ``fixed``: whether the camera is fixed in the cell. ``lens``: None: not known.
         """
         save_to = self._files.folder.calibration
-        can_read_robot = bool(sequence.start_request.tf_frame_robot_tcp)
+        can_read_robot = bool(running.start_request.tf_frame_robot_tcp)
 
         async def take_picture() -> Any:
-            return await self._take_picture(sequence, source)
+            return await self._take_picture(running, source)
 
         async def read_tip_pose() -> Pose:
-            tip = await self._read_robot_pose(sequence, None)
+            tip = await self._read_robot_pose(running, None)
             return replace(tip, at=tip.at or datetime.now(UTC)).pose()
 
         async def read_flange_pose() -> Transform:
-            return await self._read_robot_pose(sequence, sequence.picture_time)
+            return await self._read_robot_pose(running, running.picture_time)
 
         if not fixed:
             return hand_eye_wizard(
@@ -451,40 +455,40 @@ class ThesisCalibration:
     async def _localize(self) -> list[Localization]:
         return await _require(self._camera).localize()
 
-    async def _take_picture(self, sequence: _Sequence, source: str) -> Any:
-        sequence.picture_time = None
+    async def _take_picture(self, running: _RunningCalibration, source: str) -> Any:
+        running.picture_time = None
         if source == SMARTCAMERA:
             return await _require(self._camera).take_picture()
-        image, sequence.picture_time = await _require(self.graph).picture(source)
+        image, running.picture_time = await _require(self.graph).picture(source)
         return image
 
-    async def _read_robot_pose(self, sequence: _Sequence, utc: float | None) -> Transform:
-        request = sequence.start_request
+    async def _read_robot_pose(self, running: _RunningCalibration, utc: float | None) -> Transform:
+        request = running.start_request
         return await _require(self.graph).pose(
             request.tf_frame_robot_tcp, request.tf_frame_robot_base, utc
         )
 
     # ------------------------------------------------------------------ the end
 
-    def _reply(self, sequence: _Sequence, errors: Mapping[str, str]) -> dict[str, Any]:
+    def _reply(self, running: _RunningCalibration, errors: Mapping[str, str]) -> dict[str, Any]:
         """Return the fields of a reply with the current step, or with the end."""
         error = "; ".join(
             text if name == "base" else f"{name}: {text}" for name, text in errors.items()
         )
-        step, session = sequence.step, sequence.session
+        step, session = running.step, running.session
         if step is None and session is not None:
             view, name = session.current, str(session.parameters["name"])
             step = _done_step(name, view)
             if session.state == "ended":
-                self._end_sequence(sequence, f"{name!r} was finished")
+                self._end_running(running, f"{name!r} was finished")
                 # a calibration that maps no pixels, such as a hand-eye one, cannot be loaded
                 with contextlib.suppress(CalibrationError, OSError):
                     self.load(name)
-        return _reply_fields(step or sequence.first_step, error)
+        return _reply_fields(step or running.first_step, error)
 
-    def _end_sequence(self, sequence: _Sequence, reason: str) -> None:
-        sequence.close()
-        self._sequence, self._last_end = None, reason
+    def _end_running(self, running: _RunningCalibration, reason: str) -> None:
+        running.close()
+        self._running, self._last_end = None, reason
         self._restart_timer()
 
     def _restart_timer(self) -> None:
@@ -494,16 +498,14 @@ class ThesisCalibration:
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None
-        if self._sequence is not None and not self._busy:
+        if self._running is not None and not self._busy:
             self._timer = loop.call_later(self._abandon_timeout, self._abandon)
 
     def _abandon(self) -> None:
-        if self._sequence is not None:
-            text = (
-                f"the last one was left for {self._abandon_timeout:g} s; it goes on where it was "
-            )
-            self._end_sequence(
-                self._sequence, text + "when the same is started under the same name"
+        if self._running is not None:
+            text = f"the last one was abandoned after {self._abandon_timeout:g} s without a call; "
+            self._end_running(
+                self._running, text + "start it again under the same name to resume it"
             )
 
     def close(self) -> None:
@@ -511,9 +513,9 @@ class ThesisCalibration:
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None
-        sequence, self._sequence = self._sequence, None
-        if sequence is not None:
-            sequence.close()
+        running, self._running = self._running, None
+        if running is not None:
+            running.close()
 
     # ------------------------------------------------------------------ other services
 
@@ -534,7 +536,7 @@ class ThesisCalibration:
         self._loaded = self._files.load(name_or_path)
 
     async def transform(self, request: PixelPoseRequest) -> Pose:
-        """Return the robot's pose for a pose that the camera saw, in the request's reference frame.
+        """Return a pose that the camera saw, in the robot's or the request's reference frame.
 
         Raises:
             CalibrationError: ``NO_CALIBRATION``, ``WRONG_FRAME``, ``OUT_OF_FIELD``, ``BAD_TIME``.
@@ -556,8 +558,8 @@ class ThesisCalibration:
             datetime.now(UTC) if request.utc is None else datetime.fromtimestamp(request.utc, UTC)
         )
         if reference != robot:
-            reference_pose = await self._frame_pose(robot, reference, request.utc)
-            part_pose = reference_pose.undated() @ Transform.from_pose(pose, "part").undated()
+            robot_pose = await self._frame_pose(robot, reference, request.utc)
+            part_pose = robot_pose.undated() @ Transform.from_pose(pose, "part").undated()
             pose = replace(part_pose, at=time).pose()
         return pose._replace(header=Header(request.seq, time, reference))
 
@@ -565,8 +567,8 @@ class ThesisCalibration:
         """Return the pose of the robot's frame in the reference frame."""
         if self.graph is None:
             raise Code.WRONG_FRAME.error_with_value(
-                f"tf_frame_reference: expected {robot!r}, since this camera is not seen in ROS, "
-                "whose TF would lead elsewhere",
+                f"tf_frame_reference: expected {robot!r}, since other frames need ROS' TF, and "
+                "this camera is not seen in ROS",
                 robot,
                 reference,
             )
@@ -670,7 +672,7 @@ def _done_step(name: str, view: Mapping[str, Any]) -> Step:
     """Return a step that reports the result."""
     verdict, file = view["verdict"], view["result"]["file"]
     verdict_text = "" if verdict is None else f"{verdict['text']} "
-    text = f"{verdict_text}It is in the file {file}, and loaded where it maps pixels."
+    text = f"{verdict_text}It is in the file {file}. It was also loaded, if it maps pixels."
     return Step(id="done", title=f"The calibration {name} is done", description=text, button="")
 
 

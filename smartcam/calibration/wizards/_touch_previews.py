@@ -1,5 +1,7 @@
 """Make previews of a wizard's touches: JSON data, in metres, for a front-end to draw.
 
+A touch is a point that the robot's tip touched, with what the camera sees there.
+
 Touches without a calibration are drawn in the camera's frame. Touches with a calibration are drawn
 along the axes of the plane; the centre is the mean of the calibration's own touches.
 """
@@ -65,13 +67,13 @@ def compare_touches(
     held_out: Array | None = None,
     *,
     worst: int,
-    left_out: Collection[int] = (),
+    excluded: Collection[int] = (),
 ) -> dict[str, Any]:
     """Return touches compared with a calibration.
 
     ``seen`` (N, 2): camera points of the touches. ``offsets`` (N, 3): touched minus mapped, metres;
     ``held_out`` (N, 3): touched minus predicted by the other touches; NaN or None: not known.
-    ``worst``: index of the worst touch. ``left_out``: indices of the touches that do not count.
+    ``worst``: index of the worst touch. ``excluded``: indices of the touches that do not count.
 
     The result has the entries of :func:`touch_points`, each point also with ``at``, ``residual``,
     ``left_out``, ``held_out`` (or None) and ``covariance`` (2 x 2, of the mapped point; None if no
@@ -86,7 +88,7 @@ def compare_touches(
     errors = None if calibration.touch_sigma is None else calibration.covariance_at(seen)
     for index, point in enumerate(preview["points"]):
         held_out_offset = None if held_out is None else (to_plane @ held_out[index]).tolist()
-        is_excluded = index in left_out
+        is_excluded = index in excluded
         point["at"] = (to_plane @ (touches[index].robot - centre)).tolist()
         point["residual"] = (to_plane @ offsets[index]).tolist()
         point["left_out"] = is_excluded
@@ -102,7 +104,7 @@ def compare_touches(
         )
     origin = to_plane @ (calibration.origin - centre)
     positions = np.array([touch.robot for touch in touches]).reshape(-1, 3)
-    is_left_out = np.isin(np.arange(len(positions)), [*left_out])
+    is_left_out = np.isin(np.arange(len(positions)), [*excluded])
     view = _drawn_area(
         to_plane @ (np.concatenate([counted, positions[~is_left_out]]) - centre).T,
         np.column_stack([origin, to_plane @ (positions[is_left_out] - centre).T]),

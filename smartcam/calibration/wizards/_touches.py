@@ -115,21 +115,23 @@ class Touches:
         sigma = self.about["touch_sigma"]
         return None if sigma is None else 1e-3 * sigma
 
-    def check_count(self, more: int, most: int, noun: str) -> None:
+    def check_count(self, more: int, max_count: int, noun: str) -> None:
         """Raise SHAPE if ``more`` touches would be too many."""
         count = len(self.touches) + more
-        if count > most:
-            raise Code.SHAPE.error(f"{count} {noun}, expected {most} at most", most, count)
+        if count > max_count:
+            raise Code.SHAPE.error(
+                f"{count} {noun}, expected {max_count} at most", max_count, count
+            )
 
-    async def add_marks(self, rows: Sequence[Mapping[str, Any]], most: int, noun: str) -> None:
+    async def add_marks(self, rows: Sequence[Mapping[str, Any]], max_count: int, noun: str) -> None:
         """Ask which marks of a picture will be touched, then for their touches.
 
-        ``rows``: result of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.take_picture`.
+        ``rows``: result of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.take_marks`.
         ``most``: largest number of touches of a run; raises SHAPE for more. ``noun``: name of the
         points, for people.
         """
         marks = await ask_marks([Mark.of(row) for row in rows], self.camera_unit)
-        self.check_count(len(marks), most, noun)
+        self.check_count(len(marks), max_count, noun)
         self.marks = marks
         for number, mark in enumerate(marks, 1):
             title = f"Touch mark {number} of {len(marks)}"
@@ -172,7 +174,7 @@ class Touches:
             return Touch(mark_of(answer), (x, y, z), axis, label)
         unit = self.about.get("unit", "m")
         position_inputs = tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz")
-        text = f"{step.description} Then take its position from the robot, in its base."
+        text = f"{step.description} Then read the tip's position, in the robot's base."
         answer = await ask(replace(step, description=text, inputs=(*step.inputs, *position_inputs)))
         x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
         return Touch(mark_of(answer), (x, y, z), SIDES[self.side], label)

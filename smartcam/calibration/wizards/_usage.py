@@ -21,7 +21,7 @@ with smartcam.sync.connect(
     calibration=calibration,
 ) as camera:
     for part in camera.trigger().value:
-        print(part.feature_id, part.pose.position)  # of the robot, metres
+        print(part.feature_id, part.pose.position)  # in the robot's frame, metres
 """
 
 _TRANSFORM_TEMPLATE = """\

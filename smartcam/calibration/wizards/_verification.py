@@ -75,16 +75,16 @@ def drift_wizard(
     ``file``.
 
     Each finished check is a line of a file, whose first line names its format: so the file shows a
-    drift that is too slow for a single check. The calibration's own file is not changed. The file
-    takes as many checks as a journal takes entries.
+    drift that is too slow for a single check. The calibration's own file is not changed. The number
+    of checks in a file has the same limit as the number of entries in a journal.
 
     Args:
         localize: function that takes a picture and localizes marks in it.
         find: function that returns the file of a calibration by its name, or raises
             CalibrationError.
-        record_to: function that returns the file of its checks.
+        record_to: function that returns, by a calibration's name, the file of its checks.
         read_robot: function that reads the robot's pose; None: the pose is typed.
-        y_down: whether the camera's y axis points down, so that ``localize`` turns it up; None: not
+        y_down: whether the camera's own y axis points down; ``localize`` then reverses y; None: not
             known. A calibration with another direction of y is refused.
     """
 
@@ -92,7 +92,7 @@ def drift_wizard(
         name = str(parameters.get("name", "plane"))
         feature = str(parameters.get("feature") or "")
         camera = MarkCamera(localize=localize, feature=feature, y_down=y_down)
-        step = _about_step(name, typed=read_robot is None).with_defaults(parameters)
+        step = _about_step(name, pose_is_entered=read_robot is None).with_defaults(parameters)
         about = await ask(step, partial(_load_calibration, find, name, camera))
         return await _DriftCheck(about, read_robot, camera, name, record_to).run()
 
@@ -113,35 +113,39 @@ def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> in
     sigma = calibration.touch_sigma or 0.0
     freedom = None if calibration.sigma_given else calibration.freedom
     for count in range(1, MAX_TOUCHES + 1):
-        # variance of the mean of the touches minus their place by the calibration
+        # variance of the difference between the mean touched position and the calibrated one
         variance = own_variance + sigma**2 / count
-        shift = min(KNOCK_M**2 / max(variance, KNOCK_M**2 / _MAX_SHIFT), _MAX_SHIFT)
+        noncentrality = min(
+            KNOCK_M**2 / max(variance, KNOCK_M**2 / _MAX_NONCENTRALITY), _MAX_NONCENTRALITY
+        )
         if (
-            _detection_probability(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift)
+            _detection_probability(
+                STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, noncentrality
+            )
             >= NOTICED_SHARE
         ):
             return count
     return None
 
 
-_MAX_SHIFT = 1e4
+_MAX_NONCENTRALITY = 1e4
 """Ratio of a squared shift to its variance, above which a shift is always noticed."""
 
 
-def _detection_probability(level: float, freedom: int | None, shift: float) -> float:
+def _detection_probability(level: float, freedom: int | None, noncentrality: float) -> float:
     """Return the probability that a test notices a shift of three coordinates.
 
     ``level``: probability that the test reports a shift that does not exist. ``freedom``: degrees
-    of freedom of the noise; None: it is known. ``shift``: squared shift relative to its variance.
+    of freedom of the noise; None: it is known. ``noncentrality``: squared shift over its variance.
     """
     special = load("scipy.special")
     if freedom is None:
-        return 1.0 - float(special.chndtr(special.chdtri(3, level), 3, shift))
+        return 1.0 - float(special.chndtr(special.chdtri(3, level), 3, noncentrality))
     limit = special.fdtri(3, freedom, 1.0 - level)
-    return 1.0 - float(special.ncfdtr(3, freedom, shift, limit))
+    return 1.0 - float(special.ncfdtr(3, freedom, noncentrality, limit))
 
 
-def _about_step(name: str, *, typed: bool) -> Step:
+def _about_step(name: str, *, pose_is_entered: bool) -> Step:
     sigma = replace(
         SIGMA, label="How well a touch repeats, standard deviation; empty: as the calibration says"
     )
@@ -150,7 +154,7 @@ def _about_step(name: str, *, typed: bool) -> Step:
         title=f"Is {name} still true?",
         description="Touch a mark or several again, with the same tool held the same way. Offsets "
         "are compared with the noise of the new touches and of the calibration's.",
-        inputs=(UNIT, sigma) if typed else (sigma,),
+        inputs=(UNIT, sigma) if pose_is_entered else (sigma,),
     )
 
 
@@ -160,7 +164,7 @@ async def _load_calibration(
     """Read a calibration into the journal, so that a resumed check uses the same calibration."""
     file = find(name)
     calibration = PlaneCalibration.load(file)
-    camera.check_y_down(calibration.y_down, f"{name} was made")
+    camera.check_y_down(calibration.y_down, name)
     if calibration.touch_sigma is None and answers["touch_sigma"] is None:
         raise Code.WRONG_ANSWERS.error(
             f"{name} has no standard deviation of its touches: expected the touches' sigma",
@@ -214,7 +218,7 @@ class _DriftCheck(Touches):
 
     async def _take_checked_picture(self, answers: Answers) -> list[dict[str, Any]]:
         self._camera.check_y_down(self.calibration.y_down, f"{self.name} was made")
-        rows = await self._camera.take_picture(answers)
+        rows = await self._camera.take_marks(answers)
         wanted = self.calibration.camera_frame
         frames = {row["frame_id"] for row in rows} - {wanted}
         if wanted is not None and frames:

@@ -82,8 +82,8 @@ def suggest_view(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion
     return Suggestion(
         f"with the sheet {next_view.text}",
         next_view.outline,
-        f"the lens is sure to {next_view.rms_without:.2g} pixels over the image, with this view to "
-        f"{next_view.rms_with:.2g}",
+        f"the lens is known to within {next_view.rms_without:.2g} pixels over the image; with this "
+        f"view, to within {next_view.rms_with:.2g}",
     )
 
 
@@ -95,7 +95,7 @@ def _most_helpful_view(views: Sequence[TargetView]) -> NextView | None:
         lens = calibrate_intrinsics(views)
     except CalibrationError:
         return None
-    # the parts are assumed to be as far away as the target
+    # the workpieces that will be seen are assumed to be as far away as the target
     distance = float(np.median(np.linalg.norm(lens.target_points, axis=1)))
     suggested = suggest_views(
         lens, distance=distance, roll=ROLLS_RADIANS[len(views) % len(ROLLS_RADIANS)]

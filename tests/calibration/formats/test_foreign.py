@@ -321,7 +321,7 @@ def test_size_that_is_given_has_to_be_the_files(tmp_path: Path) -> None:
             "<!DOCTYPE a [<!ENTITY b 'c'>]><opencv_storage/>",
             "file: expected XML without a document type",
         ),
-        ("<opencv_storage>" + 30 * "<a>", "16 in each other"),
+        ("<opencv_storage>" + 30 * "<a>", "nested 16 deep at most"),
         ("<opencv_storage>", "expected XML (no element found"),
     ],
 )

@@ -25,7 +25,7 @@ from smartcam.calibration.formats import (
     TRAJECTORIES,
     TRANSFORMS,
     HandEyeSample,
-    compose,
+    compose_plane_frame,
     plane_frame,
     read_matrix,
     read_samples,
@@ -441,7 +441,7 @@ def test_trajectory_goes_by_its_header(tmp_path: Path, head: str, time: str) -> 
 )
 def test_trajectory_with_an_incomplete_header_is_refused(tmp_path: Path, head: str) -> None:
     (tmp_path / "t.csv").write_text(f"{head}\n10.25,1,2,3,0,0,0.6,0.8\n")
-    with refused("MALFORMED", "header: expected #t [s],x [m]", "the unit of time among them"):
+    with refused("MALFORMED", "header: expected #t [s],x [m]", "with the unit of time in brackets"):
         read_trajectory(tmp_path / "t.csv", "asl")
 
 
@@ -501,7 +501,7 @@ def test_plane_frame_of_a_map_that_has_none_is_refused(model: PlaneModel) -> Non
 @pytest.mark.parametrize("form", WRITTEN)
 def test_plane_in_every_format_has_its_scale_in_a_comment(tmp_path: Path, form: str) -> None:
     calibration = table(scale=0.00025)
-    text = compose(form, calibration)
+    text = compose_plane_frame(form, calibration)
     found = read(tmp_path, form, text, target="base", source="plane")
     assert close(found, plane_frame(calibration).transform, 4e-15)
     said = re.search(r"# multiply coordinates of plane by (\S+) to have metres", text)
@@ -513,12 +513,12 @@ def test_plane_in_every_format_has_its_scale_in_a_comment(tmp_path: Path, form: 
 def test_plane_whose_frame_would_end_the_comment_is_refused() -> None:
     calibration = dataclasses.replace(table(), camera_frame="cam\nx: 5")
     with refused("BAD_NAME", "expected a frame's name"):
-        compose("ros_industrial", calibration)
+        compose_plane_frame("ros_industrial", calibration)
 
 
 def wrong_suffix(form: str) -> str:
     with pytest.raises(ValueError, match=r"got \.doc") as caught:
-        compose(form, table(), suffix=".doc")
+        compose_plane_frame(form, table(), suffix=".doc")
     return str(caught.value)
 
 

@@ -71,7 +71,7 @@ def test_transform_of_a_reflection_says_what_it_is() -> None:
 @pytest.mark.parametrize(
     ("robot", "text"),
     [
-        ([matrix(one) for one in ROBOT], 'it is Transform("base", "flange", M[:3, :3], M[:3, 3])'),
+        ([matrix(one) for one in ROBOT], 'write Transform("base", "flange", M[:3, :3], M[:3, 3])'),
         ([None] * 6, "got None"),
         (None, "pose of the robot: expected a list"),
         (np.array([matrix(one) for one in ROBOT]), "pose of the robot: expected a list"),
@@ -89,7 +89,7 @@ def test_hand_eye_of_no_robot_poses_is_refused(robot: Any, text: str) -> None:
 @pytest.mark.parametrize(
     ("seen", "code", "text"),
     [
-        ([matrix(one) for one in SEEN], "SHAPE", 'it is Transform("camera", "target", '),
+        ([matrix(one) for one in SEEN], "SHAPE", 'write Transform("camera", "target", '),
         ([None] * 6, "SHAPE", "got None"),
         (None, "SHAPE", "pose of the target: expected a list"),
         (views(), "SHAPE", "got TargetView"),

@@ -108,7 +108,7 @@ async def test_lens_that_is_not_known_says_which_view_helps_most(tmp_path: Path)
         view = await say(session)
     assert SUGGESTIONS[3] not in view["description"]
     assert ": with the sheet " in view["description"]
-    assert view["notes"][1].startswith("the lens is sure to ")
+    assert view["notes"][1].startswith("the lens is known to within ")
     assert "orange: the next one" in view["preview"]["svg"]
 
 

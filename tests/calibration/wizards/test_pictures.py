@@ -67,7 +67,7 @@ def test_picture_with_too_many_pixels_is_refused(monkeypatch: pytest.MonkeyPatch
 
 async def test_folder_gives_the_picture_that_comes_not_the_one_before(tmp_path: Path) -> None:
     (tmp_path / "old.png").write_bytes(encoded(255 - GREY))
-    folder = PictureFolder(tmp_path, deadline=10.0)
+    folder = PictureFolder(tmp_path, timeout=10.0)
     image = await taken(folder, (tmp_path / "new.PNG", encoded()), (tmp_path / "note.txt", b"x"))
     assert np.array_equal(image, GREY)
 
@@ -83,7 +83,7 @@ class Growing(PictureFolder):
 
     def __init__(self, path: Path, data: bytes) -> None:
         self.parts: list[bytes] = []
-        super().__init__(path, deadline=10.0)
+        super().__init__(path, timeout=10.0)
         self.parts = [data[start : start + 20] for start in range(0, len(data), 20)]
 
     def _scan_folder(self) -> dict[str, tuple[int, int]]:
@@ -106,23 +106,25 @@ async def test_folder_waits_for_a_file_that_grows(
 async def test_folder_without_a_new_picture_is_an_error_in_time(tmp_path: Path) -> None:
     (tmp_path / "old.png").write_bytes(encoded())
     wanted = "expected a file that ends in one of .bmp, .jpeg"
-    with refused("NO_PICTURE", f"within 0.3 s (there before: 1); {wanted}"):
-        await PictureFolder(tmp_path, deadline=0.3).take()
+    with refused("NO_PICTURE", f"within 0.3 s (pictures from before: 1); {wanted}"):
+        await PictureFolder(tmp_path, timeout=0.3).take()
 
 
 async def test_folder_with_other_new_files_names_them(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_bytes(b"here before")
-    folder = PictureFolder(tmp_path, deadline=0.5)
+    folder = PictureFolder(tmp_path, timeout=0.5)
     waiting = asyncio.create_task(folder.take())
     await asyncio.sleep(0.1)
     for name in ("a.raw", "b.raw", "c.raw", "d.raw"):
         (tmp_path / name).write_bytes(b"no picture")
-    with refused("NO_PICTURE", "(came, but no picture: a.raw, b.raw, c.raw and 1 more); expected"):
+    with refused(
+        "NO_PICTURE", "(new files that are not pictures: a.raw, b.raw, c.raw and 1 more); expected"
+    ):
         await waiting
 
 
 def test_folder_describes_the_awaited_file(tmp_path: Path) -> None:
-    told = PictureFolder(tmp_path, deadline=5.0).awaited
+    told = PictureFolder(tmp_path, timeout=5.0).awaited
     assert (
         f"the first file written to {tmp_path} from now on counts, if its name ends in .bmp" in told
     )

@@ -298,7 +298,7 @@ async def test_wizard_resumed_with_another_y_down_takes_no_picture(tmp_path: Pat
     session = begin(tmp_path, bench, y_down=False, journal=journal)
     view = await session.submit(session.token)
     assert view["errors"] == {
-        "base": "the picture before was taken with y_down=True, now it is False, and everything "
+        "base": "the previous picture has y_down=True, now it is False, and everything "
         "would be mirrored; expected y_down=True"
     }
     assert bench.pictures == 1

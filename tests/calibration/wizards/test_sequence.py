@@ -65,7 +65,7 @@ async def test_submit_of_wrong_answers_keeps_the_step_and_names_each() -> None:
     assert view["errors"] == {
         "name": "'A B': expected small letters",
         "unit": "'inch': expected one of mm, m",
-        "base": "'z' is not asked for, but name, unit, fixed",
+        "base": "'z': no such input; this step asks for name, unit, fixed",
     }
     assert (view["step"], view["token"]) == ("name", token)
     view = await session.submit(token, {"name": "a"})

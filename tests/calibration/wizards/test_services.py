@@ -149,10 +149,10 @@ async def test_start_fresh_or_after_the_end_begins_anew_and_keeps_the_journal(
     await say(service.session)
     third = service.start("table", fresh=True)
     assert [one["step"] for one in (first, second, third)] == ["about"] * 3
-    assert len({one["flow"] for one in (first, second, third)}) == 3
+    assert len({one["run_id"] for one in (first, second, third)}) == 3
     journals = [f"folder/table.journal{number}" for number in ("", ".1", ".2")]
     assert tree(tmp_path) == ["folder", *journals]
-    assert second["flow"] in (tmp_path / "folder/table.journal.1").read_text()
+    assert second["run_id"] in (tmp_path / "folder/table.journal.1").read_text()
     service.close()
 
 

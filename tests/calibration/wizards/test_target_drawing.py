@@ -276,7 +276,7 @@ def test_compared_marks_left_out_points_and_does_not_count_them(off: float, show
     assert found.outliers == (2,)
     done = touches(GRID, touched)
     preview = compare_touches(
-        found, done, GRID, found.residuals, found.leave_one_out, worst=found.worst, left_out=(2,)
+        found, done, GRID, found.residuals, found.leave_one_out, worst=found.worst, excluded=(2,)
     )
     (one,) = (point for point in preview["points"] if point["left_out"])
     assert (one["label"], one["held_out"], one["covariance"]) == ("3", None, None)

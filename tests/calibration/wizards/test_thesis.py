@@ -295,7 +295,7 @@ async def test_zero_is_no_answer_if_it_is_out_of_range(tmp_path: Path) -> None:
     assert answer["default_needed_values"] == [0.0, 0.0]
     assert "0 stands for no answer" in answer["description_text"]
     await client.accept(answer)
-    sequence = client.calibration._sequence
+    sequence = client.calibration._running
     assert sequence is not None
     assert sequence.session is not None
     assert sequence.session.samples[0]["answers"]["touch_sigma"] is None

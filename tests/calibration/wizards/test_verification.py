@@ -180,7 +180,7 @@ async def test_check_with_another_y_down_than_the_calibration_keeps_the_step(
     session = begin(tmp_path, Bench(), y_down=False)
     view = await session.submit(session.token)
     assert (view["step"], view["errors"]) == ("about", {
-        "base": "table was made with y_down=True, now it is False, and everything would be "
+        "base": "table has y_down=True, now it is False, and everything would be "
         "mirrored; expected y_down=True"
     })  # fmt: skip
     session.close()
@@ -194,7 +194,7 @@ async def test_check_resumed_with_another_y_down_takes_no_picture(tmp_path: Path
     session.close()
     session = begin(tmp_path, bench, journal=journal, y_down=True)
     view = await session.submit(session.token)
-    assert view["errors"]["base"].startswith("table was made with y_down=False, now it is True")
+    assert view["errors"]["base"].startswith("table has y_down=False, now it is True")
     assert bench.pictures == 0
     session.close()
 
