@@ -184,10 +184,10 @@ async def _run(
     web: PageOptions,
 ) -> None:
     """Run the wizard on its page or in the terminal until it ends."""
-    from smartcam.calibration._inside import WIZARD
+    from smartcam.calibration._inside import VERIFICATION_WIZARD
 
     options = sources.options
-    wizard_name = WIZARD if check is not None else wizard or "plane"
+    wizard_name = VERIFICATION_WIZARD if check is not None else wizard or "plane"
     parameters: dict[str, Any] = {} if feature is None else {"feature": feature}
     if sources.target is not None and wizard_name in {"sheet", "hand-eye"}:
         parameters["target"] = sources.target_data

@@ -200,16 +200,16 @@ async def _find_views_in_files(
 def _iter_files(pictures: Sequence[str]) -> Iterator[Path]:
     """Yield the named files, and the pictures in named folders in natural order."""
     from smartcam._natural import natural
-    from smartcam.calibration._inside import SUFFIXES
+    from smartcam.calibration._inside import PICTURE_SUFFIXES
 
     for path in map(Path, pictures):
         if not path.is_dir():
             yield path
             continue
-        inside = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+        inside = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
         if not inside:
             raise ConfigurationError(
-                f"{path}: expected pictures ({', '.join(sorted(SUFFIXES))}), found none"
+                f"{path}: expected pictures ({', '.join(sorted(PICTURE_SUFFIXES))}), found none"
             )
         yield from sorted(inside, key=lambda file: natural(file.name))
 

@@ -23,13 +23,17 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
     from smartcam.calibration._units import METRES_PER_UNIT, LengthUnit
     from smartcam.calibration._verdict import doubt_text
-    from smartcam.calibration.formats._cameras import MAX_FILE_BYTES, CameraInfo, parse_camera_info
+    from smartcam.calibration.formats._cameras import (
+        MAX_CAMERA_FILE_BYTES,
+        CameraInfo,
+        parse_camera_info,
+    )
     from smartcam.calibration.formats._lenses import StoredLenses, read_lenses
     from smartcam.calibration.formats._robots import ROBOTS
     from smartcam.calibration.wizards._listing import list_calibrations
     from smartcam.calibration.wizards._pictures import (
         MAX_PICTURE_BYTES,
-        SUFFIXES,
+        PICTURE_SUFFIXES,
         PictureFolder,
         decode_picture,
     )
@@ -42,17 +46,17 @@ if TYPE_CHECKING:
         StepRequest,
         ThesisCalibration,
     )
-    from smartcam.calibration.wizards._verification import WIZARD
+    from smartcam.calibration.wizards._verification import VERIFICATION_WIZARD
     from smartcam.calibration.wizards._view_suggestions import STANDARD_VIEWS, suggest_view
 
 __all__ = [
-    "MAX_FILE_BYTES",
+    "MAX_CAMERA_FILE_BYTES",
     "MAX_PICTURE_BYTES",
     "METRES_PER_UNIT",
+    "PICTURE_SUFFIXES",
     "ROBOTS",
     "STANDARD_VIEWS",
-    "SUFFIXES",
-    "WIZARD",
+    "VERIFICATION_WIZARD",
     "AnyCalibration",
     "CalibrationCamera",
     "CalibrationStart",
@@ -101,14 +105,14 @@ if not TYPE_CHECKING:
             "_targets": "Target",
             "_units": "LengthUnit METRES_PER_UNIT",
             "_verdict": "doubt_text",
-            "formats._cameras": "CameraInfo MAX_FILE_BYTES parse_camera_info",
+            "formats._cameras": "CameraInfo MAX_CAMERA_FILE_BYTES parse_camera_info",
             "formats._lenses": "StoredLenses read_lenses",
             "wizards._listing": "list_calibrations",
-            "wizards._pictures": "PictureFolder MAX_PICTURE_BYTES SUFFIXES decode_picture",
+            "wizards._pictures": "PictureFolder MAX_PICTURE_BYTES PICTURE_SUFFIXES decode_picture",
             "wizards._steps": "Input",
             "wizards._thesis": "CalibrationCamera CalibrationsByCamera CalibrationStart "
             "PixelPoseRequest StepRequest ThesisCalibration",
-            "wizards._verification": "WIZARD",
+            "wizards._verification": "VERIFICATION_WIZARD",
             "wizards._view_suggestions": "STANDARD_VIEWS suggest_view",
         },
     )

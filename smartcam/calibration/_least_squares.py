@@ -35,11 +35,11 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e12
 is long enough to gain anything."""
 
 RANK_TOLERANCE = 1e-14
-"""In a matrix with a unit diagonal, singular values below this part of the largest are rounding
+"""In a matrix with a unit diagonal, singular values below this fraction of the largest are rounding
 errors."""
 
 COVARIANCE_RANK_TOLERANCE = 1e-12
-"""In a covariance with a unit diagonal, eigenvalues below this part of the largest are rounding
+"""In a covariance with a unit diagonal, eigenvalues below this fraction of the largest are rounding
 errors."""
 
 MAX_UNKNOWNS_BY_SVD = 60

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 MAX_MOVE_SPREAD: Final = 0.2
 """Offsets of left-out points are one common shift, which is reported, if none differs from their
-mean by more than this part of the mean. Without this remark, calibrations were called good although
-the sheet was pushed by 3 to 50 mm before the last two to four of nine touches, or by 20 mm before
-the last three of fourteen views."""
+mean by more than this fraction of the mean. Without this remark, calibrations were called good
+although the sheet was pushed by 3 to 50 mm before the last two to four of nine touches, or by 20 mm
+before the last three of fourteen views."""
 
 
 class Noise(NamedTuple):

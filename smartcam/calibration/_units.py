@@ -23,7 +23,7 @@ LengthUnit: TypeAlias = Literal["m", "cm", "mm", "inch"]
 METRES_PER_UNIT: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 """Metres per unit."""
 
-MAX_UNASKED_M: Final = 20.0
+MAX_PLAUSIBLE_M: Final = 20.0
 """Largest distance, metres, from one frame to another or from a sensor to a point, for which the
 unit need not be confirmed: a robot's cell is smaller than 20 m, and millimetres that are taken for
 metres exceed it from 20 mm on."""
@@ -54,11 +54,11 @@ def no_unit_error(label: str) -> CalibrationError:
 
 def check_length(metres: float, label: str) -> None:
     """Raise UNIT_UNKNOWN for a length, metres, that does not occur in a robot's cell."""
-    if metres > MAX_UNASKED_M:
+    if metres > MAX_PLAUSIBLE_M:
         raise Code.UNIT_UNKNOWN.error(
-            f"{label}: expected at most {MAX_UNASKED_M:g} m, got {metres:g} m; is it in "
+            f"{label}: expected at most {MAX_PLAUSIBLE_M:g} m, got {metres:g} m; is it in "
             'millimetres? Give unit="mm" then, or unit="m" if it is not',
-            MAX_UNASKED_M,
+            MAX_PLAUSIBLE_M,
             metres,
         )
 

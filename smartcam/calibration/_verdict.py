@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MAX_ERROR_SHARE: Final = 0.01
-"""Largest allowed error, as a part of the field, if the user gives none."""
+"""Largest allowed error, as a fraction of the field, if the user gives none."""
 
 _ERROR_95_PER_RMS: Final = 2.0
 """Twice an RMS error includes 95 of 100 errors or more, in one direction as well as in three."""

@@ -23,7 +23,7 @@ IDS = storage.Form(
 )
 
 MAX_ROUNDING_RATIO: Final = 1e-9
-"""Rounding may change elements of a covariance by this part of the covariance."""
+"""Rounding may change elements of a covariance by this fraction of the covariance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from smartcam._argument_checks import check_arguments
 from smartcam._arguments import check_path
 from smartcam._extras import load
-from smartcam.calibration._inside import MAX_FILE_BYTES, parse_camera_info, rectify
+from smartcam.calibration._inside import MAX_CAMERA_FILE_BYTES, parse_camera_info, rectify
 from smartcam.calibration.formats import CameraChain
 from smartcam.exceptions import CalibrationError, ConfigurationError, FrameFormatError
 from smartcam.geometry import CameraModel, Transform
@@ -93,10 +93,11 @@ def _rotation(matrix: NDArray[np.float64], path: str | os.PathLike[str]) -> NDAr
 
 def _read_text(path: str | os.PathLike[str]) -> str:
     with Path(path).open("rb") as file:
-        content = file.read(MAX_FILE_BYTES + 1)
-    if len(content) > MAX_FILE_BYTES:
+        content = file.read(MAX_CAMERA_FILE_BYTES + 1)
+    if len(content) > MAX_CAMERA_FILE_BYTES:
         raise CalibrationError(
-            f"{path}: expected a camera_info of {MAX_FILE_BYTES} bytes at most", code=Code.MALFORMED
+            f"{path}: expected a camera_info of {MAX_CAMERA_FILE_BYTES} bytes at most",
+            code=Code.MALFORMED,
         )
     try:
         return content.decode()

@@ -29,19 +29,19 @@ MIN_SPECK_PIXELS, MAX_SPECK_PIXELS = 3, 24
 """Least and largest area of a speck, a spot of a few pixels; smaller ones are noise."""
 
 MAX_PART_OF_IMAGE = 1 / 16
-"""A spot covers at most this part of the image's area: a grid has nine dots or more."""
+"""A spot covers at most this fraction of the image's area: a grid has nine dots or more."""
 
 MIN_ELLIPSE_SHARE = 0.85
-"""A spot fills at least this part of the ellipse with its second moments: rectangles fill 0.955,
-triangles 0.83."""
+"""A spot fills at least this fraction of the ellipse with its second moments: rectangles fill
+0.955, triangles 0.83."""
 
 MAX_ASPECT_RATIO = 6.0
 """A spot is at most this many times as long as wide, like a circle at a tilt of 80 degrees."""
 
 
 MIN_RECTANGLE_SHARE = 0.2
-"""A spot fills at least this part of the upright rectangle around it. A slanted ellipse six times
-as long as wide fills 0.22 of its rectangle if MIN_ELLIPSE_SHARE of the ellipse is filled."""
+"""A spot fills at least this fraction of the upright rectangle around it. A slanted ellipse six
+times as long as wide fills 0.22 of its rectangle if MIN_ELLIPSE_SHARE of the ellipse is filled."""
 
 
 class Spots(NamedTuple):

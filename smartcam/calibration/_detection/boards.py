@@ -18,7 +18,7 @@ from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.dots import GridMap
 from smartcam.calibration._detection.grid_growing import grow_grids
-from smartcam.calibration._detection.image import reduce_levels
+from smartcam.calibration._detection.image import shrink_image
 from smartcam.calibration._detection.saddles import find_saddles
 from smartcam.calibration._homography import local_steps
 
@@ -40,18 +40,19 @@ NEIGHBOURS = 8
 saddles may lie between them."""
 
 FITTED_SHARE = 0.45
-"""Edges at a corner are fitted along this part of a square's side, so that the fit does not reach
-the edges at the next corner."""
+"""Edges at a corner are fitted along this fraction of a square's side, so that the fit does not
+reach the edges at the next corner."""
 
 MIN_FITTED_SHARE = 0.6
-"""A candidate is a board if at least this part of its corners is found by fits, and if the colours
-of the squares there alternate as on a board."""
+"""A candidate is a board if at least this fraction of its corners is found by fits, and if the
+colours of the squares there alternate as on a board."""
 
 MIN_FILLED_SHARE = 0.5
-"""An outermost row or column is left out if less than this part of its corners is found."""
+"""An outermost row or column is left out if less than this fraction of its corners is found."""
 
 MAX_OFFSET_STEPS = 0.25
-"""A fitted corner may differ from its predicted place by this part of the step between corners."""
+"""A fitted corner may differ from its predicted place by this fraction of the step between
+corners."""
 
 MIN_SQUARE_PIXELS = 9.0
 """A corner is fitted only if a square next to the corner has a larger area than this in the image,
@@ -70,8 +71,8 @@ SQUARE_SAMPLES = np.array(
         for x, y in itertools.product((0.2, 0.35), repeat=2)
     ]
 )
-"""(16, 2), places in the four squares around a corner, as parts of the steps to the next corners:
-eight places in two opposite squares, then eight in the two other squares."""
+"""(16, 2), places in the four squares around a corner, as fractions of the steps to the next
+corners: eight places in two opposite squares, then eight in the two other squares."""
 
 MAX_SAME_BOARD_OFF_PX = 3.0
 """Boards found in two reductions of an image are the same board if the median distance between
@@ -155,7 +156,7 @@ def find_boards(image: GreyImage, wanted_count: int, *, max_count: int) -> Itera
     """
     min_factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
     for factor in dict.fromkeys((2 * min_factor, min_factor, (min_factor + 1) // 2)):
-        saddles = find_saddles(reduce_levels(image.uint8_levels, factor))
+        saddles = find_saddles(shrink_image(image.uint8_levels, factor))
         largest: Lattice = {}
         grid_search = grow_grids(
             saddles.points,

@@ -14,8 +14,8 @@ from smartcam.calibration._detection.grid_growing import area_test, grow_grids
 from smartcam.calibration._detection.image import (
     USUAL_SIDE_PX,
     GreyImage,
-    reduce_levels,
     resize_image,
+    shrink_image,
 )
 from smartcam.calibration._detection.markers import (
     Markers,
@@ -54,10 +54,10 @@ be read even in an image enlarged twice. Markers with larger modules would have 
 quadrangles of that size are no markers."""
 
 MAX_SQUARES_OFF = 0.3
-"""A corner may differ from the nearest markers' prediction by this part of a square's side."""
+"""A corner may differ from the nearest markers' prediction by this fraction of a square's side."""
 
 FITTED_SHARE = 0.45
-"""The edges at a corner are fitted along this part of a square's side."""
+"""The edges at a corner are fitted along this fraction of a square's side."""
 
 
 def charuco_board(target: Charuco, *, legacy_pattern: bool | None = None) -> Any:
@@ -187,7 +187,7 @@ def _search_sizes(image: GreyImage, target: Charuco) -> _Sighting:
     best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0, 0, 0, (), 0.0)
     factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
     if factor > 1:
-        best = _search_image(reduce_levels(image.uint8_levels, factor), 1 / factor, target, best)
+        best = _search_image(shrink_image(image.uint8_levels, factor), 1 / factor, target, best)
         if _has_all_corners(best, target, image):
             return best
     best = _search_image(image.uint8_levels, 1.0, target, best)

@@ -52,8 +52,8 @@ MAX_STRAY_PX = 0.5
 times the median distance."""
 
 AVERAGED_DOT_RATIO = 0.8
-"""Only this part of the diameter of the dot outside of a corner is averaged, which leaves out the
-dot's rim."""
+"""Only this fraction of the diameter of the dot outside of a corner is averaged, which leaves out
+the dot's rim."""
 
 DOT_RING_SIDES = 0.3
 """Distance from the centre of the dot at the origin to the paper around it, in sides of a

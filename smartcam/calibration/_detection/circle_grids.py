@@ -19,8 +19,8 @@ from smartcam.calibration._detection.grid_growing import area_test, grow_grids
 from smartcam.calibration._detection.image import (
     USUAL_SIDE_PX,
     GreyImage,
-    reduce_levels,
     resize_image,
+    shrink_image,
 )
 from smartcam.calibration._detection.ordering import (
     choose_marked,
@@ -52,9 +52,9 @@ SMALL_SIDE_PX = 800
 """A grid is searched first in an image whose longest side has at most this many pixels."""
 
 MIN_DOT_SHARE = 0.4
-"""The image is searched at twice its size only if at least this part of the target's dots is found
-in rows and columns among the specks. (Doubling the size separates dots that touch each other at the
-given size.)"""
+"""The image is searched at twice its size only if at least this fraction of the target's dots is
+found in rows and columns among the specks. (Doubling the size separates dots that touch each other
+at the given size.)"""
 
 NEIGHBOURS = 8
 """In a grid whose dots have only a few pixels, the next dots are searched among this many
@@ -68,7 +68,7 @@ MIN_DOTS_REPORTED = 9
 """An error mentions dots in rows and columns if at least this many were found."""
 
 MAX_OFFSET_RATIO = 0.15
-"""A dot may be this far from the place that the other dots predict, as a part of the distance
+"""A dot may be this far from the place that the other dots predict, as a fraction of the distance
 between dots."""
 
 RING_DIRECTIONS = np.column_stack(
@@ -134,7 +134,7 @@ def _search_image(
     )
     max_spots = EXTRA_SPOTS + 2 * len(target.points)
     if factor > 1:
-        reduced = reduce_levels(image, factor)
+        reduced = shrink_image(image, factor)
         for is_negative in (False, True):
             yield (
                 is_negative,

@@ -37,8 +37,8 @@ MAX_REACH_PX = 13
 time."""
 
 MAX_RESIDUAL_RATIO = 0.35
-"""Largest RMS of a good fit's residuals, as a part of the gain; without an edge the RMS is as large
-as the gain."""
+"""Largest RMS of a good fit's residuals, as a fraction of the gain; without an edge the RMS is as
+large as the gain."""
 
 MIN_SINE = 0.17
 """The two edges of a corner must cross at an angle whose sine is larger than this: 10 degrees."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._detection.image import GreyImage, reduce_levels
+from smartcam.calibration._detection.image import GreyImage, shrink_image
 from smartcam.calibration._detection.levenberg import (
     GAIN,
     covariances,
@@ -39,8 +39,8 @@ MAX_REACH_PX = 20
 image."""
 
 MAX_RESIDUAL_RATIO = 0.5
-"""Largest RMS of a good fit's residuals, as a part of the gain; without a dot the RMS is as large
-as the gain."""
+"""Largest RMS of a good fit's residuals, as a fraction of the gain; without a dot the RMS is as
+large as the gain."""
 
 UNREFINED_SIGMA_PX = 0.5
 """Standard deviation, pixels, that is assumed for a dot that could not be refined: it is usual for
@@ -159,7 +159,7 @@ def _refine_smaller(
     image: GreyImage, points: Array, radii: Array, reaches: Array, factor: int
 ) -> Dots:
     """Fit the dots in an image whose pixels are means of ``factor`` by ``factor`` pixels."""
-    levels = reduce_levels(image.levels, factor)
+    levels = shrink_image(image.levels, factor)
     smaller = GreyImage(levels, np.rint(levels).astype(np.uint8))
     dots = refine_dots(smaller, (points + 0.5) / factor - 0.5, radii / factor, reaches / factor)
     return Dots(

@@ -29,23 +29,23 @@ NEIGHBOURS = 12
 others that may be printed between them."""
 
 MAX_OPPOSITE_DIFFERENCE = 0.2
-"""The steps to two opposite dots differ by less than this part of the shorter step."""
+"""The steps to two opposite dots differ by less than this fraction of the shorter step."""
 
 MIN_SINE = 0.5
 """The steps to a grid's next column and next row must enclose an angle whose sine is larger than
 this: 30 degrees. The two shortest steps of a lattice enclose 60 degrees or more."""
 
 MAX_STEP_OFFSET, MAX_FIRST_STEP_OFFSET = 0.3, 0.2
-"""A dot is the grid's next dot if its distance from the end of the step is less than this part of
-the step. The second value is for the steps from the grid's first dot, near which steps change
+"""A dot is the grid's next dot if its distance from the end of the step is less than this fraction
+of the step. The second value is for the steps from the grid's first dot, near which steps change
 less."""
 
 MAX_AREA_RATIO = 1.8
 """A dot has at most this many times the area of its neighbour."""
 
 MAX_MEDIAN_OFFSET = 0.08
-"""The median distance of a flat grid's dots from their predicted places is less than this part of a
-step: a lens distorts a grid of fewer than 20 dots by less than that."""
+"""The median distance of a flat grid's dots from their predicted places is less than this fraction
+of a step: a lens distorts a grid of fewer than 20 dots by less than that."""
 
 MAX_SEEDS_RANKED = 128
 """A second pair of opposite neighbours is searched only at this many dots: the dots whose first
@@ -239,7 +239,7 @@ class _GridGrower:
     ) -> list[list[list[int]]]:
         """Return, for each dot and each of its four sides, the dots that may come next.
 
-        ``limit``: largest distance of such a dot from the end of the step, as a part of the step.
+        ``limit``: largest distance of such a dot from the end of the step, as a share of the step.
         """
         dots = np.array([dot for _, dot, _, _ in front])
         size_references = np.array([size_references for _, _, _, size_references in front])

@@ -97,7 +97,7 @@ def resize_image(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
     return resized
 
 
-def reduce_levels(levels: NDArray[Level], factor: int) -> NDArray[Level]:
+def shrink_image(levels: NDArray[Level], factor: int) -> NDArray[Level]:
     """Return grey levels (H, W) whose pixels are means of ``factor`` by ``factor`` given pixels.
 
     A place ``p`` in the result is ``(p + 0.5) * factor - 0.5`` in the given image.

@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
-from smartcam.calibration._detection.image import USUAL_SIDE_PX, reduce_levels, resize_image
+from smartcam.calibration._detection.image import USUAL_SIDE_PX, resize_image, shrink_image
 from smartcam.calibration._detection.markers import (
     MIN_AGREEING_MARKERS,
     Markers,
@@ -60,7 +60,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
         ):
             break
         scaled_image = (
-            reduce_levels(image.uint8_levels, factor)
+            shrink_image(image.uint8_levels, factor)
             if scale < 1
             else resize_image(image.uint8_levels, scale)
         )

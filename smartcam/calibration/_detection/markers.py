@@ -29,11 +29,11 @@ MAX_NEIGHBOUR_PITCHES = 2.9
 is the distance between two neighbouring markers."""
 
 MAX_VECTOR_DIFFERENCE = 0.15
-"""The vector between two markers may differ from the board's by this part of its length. A number
-that is wrong by one moves a marker by a third of the longest such vector or more."""
+"""The vector between two markers may differ from the board's by this fraction of its length. A
+number that is wrong by one moves a marker by a third of the longest such vector or more."""
 
 MAX_JACOBIAN_DIFFERENCE = 0.5
-"""The turns and scales of two neighbouring markers may differ by this part."""
+"""The turns and scales of two neighbouring markers may differ by this fraction."""
 
 MAX_PITCHES_OFF = 0.35
 """A marker without neighbours may lie this many pitches from its predicted place."""

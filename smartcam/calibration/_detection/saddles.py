@@ -37,7 +37,7 @@ MIN_SWING = 1.0
 """Along the circle, the grey levels of a corner swing by at least this many."""
 
 MAX_ASYMMETRY = 0.35
-"""The squared difference between a circle's halves is at most this part of the squared swing of
+"""The squared difference between a circle's halves is at most this fraction of the squared swing of
 their mean."""
 
 MAX_SADDLES_KEPT = 600

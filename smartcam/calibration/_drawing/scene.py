@@ -29,11 +29,11 @@ AZIMUTH, ELEVATION = math.radians(-38.0), math.radians(24.0)
 """Direction of the viewer: angle about the vertical, and angle above the ground."""
 
 FRUSTUM_RATIO: Final = 0.16
-"""Length of a camera's frustum, as a part of the scene's extent; with many cameras it is
+"""Length of a camera's frustum, as a fraction of the scene's extent; with many cameras it is
 shorter."""
 
 AXIS_RATIO: Final = 0.12
-"""Length of the axes of a frame, as a part of the scene's extent."""
+"""Length of the axes of a frame, as a fraction of the scene's extent."""
 
 LETTER_PX: Final = (7.5, 15.0)
 """Approximate width and height of a letter, pixels."""

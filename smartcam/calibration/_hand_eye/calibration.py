@@ -111,7 +111,7 @@ ROUNDING_ERROR_M = 1e-7
 """No pose is bad with an error below this length, metres, which may be a rounding error."""
 
 MAX_BAD_POSE_SHARE = 1 / 3
-"""At most this part of the poses may be left out."""
+"""At most this fraction of the poses may be left out."""
 
 MIN_GOOD_POSES = 5
 """At least this many poses must remain after those that were paired with a wrong view are left

@@ -49,14 +49,14 @@ def is_in_hand(setup: object, label: str) -> bool:
 
 
 MIN_GAIN = 1e-11
-"""A final fit ends when a step gains less than this part of the cost."""
+"""A final fit ends when a step gains less than this fraction of the cost."""
 
 ROUGH_GAIN = 1e-7
-"""A fit that is only compared with others ends when a step gains less than this part of the cost:
-it is then a hundredth of a standard deviation from the minimum."""
+"""A fit that is only compared with others ends when a step gains less than this fraction of the
+cost: it is then a hundredth of a standard deviation from the minimum."""
 
 FIRST_DAMPING = 1e-6
-"""Damping of the first step, as a part of the diagonal: closed forms are so near to the minimum
+"""Damping of the first step, as a fraction of the diagonal: closed forms are so near to the minimum
 that hardly any damping is needed."""
 
 MIN_UNEXPLAINED_BEND_SHARE = 1e-3

@@ -68,7 +68,8 @@ SURE_GAIN = 2.0
 robots whose only error is noise reach 1.9 by chance."""
 
 MAX_SIZE_ERROR_RATIO = 0.05
-"""Largest error of a target's stated size, as a part of it, from which the fit still converges."""
+"""Largest error of a target's stated size, as a fraction of it, from which the fit still
+converges."""
 
 ROBOT, REPROJECTION = "robot", "reprojection"
 

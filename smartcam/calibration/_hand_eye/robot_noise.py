@@ -53,7 +53,7 @@ MAX_ITERATIONS = 4
 """Limit of the alternations between adjusting and estimating the noise; two are usually enough."""
 
 CONVERGED_RATIO = 0.02
-"""The alternation ends when the estimates change by less than this part."""
+"""The alternation ends when the estimates change by less than this fraction."""
 
 
 def adjust_with_noise(robot: RobotPoses, observations: Observations, start: Solution) -> Solution:

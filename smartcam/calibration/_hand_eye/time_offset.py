@@ -40,7 +40,7 @@ MIN_VIEWS_FOR_OFFSET = 10
 """An offset needs at least this many views, since each view says little about it."""
 
 MAX_SIGMA_SHARE = 0.25
-"""An offset is returned only if its sigma is at most this part of the largest offset."""
+"""An offset is returned only if its sigma is at most this fraction of the largest offset."""
 
 
 class TimeOffset(NamedTuple):

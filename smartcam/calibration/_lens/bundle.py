@@ -38,17 +38,17 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_COST_GAIN_RATIO: Final = 1e-7
-"""A fit ends when a step lowers the weighted squares by less than this part: with 1000 coordinates
-the fit is then a hundredth of a standard deviation from the minimum."""
+"""A fit ends when a step lowers the weighted squares by less than this fraction: with 1000
+coordinates the fit is then a hundredth of a standard deviation from the minimum."""
 
 LOOSE_SIGMA_RATIO: Final = 0.01
-"""Assumed standard deviation of a sheet's points, as a part of the distance between neighbouring
-points. With six recorded views, a value of 0.1 gives 1.7 times the held-out error of an exact
-sheet, a value of 0.01 gives 1.1 times; with many views both give the same (measured)."""
+"""Assumed standard deviation of a sheet's points, as a fraction of the distance between
+neighbouring points. With six recorded views, a value of 0.1 gives 1.7 times the held-out error of
+an exact sheet, a value of 0.01 gives 1.1 times; with many views both give the same (measured)."""
 
 TIGHT_SIGMA_RATIO: Final = 1e-4
 """Assumed standard deviation of the common place, direction and size of a sheet's points, which no
-view shows, as a part of the distance between neighbouring points."""
+view shows, as a fraction of the distance between neighbouring points."""
 
 WEIGHT_POWER: Final = 1 / 3
 """Power of a view's weight in the covariance of a lens. With a power of 1/2, lenses from the two
@@ -57,7 +57,7 @@ halves of recorded sets differ by 1.2 times as much as expected; with a power of
 
 MIN_REFIT_GAIN_RATIO: Final = 1e-5
 """A fit without one of the poses ends when a step lowers the weighted squares by less than this
-part."""
+fraction."""
 
 MAX_FEW_POSES: Final = 5
 """With at most this many poses, leaving one out changes the fit too much for a single step, so the

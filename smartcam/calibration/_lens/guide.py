@@ -54,7 +54,8 @@ SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "
 camera's x and y."""
 
 MARGIN_RATIO: Final = 0.02
-"""Margin that stays free between the target and each side of the image, as a part of that side."""
+"""Margin that stays free between the target and each side of the image, as a fraction of that
+side."""
 
 MAX_STEPS: Final = 12
 """A target is moved to its place in at most this many steps; five are usually enough."""

@@ -56,21 +56,21 @@ MIN_TILT_RADIANS: Final = math.radians(5.0)
 not determine the focal length."""
 
 MIN_MOTION_SHARE: Final = 0.02
-"""Two views count as the same if no point moves between them by this part of the image's longer
+"""Two views count as the same if no point moves between them by this fraction of the image's longer
 side."""
 
 MAX_FOCAL_SIGMA_RATIO: Final = 0.1
-"""The focal length is not determined if its standard deviation is more than this part of it."""
+"""The focal length is not determined if its standard deviation is more than this fraction of it."""
 
 BAD_VIEW_RATIO: Final = 3.0
 """A view is bad if its weighted RMS is more than this many times the median of the other views:
 good views reach 1.6 (measured)."""
 
 MAX_BAD_VIEW_SHARE: Final = 1 / 3
-"""At most this part of the views may be left out."""
+"""At most this fraction of the views may be left out."""
 
 MIN_REACHED_SHARE: Final = 0.9
-"""If the lens' model is valid in less than this part of the image, a warning says so: models of
+"""If the lens' model is valid in less than this fraction of the image, a warning says so: models of
 wide lenses may not be valid in the corners."""
 
 POOR_FIT_RMS_PX: Final = 1.0
@@ -81,8 +81,8 @@ MAX_ITERATIONS: Final = 10
 turned, take four."""
 
 MAX_RENUMBERED_RMS_SHARE: Final = 0.7
-"""Views are renumbered only if that reduces the RMS of the residuals to less than this part: for a
-sheet that bends by 0.6 mm to one side the ratio is 0.4 or less (simulated)."""
+"""Views are renumbered only if that reduces the RMS of the residuals to less than this fraction:
+for a sheet that bends by 0.6 mm to one side the ratio is 0.4 or less (simulated)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -36,10 +36,11 @@ MIN_POINTS: Final = 4
 """The pose of a plane needs at least this many of its points."""
 
 MIN_SPREAD_RATIO: Final = 1e-3
-"""Points are on a line if their spread across it is less than this part of the spread along it."""
+"""Points are on a line if their spread across it is less than this fraction of the spread along
+it."""
 
 MAX_OUTSIDE_RATIO: Final = 0.1
-"""A point may lie outside of the image by this part of the image's sides."""
+"""A point may lie outside of the image by this fraction of the image's sides."""
 
 MIN_HANDEDNESS: Final = 0.5
 """The handedness of a view, from -1 to 1, is near -1 in a correct view and must be below minus this
@@ -47,7 +48,8 @@ value. If it is above this value, the view shows the sheet in a mirror. Views of
 fisheyes have -0.8."""
 
 MAX_RAY_SHIFT_RATIO: Final = 1e-9
-"""Rays are shifted by at most this part of the focal length, to avoid rounding errors in OpenCV."""
+"""Rays are shifted by at most this fraction of the focal length, to avoid rounding errors in
+OpenCV."""
 
 MAX_AMBIGUOUS_RATIO: Final = 4.0
 """Both poses of a view are refined if the squared residuals of one are at most this many times

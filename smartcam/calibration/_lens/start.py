@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array, DistortionModel
 
 FOCAL_LENGTHS: Final = (None, 1.0, 0.4, 2.0, 0.65, 4.0)
-"""Focal lengths from which OpenCV starts, as parts of the image's longer side. None: from OpenCV's
-closed form. The others belong to fields of view of 53, 103, 28, 75 and 14 degrees."""
+"""Focal lengths from which OpenCV starts, as fractions of the image's longer side. None: from
+OpenCV's closed form. The others belong to fields of view of 53, 103, 28, 75 and 14 degrees."""
 
 MAX_VIEWS_OF_OPENCV: Final = 20
 """OpenCV gets at most this many views; then the fit is adjusted to all views."""

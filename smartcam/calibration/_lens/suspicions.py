@@ -46,7 +46,7 @@ of a pair. In 200 recorded views, whose noise is not quite normal, the farthest 
 9.6 deviations and 0.8 pixels, or by 5.9 deviations and 1.8 pixels (measured)."""
 
 MAX_STRAY_SHARE: Final = 0.2
-"""At most this part of a view's points are strays: with more, the view is bad as a whole."""
+"""At most this fraction of a view's points are strays: with more, the view is bad as a whole."""
 
 MIN_POINTS_KEPT: Final = 8
 """Strays are left out only while at least this many points are kept: among fewer, it is not clear
@@ -63,13 +63,13 @@ MAX_RMS_PX: Final = 10.0
 the lens causes a smaller RMS."""
 
 MAX_RMS_SHARE: Final = 0.015
-"""MAX_RMS_PX is raised to this part of the longer side of the image if that is larger."""
+"""MAX_RMS_PX is raised to this fraction of the longer side of the image if that is larger."""
 
 MAX_RMS_SIGMAS: Final = 20.0
 """MAX_RMS_PX is raised to this many standard deviations of the points if that is larger."""
 
 DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
-"""A principal point is doubted if it is farther from the centre than this part of the image's
+"""A principal point is doubted if it is farther from the centre than this fraction of the image's
 sides: it may belong to an image of another size."""
 
 DOUBTED_CENTRE_SIGMAS: Final = 5.0

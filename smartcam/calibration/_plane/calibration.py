@@ -573,7 +573,7 @@ def fit_plane(
             off.
         robot_frame: name of the frame that poses will be given in.
         camera_frame: name of the frame that localizations must come in; None for any.
-        y_down: whether the camera's y axis points down and was turned up before the points came;
+        y_down: whether the camera's own y axis points down; the points have the opposite y;
             None: not known. The value is stored, and compared when the calibration is used; nothing
             is turned here.
         allowed_error: error that 95 of 100 points may have at most, metres; None: a hundredth of

@@ -135,7 +135,7 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     """Return the text of a remark if the scale is not the nominal one, else None.
 
     Scales are in metres per unit of the camera; ``uncertainty`` is the standard deviation of
-    ``measured``, as a part of it. Raises SCALE_MISMATCH if the scale is off by more than a tenth,
+    ``measured``, as a share of it. Raises SCALE_MISMATCH if the scale is off by more than a tenth,
     or at all if it must be ``exact``.
     """
     deviation = measured / nominal - 1.0

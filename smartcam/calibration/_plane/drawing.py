@@ -28,7 +28,7 @@ LEGEND_HEIGHT_PX: Final = 130.0
 """Height of the legend below the field, pixels."""
 
 MARGIN_RATIO: Final = 0.15
-"""Free margin around the points, as a part of their extent."""
+"""Free margin around the points, as a fraction of their extent."""
 
 HEAT_COLUMNS: Final = 30
 """Number of columns of the heat map; it has at most twice as many rows, to keep cells square."""
@@ -40,7 +40,7 @@ ELLIPSE_POINTS: Final = 24
 """An ellipse is drawn with this many points."""
 
 MIN_ENLARGED_RATIO: Final = 1e-9
-"""Errors below this part of the field's width are not enlarged."""
+"""Errors below this fraction of the field's width are not enlarged."""
 
 LOW_ERROR_COLOUR, HIGH_ERROR_COLOUR = (240, 247, 252), (246, 196, 140)
 """Colours of the smallest and the largest predicted error."""
@@ -101,7 +101,7 @@ def draw(
     shown.
 
     ``parts`` are localizations in the camera's frame, drawn in green. ``title`` is a line on top.
-    The SVG document has a fixed size and loads no other file; lines end with a line feed.
+    The SVG document has a fixed width and loads no other file; its text has line feeds.
     """
     elements = list(parts)
     is_used = calibration.weights > 0.0

@@ -26,7 +26,7 @@ simulation of nine touches in the middle third of a field: wrong choices cost 1 
 this level and 4 % at 0.01; both levels find a tilt of one degree."""
 
 ROUNDING_RATIO = 1e-9
-"""Residuals below this part of the points' extent are rounding errors, not noise."""
+"""Residuals below this fraction of the points' extent are rounding errors, not noise."""
 
 
 def sum_of_squares(residuals: Array, weights: Array) -> float:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 STEP_SHARE: Final = 1e-4
-"""Length of the steps of numerical derivatives, as a part of the touched field."""
+"""Length of the steps of numerical derivatives, as a fraction of the touched field."""
 
 
 def robot_sigmas(

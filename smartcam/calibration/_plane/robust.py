@@ -67,9 +67,9 @@ SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone leads to leaving out a point, or to a homography."""
 
 LEFT_OUT_COST_RATIO = 0.5
-"""Cost of a left-out point, as a part of the threshold, for comparing similarity and homography. A
-homography that only goes through one more wrong point is not chosen: with 1 instead of this value
-it was chosen in 7 of 400 cases with two wrong points of six (measured)."""
+"""Cost of a left-out point, as a fraction of the threshold, for comparing similarity and
+homography. A homography that only goes through one more wrong point is not chosen: with 1 instead
+of this value it was chosen in 7 of 400 cases with two wrong points of six (measured)."""
 
 SEED = 7
 """Subsets are drawn by random numbers from this seed, so that results repeat."""
@@ -78,11 +78,11 @@ MEDIAN_SQUARE = 2.366
 """Median of the squared length of a residual in three dimensions with a variance of 1."""
 
 MIN_TRIANGLE_RATIO = 0.02
-"""The smallest triangle of a subset must be larger than this part of its largest one: otherwise its
-map is useless."""
+"""The smallest triangle of a subset must be larger than this fraction of its largest one: otherwise
+its map is useless."""
 
 MIN_VARIANCE_RATIO = 1e-8
-"""A point is not tested if less than this part of its residual's variance remains: the map then
+"""A point is not tested if less than this fraction of its residual's variance remains: the map then
 goes through the point."""
 
 

@@ -24,7 +24,7 @@ from smartcam.calibration._plane.diagnostics import (
 )
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
-from smartcam.calibration._plane.validation import check_field, check_lever, check_positive
+from smartcam.calibration._plane.validation import check_extent, check_lever, check_positive
 from smartcam.calibration._statistics import Noise
 from smartcam.geometry._inside import Code, Remark, as_points, frame_from_axes, rotate_ccw
 
@@ -119,7 +119,7 @@ def fit_touches(
         for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
     ]
     all_touches = np.concatenate(groups)
-    check_field(all_touches)
+    check_extent(all_touches)
     ray_index = np.repeat([0, 1, 2], [len(group) for group in groups])
     levers = [float(np.linalg.norm(group.mean(0) - groups[0].mean(0))) for group in groups[1:]]
     sheet = _fit_rays(all_touches, ray_index)

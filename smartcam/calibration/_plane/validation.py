@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam._arguments import as_plain_value, excerpt
 from smartcam.calibration._plane.fitting import Normalization, Pairs
-from smartcam.calibration._units import MAX_UNASKED_M
+from smartcam.calibration._units import MAX_PLAUSIBLE_M
 from smartcam.geometry._inside import Code, as_points
 
 if TYPE_CHECKING:
@@ -32,10 +32,11 @@ MAX_THICKNESS_RATIO = 0.2
 
 SAME_MARK_RATIO = 0.01
 """Camera points with the same touch are taken as one mark if they are closer together than this
-part of the extent of all points."""
+fraction of the extent of all points."""
 
 SAME_POINT_RATIO = 1e-9
-"""Points that are closer together than this part of the extent of all points count as the same."""
+"""Points that are closer together than this fraction of the extent of all points count as the
+same."""
 
 MIN_DIFFERENCE = 1e-100
 """Two coordinates that differ by less than this are the same; its square does not underflow."""
@@ -147,7 +148,7 @@ def check_samples(
             f"expected at least {min_count} points", min_count, len(camera)
         )
     if not allow_strays:
-        check_field(robot)
+        check_extent(robot)
     for points, label in ((camera, "camera points"), (robot, "robot points")):
         _check_distinct(points, label, min_count)
         _check_width(points, label)
@@ -163,13 +164,13 @@ def check_samples(
         check_lever(lever(robot), touch_sigma)
 
 
-def check_field(robot: Array) -> None:
+def check_extent(robot: Array) -> None:
     """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than a robot's cell allows."""
-    if (size := extent(robot)) > MAX_UNASKED_M:
+    if (size := extent(robot)) > MAX_PLAUSIBLE_M:
         raise Code.UNIT_UNKNOWN.error(
-            f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "
+            f"robot points: expected metres, and a field of {MAX_PLAUSIBLE_M:g} m at most, got one "
             f"of {size:.4g} m: are they millimetres? Multiply them by 0.001",
-            MAX_UNASKED_M,
+            MAX_PLAUSIBLE_M,
             size,
         )
 

@@ -23,7 +23,7 @@ POINTS_PER_MM: Final = 72 / 25.4
 
 ARC_CONTROL_RATIO: Final = 4 / 3 * (math.sqrt(2) - 1)
 """Distance between an end of a quarter circle and the next control point of its Bezier curve, as a
-part of the radius; the curve is off by at most 0.03 % of the radius."""
+fraction of the radius; the curve is off by at most 0.03 % of the radius."""
 
 
 @dataclass(frozen=True, slots=True)

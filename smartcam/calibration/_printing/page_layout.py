@@ -29,7 +29,7 @@ MAX_MOVE_MM: Final = 5.0
 """Free space moves a target by at most this far from the border, mm; the rays get the rest."""
 
 MARGIN_RATIO: Final = 0.2
-"""Width of the white margin around a target, as a part of a square's side or of the distance
+"""Width of the white margin around a target, as a fraction of a square's side or of the distance
 between dots."""
 MIN_MARGIN_MM, MAX_MARGIN_MM = 2.0, 6.0
 """Bounds of the width of the white margin around a target, mm."""
@@ -39,8 +39,8 @@ RAY_WIDTH: Final = 0.4
 RAY_HEAD_MM: Final = (4.0, 1.5)
 """Length of a ray's head and half its width, mm."""
 NOTCH_RATIO: Final = 0.65
-"""Depth of the notch in the back of a ray's head, as a part of its length: a solid head would be
-taken for a dot."""
+"""Depth of the notch in the back of a ray's head, as a fraction of its length: a solid head would
+be taken for a dot."""
 LETTER_MM: Final = 4.0
 """Height of the rays' letters, mm."""
 
@@ -59,7 +59,7 @@ TEXT_LEFT_MM: Final = RAY_HEAD_MM[1] + LETTER_MM + 2
 MIN_LETTERS_PER_LINE: Final = 20
 """A line has room for at least this many letters, even on a small page."""
 LETTER_WIDTH_RATIO: Final = 0.6
-"""Assumed width of a letter, as a part of its height: more than the average of Helvetica or
+"""Assumed width of a letter, as a fraction of its height: more than the average of Helvetica or
 Arial."""
 
 AREA_REACH_SQUARES: Final = AREA_DISTANCE_SQUARES + AREA_DIAMETER_SQUARES / 2

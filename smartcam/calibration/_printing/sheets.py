@@ -78,10 +78,10 @@ MAX_PAGE_MM: Final = 3000.0
 """Longest side of a page, mm."""
 
 MAX_SCALE_CHANGE: Final = 0.05
-"""Largest deviation of a printer's scale, as a part of it."""
+"""Largest deviation of a printer's scale, as a fraction of it."""
 
 MAX_SCALE_DIFFERENCE: Final = 0.005
-"""Largest difference between the scales along x and y, as a part of them: about the error of
+"""Largest difference between the scales along x and y, as a fraction of them: about the error of
 reading a ruler twice."""
 
 LENGTH_DIGITS: Final = 9

@@ -171,7 +171,7 @@ class SheetCalibration(storage.SavedCalibration):
 
     @cached_property
     def chain(self) -> Chain:
-        """The calibration as a chain of solvers, for localizations with y turned up."""
+        """The calibration as a chain of solvers, for localizations with y up (-v)."""
         chain = Chain(
             [self.sheet],
             frame=self.robot_frame,
@@ -235,7 +235,7 @@ class SheetCalibration(storage.SavedCalibration):
         """Return localizations with their poses in the robot's space.
 
         Args:
-            localizations: localizations of the camera, one or many: pixels, with y turned up.
+            localizations: localizations of the camera, one or many: pixels, with y up (-v).
             tool_flip: as in :meth:`PlaneCalibration.to_robot`.
 
         If a pose has a ``sigma``, and the touches' sigma is known, its robot pose has a ``sigma``

@@ -44,7 +44,7 @@ MAX_STEPS = 20
 """The fit of the homography takes at most this many steps; it usually takes 2 or 3."""
 
 MAX_FINAL_STEP_SIGMAS = 1e-6
-"""The fit ends when a step changes each element of the homography by less than this part of its
+"""The fit ends when a step changes each element of the homography by less than this fraction of its
 standard deviation (the others being fixed); the next step would be a million times smaller."""
 
 DIRECTION_STEP_PX = 0.5
@@ -54,7 +54,7 @@ DIRECTION_STEP_PX = 0.5
 class SheetPlane:
     """A solver from a camera's pixels to a sheet's metres.
 
-    Poses must be those of localizations with the y axis turned up: x is u, y is -v, and angles
+    Poses must be those of localizations with the y axis up: x is u, y is -v, and angles
     count counter-clockwise. The results are in the target's frame, on its plane.
 
     Args:

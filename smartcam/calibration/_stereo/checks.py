@@ -45,7 +45,7 @@ MAX_RMS_PX: Final = 5.0
 """Residual RMS, pixels, above which the views of pairs do not belong together."""
 
 MAX_RMS_SHARE: Final = 0.005
-"""MAX_RMS_PX is raised to this part of the longer side of the image if that is larger."""
+"""MAX_RMS_PX is raised to this fraction of the longer side of the image if that is larger."""
 
 EXCHANGED_RESIDUAL_RATIO: Final = 1.05
 """Lenses were given in the wrong order if exchanging them makes the residuals this many times
@@ -53,7 +53,8 @@ smaller. Two lenses of one model in the wrong order make them 1.7 times larger o
 recorded pairs)."""
 
 MIN_SWAPPED_SHARE: Final = 0.75
-"""Lenses are swapped only if at least this part of the pairs fits better with them exchanged."""
+"""Lenses are swapped only if at least this fraction of the pairs fits better with them
+exchanged."""
 
 MIN_APART_CHI2: Final = 30.0
 """The cameras stand apart if the square of their distance, in standard deviations, is more than

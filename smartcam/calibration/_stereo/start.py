@@ -38,8 +38,8 @@ MIN_MISMATCH_RATIO: Final = 10.0
 and above MIN_MISMATCH_SHARE as well."""
 
 MIN_MISMATCH_SHARE: Final = 0.01
-"""The views of a pair do not belong together only if its points are off by more than this part of
-the image's longer side: neither noise nor a lens that is not yet adjusted causes that."""
+"""The views of a pair do not belong together only if its points are off by more than this fraction
+of the image's longer side: neither noise nor a lens that is not yet adjusted causes that."""
 
 
 class Lenses(NamedTuple):

@@ -19,7 +19,7 @@ MAX_STEPS = 10
 usually enough."""
 
 MAX_FINAL_STEP_RATIO = 1e-9
-"""The iteration ends when a step moves a point by less than this part of its depth."""
+"""The iteration ends when a step moves a point by less than this fraction of its depth."""
 
 
 class CameraPair(NamedTuple):

@@ -23,8 +23,7 @@ import numpy as np
 from smartcam.calibration._files.store import replace_file
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration.formats import _foreign as foreign
-from smartcam.calibration.formats._file_format import MAX_FILE_BYTES as MAX_MRCAL_BYTES
-from smartcam.calibration.formats._file_format import Format, UnscaledValue
+from smartcam.calibration.formats._file_format import MAX_FILE_BYTES, Format, UnscaledValue
 from smartcam.calibration.formats._opencv import HEAD, load_storage, storage_matrix
 from smartcam.calibration.formats._plain import (
     Plain,
@@ -59,7 +58,7 @@ CameraForm: TypeAlias = Literal[
 ]
 """Names of the formats."""
 
-MAX_FILE_BYTES: Final = 1 << 20
+MAX_CAMERA_FILE_BYTES: Final = 1 << 20
 """Largest number of bytes of a file; a chain of eight cameras has four thousand."""
 
 _KALIBR: Final[dict[DistortionModel, str]] = {"plumb_bob": "radtan", "equidistant": "equidistant"}
@@ -156,7 +155,7 @@ def read_cameras(
     if form != "opencv":
         raise _unsupported_error(form, "one file", "extrinsics as well")
     with Path(extrinsics).open("rb") as stream:
-        extrinsics_text = stream.read(MAX_FILE_BYTES + 1).decode("utf-8", "replace")
+        extrinsics_text = stream.read(MAX_CAMERA_FILE_BYTES + 1).decode("utf-8", "replace")
     return file_format.read(path, size, extrinsics_text, unit=unit)
 
 
@@ -466,7 +465,7 @@ def _camera_format(
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
     return Format(
-        title=name, suffix=".yaml", parse=parse, compose=compose, max_bytes=MAX_FILE_BYTES
+        title=name, suffix=".yaml", parse=parse, compose=compose, max_bytes=MAX_CAMERA_FILE_BYTES
     )
 
 
@@ -503,7 +502,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
     "ros_ini": _foreign_format("ros_ini", foreign.parse_ros_ini),
     "euroc": _foreign_format("euroc", foreign.parse_euroc),
     "mrcal": dataclasses.replace(
-        _foreign_format("mrcal", foreign.parse_mrcal), max_bytes=MAX_MRCAL_BYTES
+        _foreign_format("mrcal", foreign.parse_mrcal), max_bytes=MAX_FILE_BYTES
     ),
     "colmap": _foreign_format("colmap", foreign.parse_colmap),
     "basalt": _foreign_format("basalt", foreign.parse_basalt),

@@ -75,7 +75,7 @@ CALCULATION_TIMEOUT = 120.0
 
 _MOVES: Mapping[str, str] = {
     "eye-in-hand": "Bring the camera to where it looks at the sheet",
-    "eye-to-hand": "Bring the sheet before the camera, and hold it",
+    "eye-to-hand": "Bring the sheet in front of the camera, and hold it",
 }
 
 TOUCHES = 3

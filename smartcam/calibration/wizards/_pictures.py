@@ -72,7 +72,7 @@ FOLDER_TIMEOUT: Final = 25.0
 LISTING_PERIOD: Final = 0.2
 """Seconds between two listings of a folder; a file whose length stays the same is complete."""
 
-SUFFIXES: Final = frozenset(
+PICTURE_SUFFIXES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}
 )
 """Suffixes of picture files, in lower case."""
@@ -138,7 +138,7 @@ class PictureFolder:
         """Text, for people, that describes the picture that :meth:`take` waits for."""
         return (
             f"the first file written to {self.path} from now on counts, if its name ends in "
-            f"{', '.join(sorted(SUFFIXES))}. The step waits {self.timeout:g} s for it"
+            f"{', '.join(sorted(PICTURE_SUFFIXES))}. The step waits {self.timeout:g} s for it"
         )
 
     async def take(self) -> NDArray[Any]:
@@ -173,15 +173,16 @@ class PictureFolder:
             raise Code.NO_PICTURE.error(
                 f"no picture came into {self.path} within {self.timeout:g} s"
                 f"{self._describe_other_files(before, other_names)}; expected a file that ends in "
-                f"one of {', '.join(sorted(SUFFIXES))}, written after the button was pressed",
-                sorted(SUFFIXES),
+                f"one of {', '.join(sorted(PICTURE_SUFFIXES))}, written after the button was "
+                "pressed",
+                sorted(PICTURE_SUFFIXES),
             ) from exc
 
     def _other_names(self) -> set[str]:
         """Return the names of the entries of the folder that are no pictures."""
         with contextlib.suppress(OSError):
             names = [path.name for path in itertools.islice(self.path.iterdir(), MAX_FILES)]
-            return {name for name in names if Path(name).suffix.lower() not in SUFFIXES}
+            return {name for name in names if Path(name).suffix.lower() not in PICTURE_SUFFIXES}
         return set()
 
     def _describe_other_files(
@@ -204,7 +205,7 @@ class PictureFolder:
                     raise Code.NO_PICTURE.error(
                         f"{self.path}: expected {MAX_FILES} files at most, got more", MAX_FILES
                     )
-                if file.suffix.lower() not in SUFFIXES:
+                if file.suffix.lower() not in PICTURE_SUFFIXES:
                     continue
                 try:
                     status = file.stat()

@@ -60,7 +60,7 @@ def plane_wizard(
         localize: function that takes a picture and localizes marks in it.
         save_to: function that returns the file for a name.
         read_robot: function that reads the robot's pose; None: the pose is typed.
-        y_down: whether the camera's y axis points down, so that ``localize`` turns it up; None: not
+        y_down: whether the camera's own y axis points down; ``localize`` then reverses y; None: not
             known. The value is stored with the calibration, and must be the same for all pictures.
         connect: arguments of :func:`smartcam.connect` for the camera, ``url`` included, for the
             lines that use the result; None: the camera cannot be asked.

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._touches import ReadRobot
     from smartcam.geometry._inside import Array
 
-WIZARD = "drift"
+VERIFICATION_WIZARD = "drift"
 """Name of the wizard."""
 
 CHECKS_FORMAT = "smartcam.checks/1"
@@ -70,7 +70,7 @@ def drift_wizard(
     and as defaults of the first step ``unit`` (mm, m) and ``touch_sigma`` (mm).
 
     Its result has the entries ``name``, ``stale``, ``touches``, ``offsets_mm`` (length of each
-    touch's offset), ``rms_mm``, ``expected_mm``, ``z``, ``chance``, ``needed`` (see
+    touch's offset), ``rms_mm``, ``expected_mm``, ``z``, ``chance`` (p-value), ``needed`` (see
     :func:`touches_needed`; at the best mark), ``needed_at`` (number of this mark's touch) and
     ``file``.
 
@@ -96,7 +96,7 @@ def drift_wizard(
         about = await ask(step, partial(_load_calibration, find, name, camera))
         return await _DriftCheck(about, read_robot, camera, name, record_to).run()
 
-    return Wizard(name=WIZARD, version=1, script=script, steps=5)
+    return Wizard(name=VERIFICATION_WIZARD, version=1, script=script, steps=5)
 
 
 def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> int | None:
@@ -217,7 +217,7 @@ class _DriftCheck(Touches):
         return np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
 
     async def _take_checked_picture(self, answers: Answers) -> list[dict[str, Any]]:
-        self._camera.check_y_down(self.calibration.y_down, f"{self.name} was made")
+        self._camera.check_y_down(self.calibration.y_down, self.name)
         rows = await self._camera.take_marks(answers)
         wanted = self.calibration.camera_frame
         frames = {row["frame_id"] for row in rows} - {wanted}

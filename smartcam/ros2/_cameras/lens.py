@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from smartcam.calibration._inside import MAX_FILE_BYTES, parse_camera_info
+from smartcam.calibration._inside import MAX_CAMERA_FILE_BYTES, parse_camera_info
 from smartcam.calibration.formats import write_camera_info
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
 from smartcam.ros2._cameras.image_messages import header_fields_at
@@ -145,10 +145,10 @@ class CameraLens:
 
 def _read_file(path: Path) -> CameraInfo:
     with path.open("rb") as file:
-        data = file.read(MAX_FILE_BYTES + 1)
-    if len(data) > MAX_FILE_BYTES:
+        data = file.read(MAX_CAMERA_FILE_BYTES + 1)
+    if len(data) > MAX_CAMERA_FILE_BYTES:
         raise ConfigurationError(
-            f"{path}: expected a camera_info of {MAX_FILE_BYTES} bytes at most"
+            f"{path}: expected a camera_info of {MAX_CAMERA_FILE_BYTES} bytes at most"
         )
     try:
         return parse_camera_info(data.decode())

@@ -201,7 +201,7 @@ async def test_a_calibration_that_is_left_alone_is_given_up_and_goes_on_later(
     await asyncio.sleep(0.15)
     assert (await client.step(1.0, 2.0))["error"]
     await asyncio.sleep(0.3)
-    with pytest.raises(CalibrationError, match=r"was left for 0\.2 s"):
+    with pytest.raises(CalibrationError, match=r"was abandoned after 0\.2 s"):
         await client.step()
     await client.calibration.start(FIXED)
     answer = await client.accept(await client.step(), "table")
