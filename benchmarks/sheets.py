@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from benchmarks.measure import Comparison, Goal, Series
-from smartcam.calibration._lens.bundle import Bundle, Observation, adjust
+from smartcam.calibration._lens.bundle import Bundle, IndexedView, adjust
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.projection import linearize
 from smartcam.calibration._lens.sheet_shape import moved_to_nominal
@@ -127,10 +127,10 @@ class Rig:
             points=points,
             has_free_points=True,
         )
-        observations = [Observation(0, number, view) for number, view in enumerate(views[0])]
+        indexed = [IndexedView(0, number, view) for number, view in enumerate(views[0])]
         by_lens = linearize(self.rays, self.left).by_lens
         lens = np.einsum(
-            "nij,jk,nik->n", by_lens, adjust(one, observations, 0.0).noise_covariance, by_lens
+            "nij,jk,nik->n", by_lens, adjust(one, indexed, 0.0).noise_covariance, by_lens
         )
         both = Bundle(
             (self.left, self.right),
@@ -140,8 +140,8 @@ class Rig:
             points=points,
             has_free_points=True,
         )
-        observations += [Observation(1, number, view) for number, view in enumerate(views[1])]
-        covariance = adjust(both, observations, 0.0).noise_covariance
+        indexed += [IndexedView(1, number, view) for number, view in enumerate(views[1])]
+        covariance = adjust(both, indexed, 0.0).noise_covariance
         by_unknown = self._derivatives(both, np.sqrt(np.diag(covariance)))
         space = np.einsum("nij,jk,nik->n", by_unknown, covariance, by_unknown)
         return math.sqrt(float(lens.mean())), 1e3 * math.sqrt(float(space.mean()))

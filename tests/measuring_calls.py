@@ -157,7 +157,7 @@ def measuring_calls() -> dict[str, Call]:
             calibration.chain_of,
             {"calibration": plane, "origin": (0.0, 0.0), "theta": 0.0},
         ),
-        "compare": (
+        "compare_lenses": (
             calibration.compare_lenses,
             {"a": lens, "b": lens.camera, "distance": 0.5, "shape": (5, 5)},
         ),
@@ -170,7 +170,7 @@ def measuring_calls() -> dict[str, Call]:
         "estimate_time_offset": (
             calibration.estimate_time_offset,
             {"history": calibration.PoseHistory(), "target_poses": targets}
-            | {"setup": "eye-in-hand", "most": 0.2},
+            | {"setup": "eye-in-hand", "max_offset": 0.2},
         ),
         "find_target": (
             calibration.find_target,
@@ -242,7 +242,7 @@ def measuring_calls() -> dict[str, Call]:
         "find_regions": (
             depth.find_regions,
             {"mask": mask, "area": (1, 1e9), "ratio": (1, 9.0), "fullness": 0.0}
-            | {"whole": False, "most": 1000},
+            | {"whole": False, "max_regions": 1000},
         ),
         "load_cloud": (depth.load_cloud, {"path": "nowhere.ply", "unit": None}),
         "pass_through": (
@@ -253,7 +253,7 @@ def measuring_calls() -> dict[str, Call]:
             depth.read_camera_infos,
             {"left": "nowhere.yaml", "right": "nowhere.yaml"},
         ),
-        "region_depth": (depth.region_depth, {"depth": flat, **area, "shared": 1.0}),
+        "region_depth": (depth.region_depth, {"depth": flat, **area, "correlated_pixels": 1.0}),
         "register": (
             depth.register,
             {"source": cloud, "target": cloud, "method": "icp", "voxel": None}

@@ -54,7 +54,7 @@ from smartcam.calibration._hand_eye.equations import (
 from smartcam.calibration._homography import apply_homography, element_derivatives, fit_homography
 from smartcam.calibration._lens.bundle import (
     Bundle,
-    Observation,
+    IndexedView,
     adjust_weighted,
     leave_out,
     lens_values,

@@ -66,10 +66,8 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
         )
         markers = _read_markers(scaled_image, target, scale)
         mask, second_board_here = compare_with_board(markers, board_corners)
-        read_count, second_board_count = (
-            max(read_count, len(mask)),
-            max(second_board_count, second_board_here),
-        )
+        read_count = max(read_count, len(mask))
+        second_board_count = max(second_board_count, second_board_here)
         if mask.sum() > len(best.ids):
             best = markers.subset(mask)
             stray_ids = tuple(sorted((markers.ids[~mask] + target.first_id).tolist()))

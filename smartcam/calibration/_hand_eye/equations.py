@@ -545,13 +545,9 @@ def derivatives_by_parameters(
     )
     corrections = solution.corrections if solution.corrections.size else no_corrections
     start = dataclasses.replace(solution, change=change, corrections=corrections)
-    matrix, fitted_count = (
-        _normal_equations(robot, scaled_observations, start).eliminate_poses()[0],
-        12 + observations.extra_count,
-    )
-    slopes: Array = -solve_scaled(
-        matrix[:fitted_count, :fitted_count], matrix[:fitted_count, fitted_count:]
-    )[:12]
+    matrix = _normal_equations(robot, scaled_observations, start).eliminate_poses()[0]
+    count = 12 + observations.extra_count
+    slopes: Array = -solve_scaled(matrix[:count, :count], matrix[:count, count:])[:12]
     return slopes
 
 

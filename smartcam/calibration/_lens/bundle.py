@@ -71,7 +71,7 @@ Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 """An array of indices."""
 
 
-class Observation(NamedTuple):
+class IndexedView(NamedTuple):
     """A view with its camera and pose; of each pose, a camera has one view at most."""
 
     camera_index: int
@@ -186,7 +186,7 @@ class AdjustedBundle:
     """The result of adjusting a bundle."""
 
     bundle: Bundle  # bundle with the least weighted squares
-    residuals: list[Array]  # residuals of each observation (N, 2), seen minus projected, pixels
+    residuals: list[Array]  # residuals of each view (N, 2), seen minus projected, pixels
     # sum of the weighted squares of all residuals; infinite if points lie behind a camera
     weighted_squares: float
     extra_variance: float  # variance that was added to that of each coordinate, pixels^2
@@ -222,7 +222,7 @@ class AdjustedBundle:
 
 
 def adjust_weighted(
-    bundle: Bundle, observations: Sequence[Observation], extra_variance: float = 0.0
+    bundle: Bundle, indexed: Sequence[IndexedView], extra_variance: float = 0.0
 ) -> AdjustedBundle:
     """Return the least-squares solution with weights that match its residuals.
 
@@ -232,21 +232,21 @@ def adjust_weighted(
     """
     # Weights need the variance, and the variance needs the residuals, so both are computed
     # alternately. The fit depends little on the weights, so the second round hardly changes it.
-    covariance = np.concatenate([observation.view.covariance for observation in observations])
+    covariance = np.concatenate([entry.view.covariance for entry in indexed])
     for _ in range(3):
-        adjusted = adjust(bundle, observations, extra_variance)
+        adjusted = adjust(bundle, indexed, extra_variance)
         covariance_excess = excess_variance(
             np.concatenate(adjusted.residuals), covariance, adjusted.freedom
         )
         if abs(covariance_excess - extra_variance) <= 0.01 * extra_variance:
             return adjusted
         bundle, extra_variance = adjusted.bundle, covariance_excess
-    return adjust(bundle, observations, extra_variance)
+    return adjust(bundle, indexed, extra_variance)
 
 
 def adjust(
     bundle: Bundle,
-    observations: Sequence[Observation],
+    indexed: Sequence[IndexedView],
     extra_variance: float,
     min_gain: float = MIN_COST_GAIN_RATIO,
 ) -> AdjustedBundle:
@@ -255,20 +255,20 @@ def adjust(
     Each point is weighted by its covariance plus ``extra_variance``, pixels^2. The fit ends when a
     step lowers the weighted squares by less than the part ``min_gain``.
     """
-    normal_at = BundleEquations(bundle, observations, extra_variance).normal
+    normal_at = BundleEquations(bundle, indexed, extra_variance).normal
     bundle, normal = minimize(bundle, normal_at, Bundle.with_steps, min_gain=min_gain)
-    coordinate_count = 2 * sum(len(observation.view.ids) for observation in observations)
-    pose_count = len({observation.pose_index for observation in observations})
+    coordinate_count = 2 * sum(len(entry.view.ids) for entry in indexed)
+    pose_count = len({entry.pose_index for entry in indexed})
     return AdjustedBundle(
         bundle=bundle,
-        residuals=residuals(bundle, observations),
+        residuals=residuals(bundle, indexed),
         weighted_squares=normal.cost,
         extra_variance=extra_variance,
         normal=normal,
         freedom=coordinate_count
         - bundle.camera_unknown_count
         - 6 * pose_count
-        - (_free_point_unknowns(observations) if bundle.has_free_points else 0),
+        - (_free_point_unknowns(indexed) if bundle.has_free_points else 0),
     )
 
 
@@ -284,7 +284,7 @@ class LeftOut(NamedTuple):
     noise_covariance: Array
 
 
-def leave_out(adjusted: AdjustedBundle, observations: Sequence[Observation]) -> list[LeftOut]:
+def leave_out(adjusted: AdjustedBundle, indexed: Sequence[IndexedView]) -> list[LeftOut]:
     """Return the fit without each observed pose, from a single step or, if needed, a new fit."""
     # At the solution, the normal equations without a pose are all equations minus those of the
     # pose, both with the poses eliminated. Their solution is the Gauss-Newton step from the fit to
@@ -292,24 +292,18 @@ def leave_out(adjusted: AdjustedBundle, observations: Sequence[Observation]) -> 
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
     matrix, right, _, _ = adjusted.normal.eliminate_poses()
     count, left_out = adjusted.bundle.camera_unknown_count, []
-    poses = sorted({observation.pose_index for observation in observations})
+    poses = sorted({entry.pose_index for entry in indexed})
     for pose in poses:
-        observations_of_pose = [
-            observation._replace(pose_index=0)
-            for observation in observations
-            if observation.pose_index == pose
+        indexed_of_pose = [
+            entry._replace(pose_index=0) for entry in indexed if entry.pose_index == pose
         ]
         bundle = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.subset([pose]))
-        equations = BundleEquations(
-            bundle, observations_of_pose, adjusted.extra_variance, prior=False
-        )
+        equations = BundleEquations(bundle, indexed_of_pose, adjusted.extra_variance, prior=False)
         pose_normal = equations.normal(bundle)
         pose_matrix, pose_right, pose_by_shared, pose_constant = pose_normal.eliminate_poses()
         right_sides = np.column_stack([right - pose_right, np.eye(len(right), count)])
-        step, noise_covariance = np.split(
-            solve_scaled(matrix - pose_matrix, right_sides), [1], axis=1
-        )
-        shared = step[:, 0]
+        solved = solve_scaled(matrix - pose_matrix, right_sides)
+        shared, noise_covariance = solved[:, 0], solved[:, 1:]
         refitted = bundle.with_steps(shared, pose_constant - pose_by_shared @ shared)
         squares = (
             pose_normal.cost
@@ -321,29 +315,27 @@ def leave_out(adjusted: AdjustedBundle, observations: Sequence[Observation]) -> 
             len(poses) <= MAX_FEW_POSES
             or not equations.normal(refitted).cost <= MAX_ONE_STEP_COST_RATIO * squares
         ):
-            refitted = _fit_without_pose(adjusted, observations, pose, observations_of_pose)
+            refitted = _fit_without_pose(adjusted, indexed, pose, indexed_of_pose)
         left_out.append(
-            LeftOut(
-                pose, refitted, residuals(refitted, observations_of_pose), noise_covariance[:count]
-            )
+            LeftOut(pose, refitted, residuals(refitted, indexed_of_pose), noise_covariance[:count])
         )
     return left_out
 
 
 def _fit_without_pose(
     adjusted: AdjustedBundle,
-    observations: Sequence[Observation],
+    indexed: Sequence[IndexedView],
     pose: int,
-    observations_of_pose: Sequence[Observation],
+    indexed_of_pose: Sequence[IndexedView],
 ) -> Bundle:
     """Fit the cameras to all views but those of one pose, then this pose to its views."""
-    others = [observation for observation in observations if observation.pose_index != pose]
+    others = [entry for entry in indexed if entry.pose_index != pose]
     others_fit = adjust(
         adjusted.bundle, others, adjusted.extra_variance, MIN_REFIT_GAIN_RATIO
     ).bundle
     refitted = dataclasses.replace(others_fit, poses=adjusted.bundle.poses.subset([pose]))
     poses = adjust(
-        refitted.with_known_cameras(), observations_of_pose, adjusted.extra_variance
+        refitted.with_known_cameras(), indexed_of_pose, adjusted.extra_variance
     ).bundle.poses
     return dataclasses.replace(refitted, poses=poses)
 
@@ -360,12 +352,9 @@ def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> 
     )
 
 
-def _free_point_unknowns(observations: Sequence[Observation]) -> int:
+def _free_point_unknowns(indexed: Sequence[IndexedView]) -> int:
     """Return the number of unknowns of the seen points, without the 7 of their pose and size."""
-    return (
-        3 * len(np.unique(np.concatenate([observation.view.ids for observation in observations])))
-        - 7
-    )
+    return 3 * len(np.unique(np.concatenate([entry.view.ids for entry in indexed]))) - 7
 
 
 class _CameraPoints(NamedTuple):
@@ -381,12 +370,9 @@ class _CameraPoints(NamedTuple):
 
 
 def _collect_points(
-    camera: int, observations: Sequence[Observation], extra_variance: float
+    camera: int, indexed: Sequence[IndexedView], extra_variance: float
 ) -> _CameraPoints:
-    views, poses = (
-        [observation.view for observation in observations],
-        [observation.pose_index for observation in observations],
-    )
+    views, poses = [entry.view for entry in indexed], [entry.pose_index for entry in indexed]
     ends = np.cumsum([0, *(len(view.ids) for view in views)])
     return _CameraPoints(
         camera,
@@ -409,24 +395,24 @@ class BundleEquations:
     def __init__(
         self,
         bundle: Bundle,
-        observations: Sequence[Observation],
+        indexed: Sequence[IndexedView],
         extra_variance: float,
         *,
         prior: bool = True,
     ) -> None:
-        observations_by_camera = (
-            [observation for observation in observations if observation.camera_index == k]
+        indexed_by_camera = (
+            [entry for entry in indexed if entry.camera_index == k]
             for k in range(len(bundle.cameras))
         )
         self._groups = [
-            _collect_points(k, observations_of_camera, extra_variance)
-            for k, observations_of_camera in enumerate(observations_by_camera)
-            if observations_of_camera
+            _collect_points(k, indexed_of_camera, extra_variance)
+            for k, indexed_of_camera in enumerate(indexed_by_camera)
+            if indexed_of_camera
         ]
         self._is_unseen_pose = ~np.isin(
-            np.arange(bundle.poses.size), [observation.pose_index for observation in observations]
+            np.arange(bundle.poses.size), [entry.pose_index for entry in indexed]
         )
-        self._nominal = observations[0].view.target.points
+        self._nominal = indexed[0].view.target.points
         self._prior = _prior_weights(self._nominal) if prior and bundle.has_free_points else None
 
     def normal(self, bundle: Bundle) -> NormalEquations:
@@ -434,7 +420,7 @@ class BundleEquations:
         normal, cost = NormalEquations.zeros(bundle.shared_count, bundle.poses.size, 6), 0.0
         normal.pose_blocks[self._is_unseen_pose] = np.eye(
             6
-        )  # poses without an observation stay as they are
+        )  # poses without a view stay as they are
         matrix, right = normal.shared, normal.shared_right_side
         for group in self._groups:
             columns, jacobian, by_points = self._derivatives(bundle, group)
@@ -504,10 +490,10 @@ class BundleEquations:
         return np.concatenate(columns), group.whitening @ np.concatenate(blocks, axis=2), by_point
 
 
-def residuals(bundle: Bundle, observations: Iterable[Observation]) -> list[Array]:
+def residuals(bundle: Bundle, indexed: Iterable[IndexedView]) -> list[Array]:
     """Return the residuals of each view (N, 2), seen minus projected, pixels."""
     per_view = []
-    for camera, pose, view in observations:
+    for camera, pose, view in indexed:
         points = view.object_points if bundle.points is None else bundle.points[view.ids]
         in_camera = (bundle.rig_motion(camera) @ bundle.poses.subset(pose)).apply(points)
         per_view.append(view.points - bundle.cameras[camera].project(in_camera))

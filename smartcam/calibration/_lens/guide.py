@@ -14,7 +14,7 @@ import numpy as np
 
 from smartcam._argument_checks import a_number, a_target, check_arguments, of_class, or_none
 from smartcam.calibration._least_squares import inverse_scaled
-from smartcam.calibration._lens.bundle import Bundle, BundleEquations, Observation
+from smartcam.calibration._lens.bundle import Bundle, BundleEquations, IndexedView
 from smartcam.calibration._lens.field import (
     check_distance,
     finite_points,
@@ -174,8 +174,8 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
         points = used[0].view.target.points + calibration.sheet
     poses = Rigid.stack(fit.transform.rigid for fit in used)
     bundle = Bundle.single(calibration.camera, poses, basis, points)
-    observations = [Observation(0, number, fit.view) for number, fit in enumerate(used)]
-    equations = BundleEquations(bundle, observations, calibration.sigma**2)
+    indexed = [IndexedView(0, number, fit.view) for number, fit in enumerate(used)]
+    equations = BundleEquations(bundle, indexed, calibration.sigma**2)
     information = equations.normal(bundle).eliminate_poses()[0]
     inverse = np.linalg.pinv(basis)
     scatter_covariance, count = inverse @ calibration.covariance @ inverse.T, len(information)

@@ -14,7 +14,7 @@ from pydantic import Field
 from smartcam._argument_checks import check_arguments, each, of_class
 from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
-from smartcam.calibration._lens.bundle import Bundle, Observation, adjust, camera_covariance
+from smartcam.calibration._lens.bundle import Bundle, IndexedView, adjust, camera_covariance
 from smartcam.calibration._lens.coverage import Coverage, coverage
 from smartcam.calibration._lens.field import DEFAULT_MAP_SHAPE, map_pixels, points_of_pixels
 from smartcam.calibration._lens.poses import (
@@ -229,7 +229,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
         pose = Rigid.stack([locate(view, self.camera).transform.rigid])
         points = None if self.sheet is None else target.points + self.sheet
         bundle = Bundle.single(self.camera, pose, points=points)
-        return adjust(bundle, [Observation(0, 0, view)], self.sigma**2).residuals[0]
+        return adjust(bundle, [IndexedView(0, 0, view)], self.sigma**2).residuals[0]
 
     def _check(self, fields: Mapping[str, Any], label: str) -> None:
         count = 4 + len(self.camera.distortion)
@@ -475,8 +475,8 @@ def _build_calibration(
     sheet: SheetOption,
 ) -> IntrinsicCalibration:
     used_views = [views[number] for number in used]
-    observations = [Observation(0, number, view) for number, view in enumerate(used_views)]
-    sheet_fit = choose_shape(adjusted, observations, sheet)
+    indexed = [IndexedView(0, number, view) for number, view in enumerate(used_views)]
+    sheet_fit = choose_shape(adjusted, indexed, sheet)
     errors = [
         view_rms(left_out_fit.residuals[0]) if len(used) > MIN_VIEWS else math.nan
         for left_out_fit in sheet_fit.left_out

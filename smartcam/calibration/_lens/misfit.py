@@ -172,10 +172,8 @@ class SharedEquations(NamedTuple):
 
     def misfits(self, change: Array) -> Array:
         """Return the weighted squares (V,) of the views after a change (L,) of the unknowns."""
-        misfits: Array = (
-            self.squares - 2.0 * self.right_sides @ change + self.matrix @ change @ change
-        )
-        return misfits
+        squares = self.squares - 2.0 * self.right_sides @ change + self.matrix @ change @ change
+        return np.asarray(squares, dtype=np.float64)
 
     def solve(self, free: Mask, per_view: Sequence[int] = ()) -> tuple[Array, float]:
         """Return the change (L,) of the free unknowns with the least squares, and those squares.

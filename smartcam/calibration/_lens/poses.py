@@ -11,7 +11,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._files import storage
-from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Observation, adjust
+from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, IndexedView, adjust
 from smartcam.calibration._lens.projection import excess_variance
 from smartcam.calibration._views import TargetView, check_type
 from smartcam.geometry import CameraModel, Transform
@@ -104,10 +104,9 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     """
     check_type(camera, CameraModel, "pose of the target: camera")
     check_view(view, camera.size)
-    observations = [Observation(0, 0, view)]
+    indexed = [IndexedView(0, 0, view)]
     fits = [
-        adjust(Bundle.single(camera, start), observations, 0.0)
-        for start in plane_poses(view, camera)
+        adjust(Bundle.single(camera, start), indexed, 0.0) for start in plane_poses(view, camera)
     ]
     fits = sorted(
         (fit for fit in fits if math.isfinite(fit.weighted_squares)),
@@ -121,7 +120,7 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
         )
     extra_variance = excess_variance(fits[0].residuals[0], view.covariance, fits[0].freedom)
     if extra_variance:
-        fits = [adjust(fit.bundle, observations, extra_variance) for fit in fits]
+        fits = [adjust(fit.bundle, indexed, extra_variance) for fit in fits]
     best, pose = fits[0], fits[0].bundle.poses
     other = next(
         (fit for fit in fits[1:] if pose.angle_to(fit.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),

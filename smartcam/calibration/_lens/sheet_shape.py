@@ -23,7 +23,7 @@ from smartcam.geometry._inside import Code, Remark, Rigid
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, LeftOut, Observation
+    from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, IndexedView, LeftOut
     from smartcam.geometry._inside import Array
 
 SheetOption: TypeAlias = Literal["auto", "exact", "free"]
@@ -48,7 +48,7 @@ class SheetFit(NamedTuple):
 
 
 def choose_shape(
-    adjusted: AdjustedBundle, observations: Sequence[Observation], sheet: SheetOption
+    adjusted: AdjustedBundle, indexed: Sequence[IndexedView], sheet: SheetOption
 ) -> SheetFit:
     """Return the fit with the target's points either nominal or adjusted.
 
@@ -57,20 +57,20 @@ def choose_shape(
 
     Raises ``SHAPE`` if there are more points than may be adjusted.
     """
-    count = len(observations[0].view.target.points)
+    count = len(indexed[0].view.target.points)
     if sheet == "free" and count > MAX_FREE_POINTS:
         raise Code.SHAPE.error_with_value(
             f"sheet: expected a target of {MAX_FREE_POINTS} points at most that are free",
             MAX_FREE_POINTS,
             count,
         )
-    exact = SheetFit(adjusted, leave_out(adjusted, observations), None, [])
+    exact = SheetFit(adjusted, leave_out(adjusted, indexed), None, [])
     if count > MAX_FREE_POINTS or (sheet != "free" and len(exact.left_out) < MIN_POSES):
         return exact
-    free_fit = adjust_shape(adjusted.bundle, observations, adjusted.extra_variance)
+    free_fit = adjust_shape(adjusted.bundle, indexed, adjusted.extra_variance)
     left_out, offsets = (
-        leave_out(free_fit, observations),
-        _offsets(free_fit.bundle, observations[0].view.target.points),
+        leave_out(free_fit, indexed),
+        _offsets(free_fit.bundle, indexed[0].view.target.points),
     )
     # nominal points, unless adjusted ones predict better by more than one standard error: Breiman,
     # Friedman, Olshen and Stone, Classification and Regression Trees (1984), section 3.4
@@ -107,7 +107,7 @@ def _remark(offsets: Array, text: str) -> Remark:
 
 
 def adjust_shape(
-    bundle: Bundle, observations: Sequence[Observation], extra_variance: float
+    bundle: Bundle, indexed: Sequence[IndexedView], extra_variance: float
 ) -> AdjustedBundle:
     """Return the least-squares solution in which the target's points are adjusted, too.
 
@@ -115,10 +115,10 @@ def adjust_shape(
     nominal places if that is None. ``extra_variance``, pixels^2, is a first guess of the variance
     in addition to the points' covariance, which is estimated anew.
     """
-    nominal = observations[0].view.target.points
+    nominal = indexed[0].view.target.points
     points = nominal if bundle.points is None else bundle.points
     free_bundle = dataclasses.replace(bundle, points=points, has_free_points=True)
-    adjusted = adjust_weighted(free_bundle, observations, extra_variance)
+    adjusted = adjust_weighted(free_bundle, indexed, extra_variance)
     return dataclasses.replace(adjusted, bundle=_move_bundle_to_nominal(adjusted.bundle, nominal))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._lens.bundle import (
     Bundle,
-    Observation,
+    IndexedView,
     adjust_weighted,
     lens_values,
     with_lens,
@@ -101,10 +101,8 @@ def _fit_from_length(
     guess = _opencv_lens(views[:: -(-len(views) // MAX_VIEWS_OF_OPENCV)], model, length)
     # coefficients that stay 0 are set to 0, and fy to fx if they are one unknown
     lens = with_lens(guess, basis @ np.linalg.pinv(basis) @ lens_values(guess))
-    observations = [Observation(0, number, view) for number, view in enumerate(views)]
-    adjusted = adjust_weighted(
-        Bundle.single(lens, likeliest_poses(views, lens), basis), observations
-    )
+    indexed = [IndexedView(0, number, view) for number, view in enumerate(views)]
+    adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), indexed)
     if not np.isfinite(adjusted.weighted_squares):
         raise Code.POOR_FIT.error("points behind the camera")
     return adjusted

@@ -182,9 +182,8 @@ def _test_residuals(evidence: Evidence) -> Iterator[Remark]:
     ]
     worst = int(np.argmin(chances))
     if chances[worst] * len(chances) < SIGNIFICANCE_LEVEL:
-        residual = (
-            1e3 * evidence.normalization.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
-        )
+        length = float(np.linalg.norm(fitted.residuals[worst]))
+        residual = 1e3 * evidence.normalization.robot_size * length
         yield Code.OUTLIER.remark(
             f"point {evidence.point_numbers[worst]} fits far worse than the others: its residual "
             f"of {residual:.3g} mm comes by chance once in {1 / max(chances[worst], 1e-12):.3g} "

@@ -15,7 +15,7 @@ from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import (
     Bundle,
-    Observation,
+    IndexedView,
     adjust_weighted,
     camera_covariance,
 )
@@ -367,41 +367,39 @@ def calibrate_stereo(
         )
     lenses = Lenses((left, right), distortion_model, tuple(as_list(fixed, str, "fixed: name")))
     view_pairs, bundle, mismatched = guess_start(view_pairs, lenses)
-    observations = [
-        Observation(side, number, view)
+    indexed = [
+        IndexedView(side, number, view)
         for number, view_pair in enumerate(view_pairs)
         for side, view in enumerate(view_pair)
         if view is not None
     ]
-    max_bad, bad = MAX_BAD_VIEW_SHARE * len(observations), list[Observation]()
+    max_bad, bad = MAX_BAD_VIEW_SHARE * len(indexed), list[IndexedView]()
     bad += [
-        observation
-        for observation in observations
-        if observation.camera_index == 1 and observation.pose_index in mismatched
+        entry for entry in indexed if entry.camera_index == 1 and entry.pose_index in mismatched
     ]
-    others = [observation for observation in observations if observation not in bad]
+    others = [entry for entry in indexed if entry not in bad]
     if (
         drop_bad
         and len(bad) <= MAX_BAD_VIEW_SHARE * len(complete)
         and len(_complete_pairs(others)) >= min_pairs
     ):
-        observations = others
+        indexed = others
     while True:
-        adjusted = adjust_weighted(bundle, observations)
+        adjusted = adjust_weighted(bundle, indexed)
         if not math.isfinite(adjusted.weighted_squares):
             raise Code.POOR_FIT.error(
                 "stereo: expected cameras that fit the pairs of views, got points of the target "
                 "behind a camera"
             )
-        worst, ratio = worst_view([observation.view for observation in observations], adjusted)
+        worst, ratio = worst_view([entry.view for entry in indexed], adjusted)
         if ratio <= BAD_VIEW_RATIO:
             break
-        if observations[worst] not in bad:
-            bad.append(observations[worst])
-        others = observations[:worst] + observations[worst + 1 :]
+        if indexed[worst] not in bad:
+            bad.append(indexed[worst])
+        others = indexed[:worst] + indexed[worst + 1 :]
         if not drop_bad or len(bad) > max_bad or len(_complete_pairs(others)) < min_pairs:
             break
-        observations, bundle = others, adjusted.bundle
+        indexed, bundle = others, adjusted.bundle
     recalibrate = functools.partial(
         calibrate_stereo,
         left=left,
@@ -412,16 +410,15 @@ def calibrate_stereo(
         drop_bad=drop_bad,
     )
     calibration = _build_calibration(
-        _StereoSolution(view_pairs, observations, bad, adjusted, min_pairs, mismatched), sheet
+        _StereoSolution(view_pairs, indexed, bad, adjusted, min_pairs, mismatched), sheet
     )
     return examine_pairs(calibration, recalibrate, known=(left, right), drop_strays=drop_bad)
 
 
-def _complete_pairs(observations: Sequence[Observation]) -> list[int]:
+def _complete_pairs(indexed: Sequence[IndexedView]) -> list[int]:
     """Return the indices of the moments at which both cameras see the target."""
     sides = [
-        {observation.pose_index for observation in observations if observation.camera_index == side}
-        for side in range(2)
+        {entry.pose_index for entry in indexed if entry.camera_index == side} for side in range(2)
     ]
     return sorted(sides[0] & sides[1])
 
@@ -430,8 +427,8 @@ class _StereoSolution(NamedTuple):
     """The fit from which a calibration is built."""
 
     view_pairs: list[ViewPair]  # all views, the right ones numbered as the left ones
-    observations: list[Observation]  # used views
-    bad: list[Observation]  # views that fit badly, whether used or not
+    indexed: list[IndexedView]  # used views
+    bad: list[IndexedView]  # views that fit badly, whether used or not
     adjusted: AdjustedBundle  # fitted cameras
     min_pairs: int  # number of pairs that are needed
     # moments whose views do not belong together, as in :class:`FirstGuess`
@@ -449,7 +446,7 @@ def _held_out_errors(
     solution: _StereoSolution, left_out: Sequence[LeftOut]
 ) -> dict[int, PairErrors]:
     """Return the errors of each pair, with cameras that were fitted without this pair."""
-    pairs = _complete_pairs(solution.observations)
+    pairs = _complete_pairs(solution.indexed)
     if len(pairs) <= solution.min_pairs:
         return {}
     return {
@@ -465,8 +462,8 @@ def _camera_pair(bundle: Bundle) -> CameraPair:
 
 
 def _build_calibration(solution: _StereoSolution, sheet: SheetOption) -> StereoCalibration:
-    check_fit(solution.adjusted.rms, solution.observations, solution.bad)
-    sheet_fit = choose_shape(solution.adjusted, solution.observations, sheet)
+    check_fit(solution.adjusted.rms, solution.indexed, solution.bad)
+    sheet_fit = choose_shape(solution.adjusted, solution.indexed, sheet)
     adjusted = sheet_fit.adjusted
     solution, held_out_errors = (
         solution._replace(adjusted=adjusted),
@@ -474,8 +471,7 @@ def _build_calibration(solution: _StereoSolution, sheet: SheetOption) -> StereoC
     )
     cameras = _camera_pair(adjusted.bundle)
     epipolar = [
-        pair_errors(cameras, *solution.pair(n)).epipolar
-        for n in _complete_pairs(solution.observations)
+        pair_errors(cameras, *solution.pair(n)).epipolar for n in _complete_pairs(solution.indexed)
     ]
     calibration = StereoCalibration(
         **cameras._asdict(),
@@ -505,11 +501,9 @@ def _pair_fit(
     solution: _StereoSolution, number: int, held_out_errors: Mapping[int, PairErrors]
 ) -> PairFit:
     rms = {
-        observation.camera_index: _rms([residuals])
-        for observation, residuals in zip(
-            solution.observations, solution.adjusted.residuals, strict=True
-        )
-        if observation.pose_index == number
+        entry.camera_index: _rms([residuals])
+        for entry, residuals in zip(solution.indexed, solution.adjusted.residuals, strict=True)
+        if entry.pose_index == number
     }
     pose = Transform(LEFT, TARGET, *solution.adjusted.bundle.poses.subset(number))
     left, right = solution.view_pairs[number]
@@ -529,7 +523,7 @@ def _remarks(
     calibration: StereoCalibration, solution: _StereoSolution, sheet_remarks: list[Remark]
 ) -> Iterator[Remark]:
     for bad in solution.bad:
-        is_used = any(bad is observation for observation in solution.observations)
+        is_used = any(bad is entry for entry in solution.indexed)
         outcome = "is used all the same" if is_used else "was not used"
         reason = f"fits more than {BAD_VIEW_RATIO:g} times worse than the others"
         if bad.camera_index == 1 and bad.pose_index in solution.mismatched:
@@ -551,7 +545,7 @@ def _remarks(
     yield from sheet_remarks
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{len(_complete_pairs(solution.observations))} pairs are just enough for the fit: "
+            f"{len(_complete_pairs(solution.indexed))} pairs are just enough for the fit: "
             "with more pairs, the cameras could be tested with pairs that were not used to fit them"
         )
 

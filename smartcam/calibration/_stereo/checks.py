@@ -34,7 +34,7 @@ from smartcam.geometry._inside import Code, Remark
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from smartcam.calibration._lens.bundle import Observation
+    from smartcam.calibration._lens.bundle import IndexedView
     from smartcam.calibration._stereo.calibration import StereoCalibration
     from smartcam.calibration._stereo.start import ViewPair
     from smartcam.calibration._views import TargetView
@@ -155,32 +155,22 @@ def examine_pairs(
         [pair.right for pair in calibration.pairs],
     ]
     side_views = list(_side_views(calibration))
-    fitted, used = (
-        [observation.fitted for observation in side_views],
-        [observation.used for observation in side_views],
-    )
+    fitted, used = [entry.fitted for entry in side_views], [entry.used for entry in side_views]
     names = [
-        f"{view_name(observation.fitted.view, observation.pair)}, {SIDES[observation.side]}"
-        for observation in side_views
+        f"{view_name(entry.fitted.view, entry.pair)}, {SIDES[entry.side]}" for entry in side_views
     ]
     fit_remarks = list(view_remarks([fit.view for fit in fitted], names))
     for side, name in enumerate(SIDES):
         if known[side] is not None:
-            fits = [
-                observation.fitted
-                for observation in side_views
-                if observation.used and observation.side == side
-            ]
+            fits = [entry.fitted for entry in side_views if entry.used and entry.side == side]
             fit_remarks += lens_remarks(fits, f"{name} lens", calibration.sigma**2)
     pairs = [
-        list(group)
-        for _, group in itertools.groupby(side_views, key=lambda observation: observation.pair)
+        list(group) for _, group in itertools.groupby(side_views, key=lambda entry: entry.pair)
     ]
     complete = [
-        observations_of_pair
-        for observations_of_pair in pairs
-        if len(observations_of_pair) == 2
-        and all(observation.used for observation in observations_of_pair)
+        pair_views
+        for pair_views in pairs
+        if len(pair_views) == 2 and all(entry.used for entry in pair_views)
     ]
     free = np.zeros(UNKNOWN_COUNT, dtype=np.bool_)
     free[LENS], free[RIGHT_LENS] = (lens is None for lens in known)
@@ -196,10 +186,10 @@ def examine_pairs(
     )
     outliers = find_strays(fitted, calibration.sigma**2, used)
     if outliers and drop_strays:
-        for observation, view in zip(
+        for entry, view in zip(
             side_views, remove_points([fit.view for fit in fitted], outliers), strict=True
         ):
-            views_by_side[observation.side][observation.pair] = view
+            views_by_side[entry.side][entry.pair] = view
         # the new calibration already has the remarks on its own fit
         calibration, fit_remarks = recalibrate(*views_by_side), []
     outcome = "was not used" if drop_strays else "is used all the same"
@@ -237,20 +227,17 @@ def _side_views(calibration: StereoCalibration) -> Iterator[_SideView]:
                 )
 
 
-def check_fit(rms: float, observations: Sequence[Observation], bad: Sequence[Observation]) -> None:
+def check_fit(rms: float, indexed: Sequence[IndexedView], bad: Sequence[IndexedView]) -> None:
     """Raise ``POOR_FIT`` if the views of pairs do not belong together.
 
-    ``rms``: RMS of a coordinate of the residuals, pixels. ``observations``: the used views.
+    ``rms``: RMS of a coordinate of the residuals, pixels. ``indexed``: the used views.
     ``bad``: the views that fit worst.
     """
-    max_rms = max_plausible_rms(
-        [observation.view for observation in observations], MAX_RMS_PX, MAX_RMS_SHARE
-    )
+    max_rms = max_plausible_rms([entry.view for entry in indexed], MAX_RMS_PX, MAX_RMS_SHARE)
     if rms <= max_rms:
         return
     names = ", ".join(
-        f"{view_name(observation.view, observation.pose_index)} ({SIDES[observation.camera_index]})"
-        for observation in bad
+        f"{view_name(entry.view, entry.pose_index)} ({SIDES[entry.camera_index]})" for entry in bad
     )
     raise Code.POOR_FIT.error(
         "stereo: expected cameras that fit the pairs of views, got residuals of "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._lens.bundle import Bundle, Observation, adjust, empty_basis
+from smartcam.calibration._lens.bundle import Bundle, IndexedView, adjust, empty_basis
 from smartcam.calibration._lens.intrinsics import check_tilts, check_views
 from smartcam.calibration._lens.poses import half_turn, half_turned, likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
@@ -159,8 +159,8 @@ def _fit_side(
         check_tilts(adjusted, label)
     else:
         check_views(views, label, 1, known.size)
-        observations = [Observation(0, index, view) for index, view in enumerate(views)]
-        adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), observations, 0.0)
+        indexed = [IndexedView(0, index, view) for index, view in enumerate(views)]
+        adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), indexed, 0.0)
     poses: list[Rigid | None] = [None] * len(view_pairs)
     for pose_index, index in enumerate(pair_indices):
         poses[index] = adjusted.bundle.poses.subset(pose_index)

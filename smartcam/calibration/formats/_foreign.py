@@ -246,11 +246,8 @@ def parse_ros_ini(text: str) -> FoundLenses:
     coefficients = as_numbers(data["distortion"], "distortion")
     model: DistortionModel = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
     size = [*data["width"], *data["height"]]
-    return (
-        [ForeignLens(section, size, _intrinsic_parameters(matrix), model, coefficients)],
-        [],
-        None,
-    )
+    lens = ForeignLens(section, size, _intrinsic_parameters(matrix), model, coefficients)
+    return [lens], [], None
 
 
 def _intrinsic_parameters(matrix: np.ndarray[Any, Any]) -> list[float]:

@@ -23,7 +23,7 @@ from smartcam.geometry._inside import Code, Rigid
 from tests.calibration.inside import (
     Bundle,
     Coverage,
-    Observation,
+    IndexedView,
     adjust_shape,
     adjust_weighted,
     choose_shape,
@@ -360,9 +360,9 @@ def test_moved_to_nominal_removes_place_direction_and_size() -> None:
 
 def test_adjust_shape_finds_the_places_of_the_points() -> None:
     views = seen(LEFT, poses(15), sigma=0.02, points=OFF)
-    observations = [Observation(0, number, view) for number, view in enumerate(views)]
+    indexed = [IndexedView(0, number, view) for number, view in enumerate(views)]
     before = fit_lens(views, "plumb_bob")
-    found = adjust_shape(before.bundle, observations, before.extra_variance)
+    found = adjust_shape(before.bundle, indexed, before.extra_variance)
     assert found.bundle.points is not None
     off = found.bundle.points - moved_to_nominal(OFF, BOARD.points)
     assert np.sqrt((off**2).mean()) < 4e-5
@@ -375,16 +375,16 @@ def test_adjust_shape_finds_the_places_of_the_points() -> None:
 )
 def test_held_out_is_that_of_a_fit_without_the_views(count: int, *, free: bool) -> None:
     views = seen(LEFT, poses(count), points=OFF if free else None)
-    observations = [Observation(0, number, view) for number, view in enumerate(views)]
+    indexed = [IndexedView(0, number, view) for number, view in enumerate(views)]
     whole = fit_lens(views, "plumb_bob")
     if free:
-        whole = adjust_shape(whole.bundle, observations, whole.extra_variance)
-    for one in leave_out(whole, observations):
-        others = [observation for observation in observations if observation.pose_index != one.pose]
+        whole = adjust_shape(whole.bundle, indexed, whole.extra_variance)
+    for one in leave_out(whole, indexed):
+        others = [each for each in indexed if each.pose_index != one.pose]
         again = adjust(whole.bundle, others, whole.extra_variance).bundle
         only = dataclasses.replace(again, poses=again.poses.subset([one.pose])).with_known_cameras()
         (expected,) = adjust(
-            only, [Observation(0, 0, views[one.pose])], whole.extra_variance
+            only, [IndexedView(0, 0, views[one.pose])], whole.extra_variance
         ).residuals
         off, rms = (math.sqrt(float((r**2).mean())) for r in (one.residuals[0], expected))
         assert off == pytest.approx(rms, rel=0.01)
@@ -395,7 +395,7 @@ def test_held_out_error_of_a_view_does_not_use_it() -> None:
     shaken = views[3].points + 2.0 * np.random.default_rng(4).normal(size=views[3].points.shape)
     spoiled = [*views[:3], dataclasses.replace(views[3], points=shaken), *views[4:]]
     (fitted, again) = (
-        [Observation(0, n, view) for n, view in enumerate(s)] for s in (views, spoiled)
+        [IndexedView(0, n, view) for n, view in enumerate(s)] for s in (views, spoiled)
     )
     whole = fit_lens(views, "plumb_bob")
     true = next(one for one in leave_out(whole, fitted) if one.pose == 3)
@@ -433,8 +433,8 @@ def test_exact_sheet_stays_exact_even_before_a_lens_that_is_not_of_its_model(
 ) -> None:
     for seed in range(2):
         views = seen(LEFT, poses(8, seed=seed), seed=seed)
-        observations = [Observation(0, number, view) for number, view in enumerate(views)]
-        found = choose_shape(fit_lens(views, "plumb_bob", fixed), observations, "auto")
+        indexed = [IndexedView(0, number, view) for number, view in enumerate(views)]
+        found = choose_shape(fit_lens(views, "plumb_bob", fixed), indexed, "auto")
         assert found.offsets is None
         assert found.remarks == []
 
@@ -455,9 +455,9 @@ def test_adjust_shape_errors_are_those_that_the_bound_allows() -> None:
     squares = []
     for seed in range(12):
         views = seen(LEFT, poses(8, seed=seed), seed=seed, points=OFF)
-        observations = [Observation(0, number, view) for number, view in enumerate(views)]
+        indexed = [IndexedView(0, number, view) for number, view in enumerate(views)]
         fitted = fit_lens(views, "plumb_bob")
-        found = adjust_shape(fitted.bundle, observations, fitted.extra_variance)
+        found = adjust_shape(fitted.bundle, indexed, fitted.extra_variance)
         off = lens_values(found.bundle.cameras[0]) - lens_values(LEFT)
         squares.append(off @ np.linalg.solve(found.noise_covariance, off))
     assert np.mean(squares) == pytest.approx(9.0, abs=3.7)  # 3 sigma of the mean
@@ -465,14 +465,14 @@ def test_adjust_shape_errors_are_those_that_the_bound_allows() -> None:
 
 def test_adjust_shape_keeps_the_nominal_place_direction_and_size() -> None:
     views = seen(LEFT, poses(8), points=OFF)
-    observations = [Observation(0, number, view) for number, view in enumerate(views)]
+    indexed = [IndexedView(0, number, view) for number, view in enumerate(views)]
     fitted = fit_lens(views, "plumb_bob")
-    found = adjust_shape(fitted.bundle, observations, fitted.extra_variance).bundle
+    found = adjust_shape(fitted.bundle, indexed, fitted.extra_variance).bundle
     assert found.points is not None
     np.testing.assert_allclose(
         moved_to_nominal(found.points, BOARD.points), found.points, atol=1e-9
     )
-    together = np.concatenate(residuals(found, observations))
+    together = np.concatenate(residuals(found, indexed))
     assert together.std() == pytest.approx(0.045, rel=0.1)
 
 
@@ -533,10 +533,10 @@ def _bundle(count: int, *, free: bool = True) -> Bundle:
     )
 
 
-def _observations(count: int, sigma: float) -> list[Observation]:
+def _indexed_views(count: int, sigma: float) -> list[IndexedView]:
     both = pairs(count, sigma=sigma)
     return [
-        Observation(side, n, view)
+        IndexedView(side, n, view)
         for side, views in enumerate(both)
         for n, view in enumerate(views)
     ]
@@ -558,7 +558,7 @@ def test_adjust_from_near_goes_back_to_the_truth() -> None:
     random = np.random.default_rng(1)
     scale = np.array([5, 5, 5, 5, 0.02, 0.02, 1e-3, 1e-3, 0.02] * 2 + [0.02] * 6)
     away = truth.with_steps(scale * random.normal(size=24), 0.01 * random.normal(size=(6, 6)))
-    found = adjust(away, _observations(6, 0.0), 0.0)
+    found = adjust(away, _indexed_views(6, 0.0), 0.0)
     assert found.weighted_squares < 1e-3
     for one, other in zip(found.bundle.cameras, truth.cameras, strict=True):
         np.testing.assert_allclose(one.matrix, other.matrix, atol=1e-3)
@@ -566,7 +566,7 @@ def test_adjust_from_near_goes_back_to_the_truth() -> None:
 
 
 def test_adjust_sum_of_squares_is_its_freedom() -> None:
-    found = adjust(_bundle(8), _observations(8, 0.1), 0.0)
+    found = adjust(_bundle(8), _indexed_views(8, 0.1), 0.0)
     count = sum(len(one) for one in found.residuals)
     assert found.freedom == 2 * count - 24 - 6 * 8
     assert found.weighted_squares == pytest.approx(found.freedom, rel=0.15)
@@ -579,7 +579,7 @@ def test_adjust_covariance_of_poses_is_that_of_their_errors() -> None:
         views = seen(LEFT, truth, sigma=0.1, seed=seed)
         motions = Rigid.stack(one.rigid for one in truth)
         bundle = Bundle.single(LEFT, motions, np.eye(9)[:, :2])
-        found = adjust(bundle, [Observation(0, n, view) for n, view in enumerate(views)], 0.0)
+        found = adjust(bundle, [IndexedView(0, n, view) for n, view in enumerate(views)], 0.0)
         turn = found.bundle.poses.rotation[0] @ truth[0].rotation.T
         shift = found.bundle.poses.translation[0] - truth[0].translation
         off = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift])
@@ -588,11 +588,8 @@ def test_adjust_covariance_of_poses_is_that_of_their_errors() -> None:
 
 
 def test_adjust_leaves_a_pose_that_no_view_shows() -> None:
-    bundle, observations = (
-        _bundle(4),
-        [one for one in _observations(4, 0.05) if one.pose_index != 2],
-    )
-    found = adjust(bundle, observations, 0.0)
+    bundle, indexed = (_bundle(4), [one for one in _indexed_views(4, 0.05) if one.pose_index != 2])
+    found = adjust(bundle, indexed, 0.0)
     unseen = [one.poses.translation[2].tolist() for one in (found.bundle, bundle)]
     assert unseen[0] == unseen[1]
     assert found.freedom == 2 * sum(len(one) for one in found.residuals) - 24 - 6 * 3
@@ -602,16 +599,16 @@ def test_adjust_of_points_behind_the_camera_gives_up() -> None:
     bundle = _bundle(3)
     behind = bundle.poses.turned_in_target(np.tile([0, 0, 0, 0, 0, -9.0], (3, 1)))
     away = Bundle(bundle.cameras, bundle.rig, behind, bundle.basis)
-    found = adjust(away, _observations(3, 0.0), 0.0)
+    found = adjust(away, _indexed_views(3, 0.0), 0.0)
     assert math.isinf(found.weighted_squares)
     assert np.isnan(found.noise_covariance).all()
 
 
 def test_adjust_weighted_finds_the_variance_beyond_the_covariance() -> None:
-    observations = [
+    indexed = [
         one._replace(view=dataclasses.replace(one.view, covariance=0.01 * one.view.covariance))
-        for one in _observations(8, 0.2)
+        for one in _indexed_views(8, 0.2)
     ]
-    found = adjust_weighted(_bundle(8), observations)
+    found = adjust_weighted(_bundle(8), indexed)
     assert math.sqrt(found.extra_variance) == pytest.approx(0.2, rel=0.1)
     assert found.weighted_squares == pytest.approx(found.freedom, rel=0.02)

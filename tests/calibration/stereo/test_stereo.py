@@ -21,7 +21,7 @@ from smartcam.calibration._stereo.errors import spacing_errors
 from smartcam.calibration._stereo.start import Lenses, as_view_pairs, guess_start
 from smartcam.geometry._inside import Code
 from tests.calibration.inside import (
-    Observation,
+    IndexedView,
     check_fit,
     half_turned,
     moved_to_nominal,
@@ -444,18 +444,18 @@ def test_start_names_the_pair_that_does_not_belong_together() -> None:
 
 def test_check_fit_of_more_pixels_than_can_be_names_the_worst_views() -> None:
     left, right = pairs(2)
-    observations = [Observation(0, 0, left[0]), Observation(1, 0, right[0])]
-    check_fit(4.9, observations, [])
+    indexed = [IndexedView(0, 0, left[0]), IndexedView(1, 0, right[0])]
+    check_fit(4.9, indexed, [])
     with refused("POOR_FIT", "got residuals of 5.1 pixels rms, 5 at most", "worst: 01 (right)"):
-        check_fit(5.1, observations, [Observation(1, 1, right[1])])
+        check_fit(5.1, indexed, [IndexedView(1, 1, right[1])])
 
 
 def test_check_fit_allows_more_for_less_certain_points() -> None:
     left, _ = pairs(2, sigma=0.5)
-    observations = [Observation(0, 0, left[0])]
-    check_fit(9.9, observations, [])
+    indexed = [IndexedView(0, 0, left[0])]
+    check_fit(9.9, indexed, [])
     with refused("POOR_FIT", "10 at most expected", "worst: all alike"):
-        check_fit(10.1, observations, [])
+        check_fit(10.1, indexed, [])
 
 
 @pytest.mark.parametrize(
