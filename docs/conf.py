@@ -252,7 +252,7 @@ LIMITS = (
     "calibration._detection.grid_growing.MAX_SEEDS_TRIED",
     "calibration.wizards._hand_eye.MAX_VIEWS",
     "calibration._detection.levenberg.MAX_STEPS",
-    "calibration.wizards._pictures.PICTURE_DEADLINE",
+    "calibration.wizards._pictures.FOLDER_TIMEOUT",
     "calibration.wizards._pictures.MAX_FILES",
     "calibration.wizards._pictures.MAX_PICTURE_BYTES",
     "calibration._detection.ordering.MIN_ORIGIN_CONTRAST",

@@ -237,7 +237,7 @@ def compose_positional(transform: Transform, *, angles: bool = False, period: bo
 def compose_options(transform: Transform, *, angles: bool = False) -> str:
     """Return the arguments of ROS 2's program, one line.
 
-    ``angles``: as for :func:`compose_positions`.
+    ``angles``: as for :func:`compose_positional`.
     """
     values = dict(zip([*_POSITION, *_QUATERNION], pose_numbers(transform), strict=True))
     if angles:

@@ -648,10 +648,11 @@ def test_to_plane_of_raised_features_is_where_they_are() -> None:
 def test_to_plane_that_cannot_be_is_refused(exact: HandEyeCalibration) -> None:
     pose = exact.robot_poses[0]
     away = exact.camera_at(pose) @ Transform("camera", "plane", np.eye(3), np.array([0, 0, -0.5]))
-    with refused(
-        "OUT_OF_FIELD", "whose rays meet the plane in front of the camera, got [5.0, 6.0]"
-    ):
+    text = "expected pixels whose rays meet the plane in front of the camera, got [5.0, 6.0]"
+    with refused("OUT_OF_FIELD", f"to_plane: {text}"):
         exact.to_plane([[5, 6]], plane=away, robot_pose=pose)
+    with refused("OUT_OF_FIELD", f"predicted_error: {text}"):
+        exact.predicted_error([[5, 6]], plane=away, robot_pose=pose)
     if exact.setup == "eye-in-hand":
         with refused("WRONG_FRAME", "the robot's pose when the image was taken, got none"):
             exact.to_plane([[5, 6]], plane=away)
