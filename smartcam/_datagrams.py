@@ -15,7 +15,7 @@ MAX_DATAGRAM_BYTES = 1 << 16
 more."""
 
 
-def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:
+def limit_read_size(transport: asyncio.BaseTransport) -> None:
     """Make an endpoint allocate memory for one datagram per read, instead of asyncio's 256 KiB.
 
     At each read the C library would take 256 KiB from the system and return them, until it adapts;

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, P
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from smartcam._client._inside import has_pixel_positions, localizations_of, name_without_poses
+from smartcam._client._inside import has_pixel_positions, localizations_of, name_if_poseless
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConfigurationError, InterpretationError, LocalProtocolError
 from smartcam.settings import FLEET_SCHEMES, parse_address
@@ -318,7 +318,7 @@ def _spec_of_localizations(camera: ThesisCamera, application: int | None) -> Any
 def _with_poses(reading: Interpretation, application: int | None) -> Any:
     """Return an application's own interpreter if it makes localizations, else "localizations"."""
     own = reading.interpreter(application)
-    return "localizations" if own is None or name_without_poses(own) is not None else own
+    return "localizations" if own is None or name_if_poseless(own) is not None else own
 
 
 def _interpreter_of(spec: Any, application: int) -> Any:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Name
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from smartcam._client._inside import has_pixel_positions, localizations_of, name_without_poses
+from smartcam._client._inside import has_pixel_positions, localizations_of, name_if_poseless
 from smartcam._extras import from_part
 from smartcam._thesis import DEFAULT_TIMEOUT, ThesisRequest
 from smartcam.exceptions import ConfigurationError, InterpretationError
@@ -229,7 +229,7 @@ def localization_spec(reading: Interpretation | None, application: int | None) -
         application: the active application; None if that is not known.
     """
     interpreter = None if reading is None else reading.interpreter(application)
-    if interpreter is None or name_without_poses(interpreter) is not None:
+    if interpreter is None or name_if_poseless(interpreter) is not None:
         return "localizations", "m"
     return interpreter, "px" if has_pixel_positions(interpreter) else "m"
 

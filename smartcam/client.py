@@ -21,7 +21,7 @@ from smartcam._client.keepalive import KeepAlive
 from smartcam._client.polling import Polling
 from smartcam._client.requests import Requests
 from smartcam._client.results import Results
-from smartcam._client.status import StatusRequests, is_ready
+from smartcam._client.status import StatusRequests, runs_not_busy
 from smartcam._client.supervisor import Supervisor
 from smartcam._client.triggering import TriggerRequest, Triggers
 from smartcam._client.waits import Waits
@@ -62,9 +62,11 @@ class SmartCamera(Camera[ValueT]):
         self._state = state = self._make_state()
         self._waits = waits = Waits(counters)
         self._connection = connection = Connection(settings.name, waits)
-        patience, limit = settings.request_timeout, settings.switch_timeout
-        self._requests = requests = Requests(connection, waits, state, patience, limit)
-        polling = Polling(connection, requests, state, waits, listeners, patience)
+        answer_timeout, switch_timeout = settings.request_timeout, settings.switch_timeout
+        self._requests = requests = Requests(
+            connection, waits, state, answer_timeout, switch_timeout
+        )
+        polling = Polling(connection, requests, state, waits, listeners, answer_timeout)
         self._status = status = StatusRequests(connection, requests, polling, state, waits)
         self._commands = commands = Commands(connection, requests, status, state)
         self._results = results = Results(settings.name, self._default, state, listeners, counters)
@@ -74,8 +76,8 @@ class SmartCamera(Camera[ValueT]):
         self._triggers = Triggers(
             connection, requests, status, commands, results, state, waits, polling
         )
-        self._lock = CommandLock(connection, commands, status, state, waits, limit)
-        keepalive = KeepAlive(requests, waits, state, settings.liveness_timeout, limit)
+        self._lock = CommandLock(connection, commands, status, state, waits, switch_timeout)
+        keepalive = KeepAlive(requests, waits, state, settings.liveness_timeout, switch_timeout)
         self._supervisor = Supervisor(
             settings,
             connection,
@@ -179,7 +181,7 @@ class SmartCamera(Camera[ValueT]):
         deadline = self._connection.deadline(timeout)
         self._connection.require_link()
         await self._status.refresh(deadline)
-        predicate = is_ready if self._state.wanted.running else _is_not_busy
+        predicate = runs_not_busy if self._state.wanted.running else _is_not_busy
         return await self._status.until(predicate, deadline, "the camera to be ready")
 
     async def _trigger(

@@ -6,7 +6,7 @@ import asyncio
 import sys
 from typing import Any
 
-from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed
+from smartcam._datagrams import MAX_DATAGRAM_BYTES, limit_read_size
 from smartcam.emulator import Application, EmulatedCamera
 from tests.client.clientkit import emulated
 from tests.emulator.camera_wire import UdpClient, greet
@@ -29,7 +29,7 @@ class Keeper(asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """asyncio: the endpoint is there."""
         self.transport = transport
-        read_no_more_than_needed(transport)
+        limit_read_size(transport)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram."""
@@ -52,7 +52,7 @@ async def test_endpoint_reads_the_largest_datagram_whole() -> None:
 
 async def test_transport_of_another_kind_is_left_as_it_is() -> None:
     transport = asyncio.DatagramTransport()
-    read_no_more_than_needed(transport)
+    limit_read_size(transport)
     assert not hasattr(transport, "max_size")
 
 

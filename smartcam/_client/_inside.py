@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
     from smartcam._client.deadline import DeadlineTimer
-    from smartcam._client.doorbell import Outcome, make_doorbell
+    from smartcam._client.doorbell import AnyFuture, make_doorbell
     from smartcam._client.handshake import Session, attempt, dialect_names, dialect_remarks
     from smartcam._client.interpretation import (
         Interpretation,
@@ -26,13 +26,14 @@ if TYPE_CHECKING:
         camera_interpreter,
         has_pixel_positions,
         localizations_of,
-        name_without_poses,
+        name_if_poseless,
         new_tuple,
     )
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
 
 __all__ = [
+    "AnyFuture",
     "Attempt",
     "CameraState",
     "ClientCounters",
@@ -40,7 +41,6 @@ __all__ = [
     "Interpretation",
     "Interpreted",
     "Listeners",
-    "Outcome",
     "Reason",
     "Session",
     "SessionRefusedError",
@@ -53,7 +53,7 @@ __all__ = [
     "has_pixel_positions",
     "localizations_of",
     "make_doorbell",
-    "name_without_poses",
+    "name_if_poseless",
     "new_tuple",
     "reason_for",
     "reason_values",
@@ -67,10 +67,10 @@ if not TYPE_CHECKING:
             "camera_state": "CameraState",
             "counters": "ClientCounters",
             "deadline": "DeadlineTimer",
-            "doorbell": "Outcome make_doorbell",
+            "doorbell": "AnyFuture make_doorbell",
             "handshake": "Session attempt dialect_names dialect_remarks",
             "interpretation": "Interpretation Interpreted has_pixel_positions localizations_of "
-            "new_tuple camera_interpreter name_without_poses",
+            "new_tuple camera_interpreter name_if_poseless",
             "listeners": "Listeners",
             "triggering": "TriggerRequest",
         },

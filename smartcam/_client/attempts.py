@@ -41,7 +41,7 @@ class Attempt:
 
     Attributes:
         dialect: name of the dialect; until the camera's dialect is known, the names of all
-            dialects that the attempt tries.
+            dialects that the attempt attempts.
         transport: ``tcp`` or ``udp``.
         step: name of the last step that was begun.
         outcome: text that says how the attempt ended.
@@ -66,13 +66,13 @@ class Attempt:
         return self.step != OPENING
 
     def reach(self, step: str) -> None:
-        """Note that a step begins, and call ``on_step``."""
+        """Record that a step begins, and call ``on_step``."""
         self.step = step
         if self.on_step is not None:
             self.on_step(step)
 
     def end(self, error: Exception, waited: float) -> None:
-        """Note the error that ended the attempt; a ``UnicodeError`` means an invalid host name."""
+        """Record the error that ended it; a ``UnicodeError`` means an invalid host name."""
         self.error = error
         timeout = isinstance(error, TimeoutError)
         self.hung_up = self.step == CONNECTING and not timeout and not self.received
@@ -83,7 +83,8 @@ class Attempt:
             self.outcome = f"{received_text} for {shown_time(waited, coarse=True)}"
         elif isinstance(system, OSError) and system.errno is not None and system.errno > 0:
             words = os.strerror(system.errno)  # plainer than "Connect call failed"
-            self.outcome = str(system) if words.startswith("Unknown error") else words  # Winsock's
+            # on Windows strerror() does not know the numbers of Winsock
+            self.outcome = str(system) if words.startswith("Unknown error") else words
         elif isinstance(error, socket.gaierror) and error.strerror:
             self.outcome = error.strerror
         else:
@@ -125,7 +126,8 @@ REASONS: tuple[Reason, ...] = (
     Reason(
         lambda attempt: isinstance(attempt.error, (CommandRejectedError, SessionRefusedError)),
         "{where} refuses: {outcome}",
-        "Address and dialect are right. Look at the password, and for another client.",
+        "Address and dialect are right. Check the password, and whether another client is "
+        "connected.",
     ),
     Reason(
         lambda attempt: attempt.failed_with(errno.ECONNREFUSED),
@@ -136,7 +138,7 @@ REASONS: tuple[Reason, ...] = (
     ),
     Reason(
         lambda attempt: attempt.failed_with(*_UNREACHABLE),
-        "there is no way to {where}: {outcome}",
+        "{where} cannot be reached: {outcome}",
         "Look at the address, at this machine's network and mask, the cable and the camera's "
         "power: both must be in one network, or have a route.",
     ),
@@ -172,24 +174,24 @@ REASONS: tuple[Reason, ...] = (
     Reason(
         lambda attempt: attempt.transport == Transport.UDP.value,
         "nothing comes back from {where}: {outcome}; UDP does not tell whether anybody is there",
-        "Look at address, cable and power, whether the camera's process interface is at {port} "
-        "({default} by default){interface}, and for another client or dialect.",
+        "Check address, cable and power, whether the camera's process interface is at {port} "
+        "({default} by default){interface}, and whether it has another client or dialect.",
     ),
     Reason(
         lambda attempt: True,
         "{where} takes the connection and says nothing: {step}: {outcome}",
-        "Look whether the camera's process interface is at {port} ({default} by default)"
-        "{interface}, and for another client or dialect.",
+        "Check whether the camera's process interface is at {port} ({default} by default)"
+        "{interface}, and whether it has another client or dialect.",
     ),
 )
 """Causes in order: the first that fits any attempt counts. Causes with received bytes come before
 silence."""
 
 
-def reason_for(tries: Sequence[Attempt]) -> tuple[Reason, Attempt]:
+def reason_for(attempts: Sequence[Attempt]) -> tuple[Reason, Attempt]:
     """Return the reason why attempts failed, and the attempt that shows it."""
     return next(
-        (reason, attempt) for reason in REASONS for attempt in tries if reason.fits(attempt)
+        (reason, attempt) for reason in REASONS for attempt in attempts if reason.fits(attempt)
     )
 
 
@@ -208,7 +210,7 @@ def reason_values(attempt: Attempt, address: Address, protocol: Protocol) -> dic
     }
 
 
-def explain(tries: Sequence[Attempt], address: Address, protocol: Protocol) -> str:
+def explain(attempts: Sequence[Attempt], address: Address, protocol: Protocol) -> str:
     """Return one cause and one cure for attempts that failed."""
-    reason, attempt = reason_for(tries)
+    reason, attempt = reason_for(attempts)
     return f"{reason.text}. {reason.cure}".format(**reason_values(attempt, address, protocol))

@@ -47,7 +47,7 @@ class CameraState:
         active: id of the application that was active by the camera's last message about it.
         wanted: application and run state that the program has set.
         expected: id of the application that all results must come from; None for any.
-        active_in_doubt: True after another client or a person loaded an application.
+        application_in_doubt: True after another client or a person loaded an application.
         loads_by_others: number of times that another client or a person loaded one.
         statuses_received: number of statuses received.
         status_asked_at: loop time at which the camera was last asked for its status.
@@ -62,7 +62,7 @@ class CameraState:
         self.active: int | None = None
         self.shared: bool = shared
         self.set_wanted(Wanted(application, None))
-        self.active_in_doubt: bool = False
+        self.application_in_doubt: bool = False
         self.loads_by_others: int = 0
         self.statuses_received: int = 0
         self.status_asked_at: float = 0.0
@@ -74,7 +74,7 @@ class CameraState:
 
     def begin_session(self) -> None:
         """Forget facts that only the previous session has reported."""
-        self._last_status, self.active_in_doubt = None, False
+        self._last_status, self.application_in_doubt = None, False
         self._statuses_due = self.statuses_received
 
     def note_status(self, report: StatusReport, awaited: Container[object]) -> int | None:
@@ -101,7 +101,7 @@ class CameraState:
             and old_bits & _RUNNING_OR_BUSY == _BUSY
             and not (self._loaded_by_us or SwitchAnswer in awaited)
         ):
-            self.active_in_doubt = True
+            self.application_in_doubt = True
             self.loads_by_others += 1
         return old_bits
 
@@ -131,12 +131,12 @@ class CameraState:
         return max(self._statuses_due, self.statuses_received)
 
     def note_status_request(self, now: float, count: int = 1) -> None:
-        """Note ``count`` requests for the status, whose answers are pending."""
+        """Record ``count`` requests for the status, whose answers are pending."""
         self.status_asked_at = now
         self._statuses_due = self.statuses_due + count
 
     def note_statuses_lost(self) -> None:
-        """Note that the pending statuses will not come."""
+        """Record that the pending statuses will not come."""
         self._statuses_due = self.statuses_received
 
     @property
@@ -146,7 +146,7 @@ class CameraState:
         return "the active application" if unnamed else f"application {self.active}"
 
     def set_active(self, application: int, at: datetime) -> None:
-        """Note which application is active."""
+        """Record which application is active."""
         previous, self.active = self.active, application
         if previous != application and self._listeners.wants_changes:
             self._listeners.publish(
@@ -156,23 +156,23 @@ class CameraState:
             )
 
     def note_switch(self, application: int) -> None:
-        """Note that the camera has loaded an application as this client asked."""
+        """Record that the camera has loaded an application as this client asked."""
         self.want_application(application)
         self._loaded_by_us = True
 
-    def clear_active_doubt(self) -> None:
+    def clear_application_doubt(self) -> None:
         """End the doubt: the camera was asked which application is active."""
-        self.active_in_doubt = False
+        self.application_in_doubt = False
 
     def set_wanted(self, wanted: Wanted) -> None:
-        """Note the application and run state that the program has set."""
+        """Record the application and run state that the program has set."""
         self.wanted: Wanted = wanted
         self.expected: int | None = None if self.shared else wanted.application
 
     def want_application(self, application: int) -> None:
-        """Note the application that results are expected from."""
+        """Record the application that results are expected from."""
         self.set_wanted(self.wanted._replace(application=application))
 
     def want_running(self, running: bool) -> None:
-        """Note the requested run state."""
+        """Record the requested run state."""
         self.set_wanted(self.wanted._replace(running=running))

@@ -126,8 +126,7 @@ class CommandLock:
         Afterwards a job goes back to the former application. It is awaited, except after an error
         or a cancellation.
         """
-        # an unknown application is refused before anything is switched
-        self._connection.deadline(timeout)
+        self._connection.deadline(timeout)  # refuses a wrong timeout before anything is switched
         async with self.hold(self._switch_timeout) as switch_deadline:
             before = await self.enter_application(application, switch_deadline)
             try:
@@ -256,7 +255,8 @@ class CommandLock:
         async with self._lock:
             if not needed():
                 return
-            logger.info("%s: loaded again, to empty its queue of input", self._connection.name)
+            name = self._connection.name
+            logger.info("%s: loading the application again, to empty the input queue", name)
             try:
                 deadline = self._connection.deadline(self._switch_timeout)
                 active = await commands.query_loaded(deadline)
@@ -289,7 +289,7 @@ class CommandLock:
 
     async def _restore_earlier(self, before: PreviousState) -> None:
         """Go back to an earlier application and run state; never raises."""
-        await self._wait_adopted()
+        await self._wait_until_session_began()
         async with self._lock:
             try:
                 await self._reach_state(before.application, before.running)
@@ -303,11 +303,11 @@ class CommandLock:
                 self._state.set_wanted(before.wanted)
 
     async def _restore_wanted(self) -> None:
-        """Restore the named application and the wanted run state; never raises.
+        """Restore the wanted application and run state; never raises.
 
         If the link is lost again, the next session does it.
         """
-        await self._wait_adopted()
+        await self._wait_until_session_began()
         wanted = self._state.wanted
         async with self._lock:
             try:
@@ -319,7 +319,7 @@ class CommandLock:
             finally:
                 self._state.set_wanted(wanted)
 
-    async def _wait_adopted(self) -> None:
+    async def _wait_until_session_began(self) -> None:
         """Wait until the session of a job has begun: an eager task starts before that."""
         if self._waits.end_reason is not None:
             await asyncio.sleep(0)

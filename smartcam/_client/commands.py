@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam._client.handshake import code_text
-from smartcam._client.status import is_ready
+from smartcam._client.status import runs_not_busy
 from smartcam.exceptions import CommandRejectedError, ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import Verdict
@@ -43,8 +43,8 @@ class Commands:
 
     def __post_init__(self) -> None:
         self.unconfirmed: bool = False
-        # number of loads by others when void_inspection() stopped the camera; None if it has
-        # started it again
+        # number of loads by others when discard_inspection() stopped the camera; None once it was
+        # started again
         self._loads_when_halted: int | None = None
 
     def begin_session(self, link: Link) -> None:
@@ -60,11 +60,11 @@ class Commands:
 
     @property
     def is_in_run_mode(self) -> bool:
-        """True if the application runs, or :meth:`void_inspection` has stopped it for a while."""
+        """True if the application runs, or :meth:`discard_inspection` has stopped it shortly."""
         return self.is_halted() or Status.RUNNING in self._status.last
 
     def is_halted(self) -> bool:
-        """Return True if :meth:`void_inspection` was interrupted, and nothing started it again."""
+        """Return True if :meth:`discard_inspection` was interrupted, and nothing restarted it."""
         return self._loads_when_halted == self._state.loads_by_others
 
     # ------------------------------------------------------------------ run state
@@ -81,19 +81,19 @@ class Commands:
         self._state.want_running(False)
         await self._leave_run_mode(deadline)
 
-    async def void_inspection(self, deadline: float) -> None:
+    async def discard_inspection(self, deadline: float) -> None:
         """Stop, receive everything that the camera has sent, and start again.
 
         Cancellation: the camera may stay stopped (:meth:`is_halted`).
         """
         self._loads_when_halted = self._state.loads_by_others
         await self._confirm_stop(deadline)
-        await self._requests.fence(deadline)
+        await self._requests.round_trip(deadline)
         await self._enter_run_mode(deadline)
 
     async def _enter_run_mode(self, deadline: float) -> None:
         await self._command_and_wait(
-            m.Start(), is_ready, deadline, "Running and not BUSY after Start"
+            m.Start(), runs_not_busy, deadline, "Running and not BUSY after Start"
         )
         self._loads_when_halted = None
 
@@ -121,7 +121,7 @@ class Commands:
         if self._connection.features.polled:
             await self._status.refresh(deadline)
         else:
-            await self._requests.fence(deadline)
+            await self._requests.round_trip(deadline)
         self.unconfirmed = False
 
     # ------------------------------------------------------------------ application
@@ -163,7 +163,7 @@ class Commands:
         if Status.RUNNING not in self._status.last:
             await self.start(deadline)
         self._state.want_running(True)
-        await self._status.until(is_ready, deadline, "Running and not BUSY")
+        await self._status.until(runs_not_busy, deadline, "Running and not BUSY")
 
     async def switch(self, application: int | str, deadline: float, *, start: bool) -> None:
         """Stop if needed, switch, wait until not BUSY, start if wanted.
@@ -237,7 +237,9 @@ class Commands:
         if isinstance(application, str):
             self._connection.require(m.LoadFile)
             if not application.isprintable():
-                raise ConfigurationError(f"{name}: {application!r} is no file's name")
+                raise ConfigurationError(
+                    f"{name}: expected a file's name of printable characters, got {application!r}"
+                )
             return m.LoadFile(name=application.encode())
         self._connection.require(m.SwitchApplication)
         self.check_id(application)

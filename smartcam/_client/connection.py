@@ -26,56 +26,58 @@ class Features:
     """The features of a session's protocol that matter in every trigger.
 
     Attributes:
-        ordered: messages arrive in order and none is lost (TCP).
+        keeps_order: messages arrive in order and none is lost (TCP).
         numbered: the sequence number of a trigger can be set.
         acknowledged: the camera answers a trigger.
         polled: the camera sends the status only on request.
-        fences: a Query is sent with each trigger; the messages around its answer show whether
-            the camera accepted the trigger.
+        sends_queries: a Query is sent with each trigger; the messages around its answer show
+            whether the camera accepted the trigger.
         shows_triggers: the status shows each accepted trigger.
-        ends_triggers: the client ends a trigger without a result before the trigger's deadline.
-        tells_all: every change of the status is sent, in order, and nothing else shows the outcome
-            of a trigger.
+        ends_triggers: if no result comes, the client ends the trigger shortly before its deadline.
+        statuses_suffice: every change of the status is sent, in order, and nothing else shows the
+            outcome of a trigger.
     """
 
-    ordered: bool = True
+    keeps_order: bool = True
     numbered: bool = False
     acknowledged: bool = False
     polled: bool = False
-    fences: bool = False
+    sends_queries: bool = False
     shows_triggers: bool = True
     ends_triggers: bool = False
-    tells_all: bool = False
+    statuses_suffice: bool = False
 
     @staticmethod
     def of(link: Link) -> Features:
         """Return the features of a link's session; they are cached for each dialect."""
-        dialect, ordered = link.machine.dialect, link.machine.transport is Transport.TCP
-        known = _known_features.get((id(dialect), ordered))
+        dialect, keeps_order = link.machine.dialect, link.machine.transport is Transport.TCP
+        known = _known_features.get((id(dialect), keeps_order))
         if known is not None:
             return known[1]
-        features = Features._of(dialect, ordered=ordered)
+        features = Features._of(dialect, keeps_order=keeps_order)
         if len(_known_features) < MAX_KNOWN_FEATURES:
-            _known_features[id(dialect), ordered] = dialect, features
+            _known_features[id(dialect), keeps_order] = dialect, features
         return features
 
     @staticmethod
-    def _of(dialect: Dialect, *, ordered: bool) -> Features:
+    def _of(dialect: Dialect, *, keeps_order: bool) -> Features:
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
         ends = dialect.has(m.EndTrigger)
         # a camera that answers in order needs no Query: the trigger's answer is enough
-        fences = ordered and not dialect.in_order
-        tells_all = fences and dialect.shows_triggers and not (polled or acknowledged or ends)
+        sends_queries = keeps_order and not dialect.results_are_attributable
+        statuses_suffice = (
+            sends_queries and dialect.shows_triggers and not (polled or acknowledged or ends)
+        )
         return Features(
-            ordered=ordered,
+            keeps_order=keeps_order,
             numbered=dialect.has(m.SetSequenceNumber),
             acknowledged=acknowledged,
             polled=polled,
-            fences=fences,
+            sends_queries=sends_queries,
             shows_triggers=dialect.shows_triggers,
             ends_triggers=ends,
-            tells_all=tells_all,
+            statuses_suffice=statuses_suffice,
         )
 
 

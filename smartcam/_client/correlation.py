@@ -33,6 +33,7 @@ from typing import Literal
 from smartcam.models import Status
 
 OwedFate = Literal["late", "streamed"]
+"""How the result of a given-up trigger is counted when it arrives; streams get it in both cases."""
 
 NUMBER_STEP = 1000
 """Step by which each trigger's number is lower than the number of the trigger before.
@@ -60,33 +61,34 @@ class TriggerEvidence:
         begin_count: number of observed beginnings of inspections that may belong to the trigger. If
             the client gets every status and ``proven`` is True, the first inspection is the
             trigger's.
-        reached: True if containers that arrive now are not older than the trigger.
+        takes_containers: True if containers that arrive now count as the trigger's: none of them
+            can be older than the trigger.
         proven: True if the messages prove that the camera accepted this trigger.
         doubtful: True if the messages can no longer show which trigger the camera accepted.
     """
 
-    __slots__ = ("begin_count", "doubtful", "proven", "reached")
+    __slots__ = ("begin_count", "doubtful", "proven", "takes_containers")
 
     def __init__(self) -> None:
         self.begin_count = 0
-        self.reached = self.proven = True
+        self.takes_containers = self.proven = True
         self.doubtful = False
 
-    def on_query_answer(self) -> None:
-        """Note that a Query that was sent with the trigger is answered."""
+    def on_trigger_query_answer(self) -> None:
+        """Record that a Query that was sent with the trigger is answered."""
 
     def on_trigger_answer(self) -> None:
-        """Note that the trigger is answered: the camera has received it."""
+        """Record that the trigger is answered: the camera has received it."""
 
     def on_status(self, status: int) -> None:
-        """Note a status."""
+        """Record a status."""
 
-    def note_usual_round(self) -> bool:
-        """Note the usual messages of a trigger together; return False if each must be noted."""
+    def note_usual_exchange(self) -> bool:
+        """Record a trigger's usual messages together; return False to record each one singly."""
         return False
 
     def on_beginning(self) -> bool:
-        """Note that an inspection began; return True if it may be the trigger's."""
+        """Record that an inspection began; return True if it may be the trigger's."""
         self.begin_count += 1
         return self.begin_count == 1
 
@@ -98,14 +100,14 @@ class EvidenceByAcknowledgement(TriggerEvidence):
 
     def __init__(self) -> None:
         super().__init__()
-        self.reached = self.proven = False
+        self.takes_containers = self.proven = False
 
     def on_trigger_answer(self) -> None:
-        """Note that the camera has accepted the trigger."""
-        self.reached = self.proven = True
+        """Record that the camera has accepted the trigger."""
+        self.takes_containers = self.proven = True
 
 
-class EvidenceByFence(TriggerEvidence):
+class EvidenceByRoundTrip(TriggerEvidence):
     """Evidence without statuses: containers before the Query's answer are older.
 
     About containers after the answer it shows nothing.
@@ -115,11 +117,11 @@ class EvidenceByFence(TriggerEvidence):
 
     def __init__(self) -> None:
         super().__init__()
-        self.reached = False
+        self.takes_containers = False
 
-    def on_query_answer(self) -> None:
-        """Note that the camera has answered the Query before the trigger."""
-        self.reached = True
+    def on_trigger_query_answer(self) -> None:
+        """Record that the camera has answered the Query before the trigger."""
+        self.takes_containers = True
 
 
 class EvidenceByStatus(TriggerEvidence):
@@ -133,11 +135,11 @@ class EvidenceByStatus(TriggerEvidence):
 
     def __init__(self) -> None:  # does not call the base's, to be fast: each trigger makes one
         self.begin_count = 0
-        self.reached = self.proven = self.doubtful = False
+        self.takes_containers = self.proven = self.doubtful = False
         self._answer_count = 0  # answers to the Queries before the trigger and after it
 
-    def on_query_answer(self) -> None:
-        """Note an answer; the second one completes the count of inspections between both."""
+    def on_trigger_query_answer(self) -> None:
+        """Record an answer; the second one completes the count of inspections between both."""
         self._answer_count += 1
         self.proven = self._answer_count == 2 and self.begin_count > 0
 
@@ -146,18 +148,18 @@ class EvidenceByStatus(TriggerEvidence):
         if not self._answer_count:
             return False
         self.begin_count += 1
-        self.reached = self.begin_count == 1
+        self.takes_containers = self.begin_count == 1
         if self._answer_count == 2:
             self.proven = True
         else:
             self.doubtful = self.begin_count > 1
-        return self.reached
+        return self.takes_containers
 
-    def note_usual_round(self) -> bool:
-        """Note both Queries' answers and one inspection between them, if none was noted yet."""
+    def note_usual_exchange(self) -> bool:
+        """Record both Queries' answers and one inspection between them, if none was noted yet."""
         if self._answer_count or self.begin_count:
             return False
-        self._answer_count, self.begin_count, self.reached, self.proven = 2, 1, True, True
+        self._answer_count, self.begin_count, self.takes_containers, self.proven = 2, 1, True, True
         return True
 
 
@@ -168,23 +170,23 @@ class EvidenceByAnswer(TriggerEvidence):
 
     def __init__(self) -> None:
         super().__init__()
-        self.reached = self.proven = False
+        self.takes_containers = self.proven = False
         self._query_answered = False
         # whether the camera waited for a trigger, by the first status after the Query's answer
         self._waited_before: bool | None = None
 
-    def on_query_answer(self) -> None:
-        """Note that the next status shows the camera's state before the trigger."""
+    def on_trigger_query_answer(self) -> None:
+        """Record that the next status shows the camera's state before the trigger."""
         self._query_answered = True
 
     def on_trigger_answer(self) -> None:
-        """Note the trigger's answer; if the camera is busy, the trigger stays doubtful."""
-        self.reached = True
+        """Record the trigger's answer; if the camera is busy, the trigger stays doubtful."""
+        self.takes_containers = True
         self.doubtful = not self._waited_before
 
     def on_status(self, status: int) -> None:
         """Check that the camera waited for the trigger, and dropped no trigger."""
-        if self.reached:
+        if self.takes_containers:
             if status & _OVERTRIGGERED:
                 self.doubtful = True
             else:
@@ -251,46 +253,46 @@ class Correlation:
     """Decides to which trigger each container belongs, without I/O and time.
 
     Args:
-        chance: random share of the range of numbers at which numbers begin, 0 to 1: so results of
-            another client that still arrive most probably have other numbers.
+        first_number_share: random number, 0 to 1, from which the first sequence number is made, so
+            that results of another client most probably have other numbers.
 
     Attributes:
         pending: the running trigger.
         satisfied: whether the last trigger has its results, and no inspection has begun since.
         owed: results of given-up triggers, which may still arrive; the oldest first.
-        doubted: whether the status may be older than the last trigger, which was given up. Then the
-            status may show that the camera waits although it is inspecting.
+        status_may_be_old: whether the status may be older than the last trigger, which was given
+            up. Then the status may show that the camera waits although it is inspecting.
     """
 
-    def __init__(self, chance: float) -> None:
+    def __init__(self, first_number_share: float) -> None:
         self.pending: SentTrigger | None = None
-        self.doubted: bool = False
+        self.status_may_be_old: bool = False
         self._gets_every_status = False  # whether every status is sent, in order
         self.satisfied: bool = False
         # evidence of the last trigger, until it has its results
         self._last: TriggerEvidence | None = None
         self.owed: list[_Owed] = []
-        # owed results by the triggers' numbers; they are late whenever they arrive
+        # fates of given-up triggers' results, by the triggers' numbers; kept until MAX_OWED
         self._given_up_fates: dict[int, OwedFate] = {}
         self._last_number: int | None = None  # number of the last trigger that had its results
-        self._last_own_number = int(chance * RANGE_OF_FIRST_NUMBER)
+        self._last_own_number = int(first_number_share * RANGE_OF_FIRST_NUMBER)
         self._user_number: int | None = None
 
     @property
     def owed_fate(self) -> OwedFate | None:
-        """Fate of the result of an earlier trigger that may still arrive."""
+        """Fate of the oldest owed result; None if no result is owed."""
         return self.owed[0].fate if self.owed else None
 
     # ------------------------------------------------------------------ the session
 
-    def begin_session(self, *, complete: bool) -> None:
+    def begin_session(self, *, gets_every_status: bool) -> None:
         """Begin a session; owed results of earlier triggers may still arrive in it.
 
         Args:
-            complete: every change of the status is sent, in order.
+            gets_every_status: True if every change of the status is sent, in order.
         """
-        self._gets_every_status = complete
-        self.satisfied = self.doubted = False
+        self._gets_every_status = gets_every_status
+        self.satisfied = self.status_may_be_old = False
         self._last = None
         for owed in self.owed:  # the status with its inspection's beginning may have been lost
             owed.evidence = TriggerEvidence()
@@ -299,15 +301,15 @@ class Correlation:
     def forget_owed(self) -> None:
         """Forget owed results, since none can arrive: the application was stopped or replaced."""
         self.owed.clear()
-        self.satisfied = self.doubted = False
+        self.satisfied = self.status_may_be_old = False
         self._last = None
 
     def note_query_answered(self) -> None:
-        """Note that a Query is answered, so that all messages of earlier triggers are received.
+        """Record that a Query is answered, so that all messages of earlier triggers are received.
 
         An earlier trigger without a sign of an inspection was not accepted: it has no result.
         """
-        self.doubted = False
+        self.status_may_be_old = False
         if self._gets_every_status:
             self.owed = [owed for owed in self.owed if owed.evidence.begin_count]
             self._last = None
@@ -333,27 +335,27 @@ class Correlation:
         return self._last_own_number % (highest + 1)
 
     def set_next_number(self, number: int) -> None:
-        """Note that the user has set the number of the next inspection."""
+        """Record that the user has set the number of the next inspection."""
         self._user_number = number
 
     def begin_trigger(self, pending: SentTrigger) -> None:
-        """Note that a trigger is sent."""
+        """Record that a trigger is sent."""
         self.pending, self.satisfied = pending, False
         self._last = pending.evidence
         if pending.number is None:
             self._user_number = None  # the trigger's inspection uses it
 
     def end_trigger(self) -> None:
-        """Note that the trigger's caller no longer waits."""
+        """Record that the trigger's caller no longer waits."""
         self.pending = None
 
     def complete(self, pending: SentTrigger) -> None:
-        """Note that the trigger has all its results."""
+        """Record that the trigger has all its results."""
         self.satisfied, self._last_number = True, pending.number
         self._last = None
 
     def give_up(self, pending: SentTrigger, fate: OwedFate = "late", *, unread: int = 0) -> None:
-        """Note that the caller no longer waits for the trigger, whose results may still arrive.
+        """Record that the caller no longer waits for the trigger, whose results may still arrive.
 
         Args:
             pending: the trigger.
@@ -366,7 +368,7 @@ class Correlation:
         if pending.given_up or missing_count <= 0:
             return
         pending.given_up = True
-        self.doubted = self.doubted or not pending.evidence.begin_count
+        self.status_may_be_old = self.status_may_be_old or not pending.evidence.begin_count
         self.owed.append(_Owed(fate, pending.number, missing_count, pending.evidence))
         del self.owed[:-MAX_OWED]
         if pending.number is not None:
@@ -376,18 +378,18 @@ class Correlation:
 
     # ------------------------------------------------------------------ received messages
 
-    def on_query_answer(self) -> None:
-        """Note that a Query that was sent with the last trigger is answered."""
+    def on_trigger_query_answer(self) -> None:
+        """Record that a Query that was sent with the last trigger is answered."""
         if self._last is not None:
-            self._last.on_query_answer()
+            self._last.on_trigger_query_answer()
 
     def on_trigger_answer(self) -> None:
-        """Note that the last trigger was acknowledged."""
+        """Record that the last trigger was acknowledged."""
         if self._last is not None:
             self._last.on_trigger_answer()
 
-    def note_usual_round(self, pending: SentTrigger) -> bool:
-        """Note two answers and one inspection between them; return False if this is not possible.
+    def note_usual_exchange(self, pending: SentTrigger) -> bool:
+        """Record two answers and one inspection between them; return False if this is not possible.
 
         It is not possible if the trigger already has a result, if an earlier result is owed, or if
         the evidence is of another kind. After True, the inspection's container is this trigger's.
@@ -395,13 +397,13 @@ class Correlation:
         evidence = pending.evidence
         if not self._gets_every_status or self.owed or self._last is not evidence:
             return False
-        if not evidence.note_usual_round():
+        if not evidence.note_usual_exchange():
             return False
-        self.doubted = False
+        self.status_may_be_old = False
         return True
 
     def on_status(self, previous: int | None, status: int) -> bool:
-        """Note the beginning of an inspection: Waiting for Trigger falls while running.
+        """Record the beginning of an inspection: Waiting for Trigger falls while running.
 
         Args:
             previous: the status before, None if there was none in this session.
@@ -418,14 +420,14 @@ class Correlation:
         if previous is not None and not previous & _WAITING:
             return False
         if last is not None and last.on_beginning():
-            self.doubted = False
+            self.status_may_be_old = False
             return False
         self.satisfied = False
         self._user_number = None  # the inspection uses the number
         return self._gets_every_status and previous is not None
 
-    def judge_marked(self, is_ours: bool) -> Match:
-        """Return the trigger of a container that the wire marks as this client's or not."""
+    def judge_requested(self, is_ours: bool) -> Match:
+        """Return the trigger of a container that shows whether this client requested it."""
         pending = self.pending
         if not is_ours:
             return NOBODYS
@@ -444,7 +446,7 @@ class Correlation:
         if pending is not None and not pending.ended:
             numbered = number is not None and pending.number is not None
             if not numbered or number == pending.number:
-                if pending.evidence.reached:
+                if pending.evidence.takes_containers:
                     return OURS if pending.received < pending.wanted else EXTRA
                 if not pending.evidence.begin_count:
                     pending.early_count += 1
@@ -470,10 +472,12 @@ class Correlation:
 
     def _may_be_owed(self, evidence: TriggerEvidence) -> bool:
         """Return True if a container that arrives now may be a result of a given-up trigger."""
-        return bool(evidence.begin_count) or (evidence.reached and not self._gets_every_status)
+        return bool(evidence.begin_count) or (
+            evidence.takes_containers and not self._gets_every_status
+        )
 
     def _count_owed(self, owed: list[_Owed]) -> OwedFate:
-        """Note that the first of these owed results has arrived, and return its fate."""
+        """Record that the first of these owed results has arrived, and return its fate."""
         if not owed:
             return "late"
         owed[0].missing_count -= 1

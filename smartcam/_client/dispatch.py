@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam._client.remarks import Remarks
+from smartcam._client.limited_log import LimitedLog
 from smartcam._client.waits import copy_to_raise
 from smartcam.exceptions import ConnectionClosedError
 from smartcam.models import NoticeReceived, Status, StatusChanged
@@ -44,7 +44,7 @@ EVENTS_PER_TRIGGER = 5
 which is between two statuses."""
 
 MAX_NOTICE_CHARACTERS = 4096
-"""Largest number of characters that are kept of a remark of the camera."""
+"""Largest number of characters that are kept of a camera's notice."""
 
 _LOGGED_CHANGES = (
     (
@@ -63,7 +63,7 @@ _NOTED_BITS = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
 _WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
 
 
-class _UsualRound(NamedTuple):
+class _UsualExchange(NamedTuple):
     """The messages that usually surround a trigger's result: the same objects each time.
 
     Attributes:
@@ -99,9 +99,9 @@ class Dispatch:
 
     def __post_init__(self) -> None:
         self._dialect: Dialect | None = None
-        self._remarks = Remarks(self._name)
+        self._log = LimitedLog(self._name)
         # messages around the last trigger's result; None if they were not the usual ones
-        self._usual: _UsualRound | None = None
+        self._usual: _UsualExchange | None = None
         self._observers_want_events = False
         self._handlers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
             m.StatusReport: self._on_status,
@@ -118,36 +118,36 @@ class Dispatch:
         """Layout that results are read with; None if there is none, or several."""
         return self._results.interpretation.layout
 
-    def begin_session(self, dialect: Dialect, *, ordered: bool) -> None:
-        """Begin a session; ``ordered``: messages come in order and none is lost (TCP)."""
+    def begin_session(self, dialect: Dialect, *, keeps_order: bool) -> None:
+        """Begin a session; ``keeps_order``: messages come in order and none is lost (TCP)."""
         self._dialect = dialect
         self._waits.begin_session()
         self._state.begin_session()
         # if the status comes only on request, changes of it are missed
-        complete = ordered and dialect.capabilities.status_by_itself and dialect.shows_triggers
-        self._results.begin_session(ordered=ordered, complete=complete)
+        gets_all = keeps_order and dialect.capabilities.status_by_itself and dialect.shows_triggers
+        self._results.begin_session(keeps_order=keeps_order, gets_every_status=gets_all)
 
     def dispatch_early(self, chunks: Iterable[Chunk]) -> None:
         """Pass on the messages received while the session was made.
 
-        No request is sent before that: an answer among them belongs to the handshake.
+        Until this call only the handshake sends requests, so answers among them belong to it.
         """
         for chunk in chunks:
             self._dispatch_chunk(chunk)
-        if self._state.active_in_doubt:
+        if self._state.application_in_doubt:
             self._requests.ask_active_application()
 
     def dispatch(self, chunk: Chunk) -> None:
         """Pass on every event of a chunk, in order; never waits, never raises."""
         self._dispatch_chunk(chunk)
-        if self._state.active_in_doubt:
+        if self._state.application_in_doubt:
             self._requests.ask_active_application()
 
     def _dispatch_chunk(self, chunk: Chunk) -> None:
         at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.pending_answers
         events, handlers = chunk.events, self._handlers
         self._observers_want_events = self._listeners.observers_want_events()
-        if len(events) == EVENTS_PER_TRIGGER and self._handle_usual_round(events, now, at):
+        if len(events) == EVENTS_PER_TRIGGER and self._handle_usual_exchange(events, now, at):
             return
         if len(events) >= MIN_EVENTS_TO_GATHER and self._is_streaming_only():
             events = gather_containers(events, self._state.endian)
@@ -158,7 +158,7 @@ class Dispatch:
             if answers and isinstance(event, m.Message):
                 self._waits.on_message(event, now, chunk.delivery)
 
-    def _handle_usual_round(self, events: list[Event], now: float, at: datetime) -> bool:
+    def _handle_usual_exchange(self, events: list[Event], now: float, at: datetime) -> bool:
         """Handle the answers to the running trigger in one step, if they are the usual ones.
 
         Otherwise, or if anybody but the trigger's caller and streams of results needs the events,
@@ -174,7 +174,7 @@ class Dispatch:
             or end_status is not usual.end_status
             or last_answer is not usual.last_answer
         ):
-            usual = self._usual = _usual_round(events)
+            usual = self._usual = _usual_exchange(events)
         if usual is None or type(container) is not m.ResultContainer:
             return False
         state, listeners = self._state, self._listeners
@@ -182,15 +182,15 @@ class Dispatch:
             self._observers_want_events
             or listeners.events.references
             or listeners.statuses.references
-            or not self._waits.awaits_fences(2)
+            or not self._waits.awaits_only_queries(2)
             or not state.is_unchanged(usual.application, usual.bits, usual.endian)
             or container.application != usual.application
         ):
             return False
-        owner = self._results.take_usual_round(container)
+        owner = self._results.match_usual_exchange(container)
         if owner is None:
             return False
-        self._waits.expect_fences(0)
+        self._waits.expect_query_answers(0)
         if listeners.wants_statuses:  # true in a fleet's agent
             state.note_status(usual.begin_status, ())
             listeners.offer_status(usual.begin_status.status, now)
@@ -214,7 +214,7 @@ class Dispatch:
         The first error counts. Streams stay open until :meth:`finish`.
         """
         if self._waits.fail(error):
-            self._remarks.end()
+            self._log.end()
             if self._listeners.may_have_waiters:
                 self._listeners.fail(copy_to_raise(error))
             self._results.fail(error)
@@ -234,8 +234,8 @@ class Dispatch:
         return Verdict.DONE if self._dialect is None else self._dialect.code(code).verdict
 
     def _on_query_answer(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
-        if self._waits.count_fence_answer():
-            self._results.on_query_answer(now)
+        if self._waits.count_query_answer():
+            self._results.on_trigger_query_answer(now)
         state = self._state
         if answer.application != state.active and self._verdict(answer.code) is Verdict.DONE:
             state.set_active(answer.application, at)
@@ -257,8 +257,8 @@ class Dispatch:
         self._counters.note_notice()
         level = logging.WARNING if notice.kind == "error" else logging.INFO
         kind, code, text = notice.kind, notice.code, notice.text[:MAX_NOTICE_CHARACTERS]
-        form = "! the camera says: %s %d: %.200s"
-        self._remarks.log(f"notice {kind}", level, form, kind, code, text, now=now)
+        line = "! the camera says: %s %d: %.200s"
+        self._log.log(f"notice {kind}", level, line, kind, code, text, now=now)
         event = NoticeReceived(camera=self._name, at=at, kind=kind, code=code, text=text)
         self._listeners.publish(event)
 
@@ -275,7 +275,7 @@ class Dispatch:
             listeners.publish(event)
         listeners.offer_status(status, now)
         if waits.status_waiters:
-            waits.show_status(status)
+            waits.offer_status(status)
 
     def _note_changes(self, bits: int, old_bits: int, now: float) -> None:
         risen, fallen = bits & ~old_bits, old_bits & ~bits
@@ -283,10 +283,10 @@ class Dispatch:
             self._counters.note_overtrigger()
         for bit, level, kind, text in _LOGGED_CHANGES:
             if (risen if level != logging.INFO else fallen) & bit:
-                self._remarks.log(kind, level, text, now=now)
+                self._log.log(kind, level, text, now=now)
 
 
-def _usual_round(events: list[Event]) -> _UsualRound | None:
+def _usual_exchange(events: list[Event]) -> _UsualExchange | None:
     """Return the messages around a trigger's result; None if they are not the usual ones."""
     first, begin, _, end, last = events
     if (
@@ -297,12 +297,12 @@ def _usual_round(events: list[Event]) -> _UsualRound | None:
     ):
         return None
     bits, application = int(end.status), first.application
-    waits = bits & (_WAITING | _RUNNING) == _WAITING | _RUNNING
-    if not waits or int(begin.status) != bits & ~_WAITING:
+    is_waiting = bits & (_WAITING | _RUNNING) == _WAITING | _RUNNING
+    if not is_waiting or int(begin.status) != bits & ~_WAITING:
         return None
     if begin.endian != end.endian or last.application != application:
         return None
-    return _UsualRound(first, begin, end, last, application, bits, end.endian)
+    return _UsualExchange(first, begin, end, last, application, bits, end.endian)
 
 
 def gather_containers(events: list[Event], endian: int) -> list[Event]:
@@ -335,5 +335,5 @@ def gather_containers(events: list[Event], endian: int) -> list[Event]:
 
 def _is_plain(container: m.ResultContainer) -> bool:
     """Return True if a container has only bytes, names its application, and answers no request."""
-    named = container.application >= 0 and not container.asked
+    named = container.application >= 0 and not container.requested
     return named and container.cells is None and container.fault is None

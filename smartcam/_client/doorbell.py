@@ -6,8 +6,8 @@ such as a transport's, rings this doorbell, the task continues at once. It still
 exception in the task ends the task, and never reaches the callback.
 
 A caller that waits for a :class:`DirectFuture` continues in the same way when the receive task
-sleeps again, since no task can take a step within another task's step. Other outcomes, such as a
-timeout, wake the caller through the loop.
+sleeps again, since no task can take a step within another task's step. An error, such as a
+timeout, wakes the caller through the loop.
 
 :class:`Doorbell` and :class:`DirectFuture` use the protocol between asyncio's tasks and futures
 (``_asyncio_future_blocking``), as other implementations of futures do. :class:`PlainDoorbell` uses
@@ -46,8 +46,8 @@ class Doorbell:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop  # asyncio's tasks read it
-        # outcomes set while the receive task runs, whose tasks are woken after it; None: an
-        # outcome wakes its task through the loop
+        # futures set while the receive task runs, whose tasks are woken after it; None: a future
+        # wakes its task through the loop
         self.to_wake: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False
         # function that wakes the waiting task; None if no task waits
@@ -66,7 +66,7 @@ class Doorbell:
             self._loop.call_soon(wake, self, context=context)
 
     def deliver(self) -> None:
-        """Make the task continue as by :meth:`ring`, then the callers whose outcomes it has set.
+        """Make the task continue as by :meth:`ring`, then the callers whose futures it has set.
 
         Exceptions that end the program are raised in the loop, since a transport would handle them
         as errors of the transport.
@@ -82,35 +82,35 @@ class Doorbell:
             loop.call_soon(_raise, exc)
         finally:
             to_wake, self.to_wake = self.to_wake, None
-        for outcome in to_wake or ():
+        for future in to_wake or ():
             try:
-                outcome.wake()
+                future.wake()
             except ENDS_PROGRAM as exc:
                 loop.call_soon(_raise, exc)
 
-    def wake_in_order(self) -> None:
+    def wake_after_subscribers(self) -> None:
         """Wake callers through the loop, after the tasks that are ready by now.
 
         So subscribers get a result before its trigger's caller continues.
         """
         to_wake, self.to_wake = self.to_wake, None
-        for outcome in to_wake or ():
-            outcome.wake_soon()
+        for future in to_wake or ():
+            future.wake_soon()
 
-    def make_outcome(self) -> DirectFuture[Any]:
-        """Return an outcome that one task may wait for."""
+    def make_future(self) -> DirectFuture[Any]:
+        """Return a future that one task may wait for."""
         return DirectFuture(self, self._loop)
 
-    def set_outcome(self, outcome: Outcome, value: object) -> None:
-        """Set the result of an outcome: its task continues at once, unless another task runs."""
-        if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
-            outcome.set_result(value)
+    def set_future(self, future: AnyFuture, value: object) -> None:
+        """Set the result of a future: its task continues at once, unless another task runs."""
+        if isinstance(future, asyncio.Future) or asyncio.current_task(self._loop) is not None:
+            future.set_result(value)
             return
         to_wake, self.to_wake = self.to_wake, []
-        outcome.set_result(value)
+        future.set_result(value)
         self.to_wake = to_wake
         try:
-            outcome.wake()
+            future.wake()
         except ENDS_PROGRAM as exc:
             self._loop.call_soon(_raise, exc)
 
@@ -123,7 +123,7 @@ class Doorbell:
     def add_done_callback(
         self, wake: Callable[[Doorbell], None], *, context: contextvars.Context
     ) -> None:
-        """Note that the task sleeps now; ``wake`` makes it continue."""
+        """Record that the task sleeps now; ``wake`` makes it continue."""
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
@@ -162,17 +162,17 @@ class DirectFuture(Generic[T]):
         return self._done
 
     def cancelled(self) -> bool:
-        """Return True if the wait was cancelled before there was an outcome."""
+        """Return True if the wait was cancelled before the future was set."""
         return self._cancelled
 
     def set_result(self, value: T) -> None:
         """Make the task continue with a result.
 
         Raises:
-            asyncio.InvalidStateError: the outcome is set already.
+            asyncio.InvalidStateError: the future is set already.
         """
         if self._done:
-            raise asyncio.InvalidStateError("the outcome is set already")
+            raise asyncio.InvalidStateError("the future is set already")
         self._done, self._value = True, value
         to_wake = self._bell.to_wake
         if to_wake is None:
@@ -184,10 +184,10 @@ class DirectFuture(Generic[T]):
         """Make the task continue with an error.
 
         Raises:
-            asyncio.InvalidStateError: the outcome is set already.
+            asyncio.InvalidStateError: the future is set already.
         """
         if self._done:
-            raise asyncio.InvalidStateError("the outcome is set already")
+            raise asyncio.InvalidStateError("the future is set already")
         self._done, self._error = True, error
         self.wake_soon()
 
@@ -219,7 +219,7 @@ class DirectFuture(Generic[T]):
     def add_done_callback(
         self, wake: Callable[[DirectFuture[T]], None], *, context: contextvars.Context
     ) -> None:
-        """Note that the task sleeps now; ``wake`` makes it continue."""
+        """Record that the task sleeps now; ``wake`` makes it continue."""
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
@@ -296,16 +296,16 @@ class PlainDoorbell:
         """Make the task continue; callers continue after it, through the loop."""
         self.ring()
 
-    def wake_in_order(self) -> None:
+    def wake_after_subscribers(self) -> None:
         """Do nothing, since all callers continue through the loop anyway."""
 
-    def make_outcome(self) -> asyncio.Future[Any]:
-        """Return an outcome that one task may wait for."""
+    def make_future(self) -> asyncio.Future[Any]:
+        """Return a future that one task may wait for."""
         return self._loop.create_future()
 
-    def set_outcome(self, outcome: Outcome, value: object) -> None:
-        """Set the result of an outcome; the waiting task continues in the loop's next turn."""
-        outcome.set_result(value)
+    def set_future(self, future: AnyFuture, value: object) -> None:
+        """Set the result of a future; the waiting task continues in the loop's next turn."""
+        future.set_result(value)
 
     def __await__(self) -> Generator[Any, None, None]:
         self._waiter = self._loop.create_future()
@@ -315,8 +315,8 @@ class PlainDoorbell:
             self._waiter = None
 
 
-Outcome: TypeAlias = DirectFuture[Any] | asyncio.Future[Any]
-"""The value of :meth:`Doorbell.make_outcome` or :meth:`PlainDoorbell.make_outcome`."""
+AnyFuture: TypeAlias = DirectFuture[Any] | asyncio.Future[Any]
+"""The value of :meth:`Doorbell.make_future` or :meth:`PlainDoorbell.make_future`."""
 
 
 def make_doorbell(loop: asyncio.AbstractEventLoop) -> Doorbell | PlainDoorbell:

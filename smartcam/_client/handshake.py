@@ -1,8 +1,9 @@
 """Make a session: try new links, one after the other, until the camera answers.
 
-Each attempt sends Disconnect (harmless without a session; old sessions confuse the camera, thesis
-3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
-Query. Anything unexpected, silence included, ends the attempt, and the next one uses a new link.
+Each attempt sends Disconnect (harmless without a session; an old session confuses the camera,
+section 3.1.4 of the thesis in ``docs/sources.md``), then Connect, and awaits the answer with its
+version, the first status and the answer to a Query. Anything unexpected, silence included, ends
+the attempt, and the next one uses a new link.
 If a camera closes the connection without sending a byte, the next attempt is made without the
 Disconnect.
 If the address names no dialect, the protocol's dialects are tried in turn. Dialects that begin a
@@ -79,15 +80,15 @@ class Session(NamedTuple):
         address: address of the attempt, in which the dialect is named.
         dialect: dialect of the session.
         version: protocol version from the Connect answer.
-        early: chunks received while the session was made, in order: the first status, and any
-            other messages.
+        early_chunks: chunks received while the session was made, in order: the first status, and
+            any other messages.
     """
 
     link: Link
     address: Address
     dialect: Dialect
     version: int
-    early: list[Chunk]
+    early_chunks: list[Chunk]
 
 
 @dataclass(slots=True)
@@ -97,7 +98,7 @@ class _Collector:
     Attributes:
         link: link that the chunks come from.
         max_bytes: largest number of bytes that may come until there is a session.
-        early: the chunks received.
+        early_chunks: the chunks received.
         version: protocol version in the answer to Connect.
         statuses: number of statuses.
         answers: number of answers to Query, successful or not.
@@ -106,7 +107,7 @@ class _Collector:
 
     link: Link
     max_bytes: int
-    early: list[Chunk] = field(default_factory=list[Chunk])
+    early_chunks: list[Chunk] = field(default_factory=list[Chunk])
     version: int | None = None
     statuses: int = 0
     answers: int = 0
@@ -119,7 +120,7 @@ class _Collector:
             raise RemoteProtocolError(
                 f"{received} bytes came before there was a session; {self.max_bytes} are accepted"
             )
-        self.early.append(chunk)
+        self.early_chunks.append(chunk)
         dialect = self.link.machine.dialect
         for event in chunk.events:
             match event:
@@ -183,7 +184,7 @@ class _Collector:
             machine.adopt((without_status if unanswered else with_status)[0])
         else:
             machine.adopt(machine.candidates[0])
-        for chunk in self.early:
+        for chunk in self.early_chunks:
             chunk.events[:] = [
                 machine.dialect.reinterpret_status(event, first_dialect)
                 if isinstance(event, StatusReport)
@@ -270,7 +271,7 @@ async def attempt(
         logger.warning("%s ! %s", name, dialect.remark)
     if (address.dialect, address.quirks) != (dialect.name, dialect.quirks):
         address = address._replace(dialect=dialect.name, quirks=dialect.quirks)
-    return Session(link, address, dialect, collector.version, collector.early)
+    return Session(link, address, dialect, collector.version, collector.early_chunks)
 
 
 def dialect_groups(address: Address) -> list[tuple[Dialect, ...]]:
@@ -285,23 +286,23 @@ def _dialect_groups(protocol: Protocol, address: Address) -> list[tuple[Dialect,
 
 
 def _groups_for_layout(
-    tries: list[tuple[Dialect, ...]], layout: Layout | None
+    groups: list[tuple[Dialect, ...]], layout: Layout | None
 ) -> list[tuple[Dialect, ...]]:
     """Return the dialects that can use a layout, in their groups.
 
     Raises:
         ConfigurationError: no group can use the layout.
     """
-    groups: list[tuple[Dialect, ...]] = []
+    usable: list[tuple[Dialect, ...]] = []
     first_error: ConfigurationError | None = None
-    for dialects in tries:
+    for dialects in groups:
         try:
-            groups.append(tuple(dialect.for_layout(layout) for dialect in dialects))
+            usable.append(tuple(dialect.for_layout(layout) for dialect in dialects))
         except ConfigurationError as exc:
             first_error = first_error or exc
-    if first_error is not None and not groups:
+    if first_error is not None and not usable:
         raise first_error
-    return groups
+    return usable
 
 
 def dialect_remarks(address: Address) -> set[str]:
@@ -346,21 +347,21 @@ async def establish(
     groups = _groups_for_layout(_dialect_groups(protocol, address), layout)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + settings.connect_timeout
-    tries: list[Attempt] = []
+    attempts: list[Attempt] = []
     cause: BaseException | None = None
     disconnect_first = True
-    round_tries: list[Attempt] = []
+    round_attempts: list[Attempt] = []
     for rounds_left in range(settings.connect_attempts, 0, -1):
         if isinstance(cause, CommandRejectedError):
             break  # the camera refused, and would refuse again
-        round_tries = []
+        round_attempts = []
         round_end = loop.time() + (deadline - loop.time()) / rounds_left
         is_detecting = len(groups) > 1 and rounds_left == settings.connect_attempts > 1
         for position, dialects in enumerate(groups):
             begun_at, untried_count = loop.time(), len(groups) - position
             progress = Attempt(dialect_names(dialects), transport.value)
-            tries.append(progress)
-            round_tries.append(progress)
+            attempts.append(progress)
+            round_attempts.append(progress)
             try:
                 async with asyncio.timeout_at(round_end) as limit:
                     progress.on_step = _step_timer(
@@ -383,18 +384,18 @@ async def establish(
             if progress.hung_up:
                 # perhaps because of the Disconnect, so only every other attempt sends it
                 disconnect_first = not disconnect_first
-            logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
+            logger.debug("%s ! attempt %d: %s", settings.name, len(attempts), progress)
             if progress.step == OPENING or isinstance(cause, CommandRejectedError):
                 break  # another dialect would fail, too, in this round
             if progress.step != CONNECTING:
                 groups = [dialects]  # the camera answered the Connect, so this is its dialect
                 break
-    reason = explain(round_tries, address, protocol)
+    reason = explain(round_attempts, address, protocol)
     raise ConnectFailedError(
         f"{settings.name}: no session with {address.url}: {reason}",
         host=address.host,
         port=address.port,
-        attempts=tuple(f"attempt {number}: {tried}" for number, tried in enumerate(tries, 1)),
+        attempts=tuple(f"attempt {number}: {tried}" for number, tried in enumerate(attempts, 1)),
     ) from cause
 
 

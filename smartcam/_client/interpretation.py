@@ -64,7 +64,7 @@ MAX_NUMBER = (1 << 31) - 1
 
 
 Interpreted: TypeAlias = tuple[Any, int | None, int]
-"""A container's value, its sequence number if the layout has one, and its empty slots."""
+"""A container's value, its sequence number if the layout has one, and its number of empty slots."""
 
 
 class Numbering(NamedTuple):
@@ -84,12 +84,12 @@ class Interpretation:
 
     Args:
         spec: a value of ``interpret_as``.
-        lenient: whether any non-zero byte is a true bool.
+        lenient: whether any non-zero byte counts as True in a bool.
         y_down: whether the camera's y axis points down.
         calibration: a value of ``calibration``.
-        strict_calibration: True if the calibration was given together with ``spec``. If False, it
-            is not applied to values that never are localizations; if True, such a specification is
-            an error.
+        strict_calibration: True if the calibration was given together with ``spec``. Then a
+            ``spec`` whose values never are localizations is an error; if False, the calibration is
+            not applied to such values.
 
     Attributes:
         by_application: whether each application has its own interpreter.
@@ -113,8 +113,8 @@ class Interpretation:
         self._y_down = y_down
         self._plain_context = Context(y_down=y_down, lenient=lenient)
         self._endian = 0
-        self._reader_of_all: _ApplicationReader | None = None
-        self._by_application: dict[int, _ApplicationReader] = {}
+        self._setup_of_all: _ApplicationSetup | None = None
+        self._by_application: dict[int, _ApplicationSetup] = {}
         if hasattr(spec, "items"):
             for application, application_spec in spec.items():
                 if not isinstance(application, int):
@@ -122,27 +122,27 @@ class Interpretation:
                         f"interpret_as: a mapping goes from application id to a specification; "
                         f"{excerpt(application)} is no id"
                     )
-                self._by_application[application] = _make_reader(
+                self._by_application[application] = _make_setup(
                     resolve(application_spec, lenient=lenient), strict_calibration
                 )
         else:
-            self._reader_of_all = (
-                _raw_reader(strict_calibration)
+            self._setup_of_all = (
+                _raw_setup(strict_calibration)
                 if spec is None
-                else _make_reader(resolve(spec, lenient=lenient), strict_calibration)
+                else _make_setup(resolve(spec, lenient=lenient), strict_calibration)
             )
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None and strict_calibration:
-            if self._reader_of_all is not None:
-                self._calibrations.check(None, self._reader_of_all.interpreter)
-            for application, reader in self._by_application.items():
-                self._calibrations.check(application, reader.interpreter)
-        self.by_application: bool = self._reader_of_all is None
+            if self._setup_of_all is not None:
+                self._calibrations.check(None, self._setup_of_all.interpreter)
+            for application, setup in self._by_application.items():
+                self._calibrations.check(application, setup.interpreter)
+        self.by_application: bool = self._setup_of_all is None
 
     @property
     def layout(self) -> Layout | None:
         """Layout of every container; None if there is none, or each application has its own."""
-        return None if self._reader_of_all is None else self._reader_of_all.interpreter.layout
+        return None if self._setup_of_all is None else self._setup_of_all.interpreter.layout
 
     @property
     def applications(self) -> tuple[int, ...]:
@@ -151,46 +151,46 @@ class Interpretation:
 
     def interpreter(self, application: int | None) -> Interpreter | None:
         """Return the interpreter of an application; None for one that is not known."""
-        reader = self._reader_for(application)
-        return None if reader is None else reader.interpreter
+        setup = self._setup_for(application)
+        return None if setup is None else setup.interpreter
 
     def numbering(self, application: int | None) -> Numbering | None:
-        """Return the form of the number in this application's containers; None if there is none."""
-        reader = self._reader_of_all or self._reader_for(application)
-        return reader.numbering if reader is not None else None
+        """Return the form of an application's sequence numbers; None if it has none."""
+        setup = self._setup_of_all or self._setup_for(application)
+        return setup.numbering if setup is not None else None
 
     def numbered_layouts(self) -> str | dict[int, str] | None:
-        """Return the layouts with a number in them, in the form of ``interpret_as``."""
-        if self._reader_of_all is not None:
-            return _numbered_layout_text(self._reader_of_all)
-        texts = {key: _numbered_layout_text(reader) for key, reader in self._by_application.items()}
+        """Return the layouts with a sequence number, in the form of ``interpret_as``."""
+        if self._setup_of_all is not None:
+            return _numbered_layout_text(self._setup_of_all)
+        texts = {key: _numbered_layout_text(setup) for key, setup in self._by_application.items()}
         return {key: text for key, text in texts.items() if text is not None} or None
 
-    def number(self, container: ResultContainer, endian: int) -> int | None:
+    def sequence_number(self, container: ResultContainer, endian: int) -> int | None:
         """Return a container's sequence number; None if the layout has none or does not fit."""
-        reader = self._reader_for(container.application)
-        if reader is None or reader.interpreter.layout is None:
+        setup = self._setup_for(container.application)
+        if setup is None or setup.interpreter.layout is None:
             return None
         try:
-            return reader.interpreter.layout.sequence(container.data, byte_order(endian))
+            return setup.interpreter.layout.sequence(container.data, byte_order(endian))
         except InterpretationError:
             return None
 
-    def _reader_for(self, application: int | None) -> _ApplicationReader | None:
-        if self._reader_of_all is not None or application is None:
-            return self._reader_of_all
+    def _setup_for(self, application: int | None) -> _ApplicationSetup | None:
+        if self._setup_of_all is not None or application is None:
+            return self._setup_of_all
         return self._by_application.get(application)
 
-    def _known_reader(self, application: int) -> _ApplicationReader:
-        reader = self._reader_for(application)
-        if reader is None:
+    def _known_setup(self, application: int) -> _ApplicationSetup:
+        setup = self._setup_for(application)
+        if setup is None:
             known = sorted(self._by_application)
             raise WrongApplicationError(
                 f"a result of application {application} came; interpret_as knows {known}",
                 expected=known,
                 got=application,
             )
-        return reader
+        return setup
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
@@ -202,15 +202,15 @@ class Interpretation:
                 value into poses of the robot; then the calibration's error is chained.
             WrongApplicationError: a mapping does not know its application.
         """
-        chosen = self._reader_of_all or self._known_reader(container.application)
-        interpreter, plain_interpreter = chosen.interpreter, chosen.plain_interpreter
+        setup = self._setup_of_all or self._known_setup(container.application)
+        interpreter, plain_interpreter = setup.interpreter, setup.plain_interpreter
         data = container.data
         if container.cells is not None or container.fault is not None:
             data = _from_cells(container, interpreter)
-        if plain_interpreter is not None and not chosen.sequenced:
+        if plain_interpreter is not None and not setup.sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(plain_interpreter, data, context)
-            if self._calibrations is not None and chosen.calibrated:
+            if self._calibrations is not None and setup.calibrated:
                 value = self._calibrations.apply(value, container.application)
             return value, None, context.empty_slots
         order = byte_order(endian)
@@ -219,9 +219,9 @@ class Interpretation:
         )
         reader = Reader(data, context, interpreter.layout)
         value = run(interpreter, reader)
-        if self._calibrations is not None and chosen.calibrated:
+        if self._calibrations is not None and setup.calibrated:
             value = self._calibrations.apply(value, container.application)
-        sequence = run_sequence(interpreter, reader) if chosen.sequenced else None
+        sequence = run_sequence(interpreter, reader) if setup.sequenced else None
         return value, sequence, context.empty_slots
 
     def _context(
@@ -251,19 +251,19 @@ class Interpretation:
         Return None if the containers must be interpreted singly: the interpreter uses a Reader, a
         sequence number must be read, or a container does not fit.
         """
-        chosen = self._reader_for(application)
+        setup = self._setup_for(application)
         if (
-            chosen is None
-            or chosen.plain_interpreter is None
-            or chosen.sequenced
+            setup is None
+            or setup.plain_interpreter is None
+            or setup.sequenced
             or endian not in _BYTE_ORDERS
         ):
             return None
         context = self._context(application, endian, camera, number, at)
         try:
-            values = chosen.plain_interpreter.read_all(payloads, context)
+            values = setup.plain_interpreter.read_all(payloads, context)
             complete = len(values) == len(payloads)
-            if self._calibrations is not None and chosen.calibrated:
+            if self._calibrations is not None and setup.calibrated:
                 # one by one, so that a value does not depend on the others in its last bits
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
@@ -303,7 +303,7 @@ class _Calibrations:
 
         Args:
             application: id of the application whose results are read; None: any.
-            interpreter: reader of these results.
+            interpreter: interpreter of these results.
 
         Raises:
             ConfigurationError: the calibration applies to no value.
@@ -313,11 +313,12 @@ class _Calibrations:
         if known is not None:
             if application is not None and application not in known:
                 raise ConfigurationError(
-                    f"calibration: expected one{of}, or None to leave its values as they are; "
+                    f"calibration: expected a calibration{of}, or None to leave its values as they "
+                    f"are; "
                     f"the mapping has {sorted(known)}"
                 )
             given = [*known.values()] if application is None else [known[application]]
-        name = name_without_poses(interpreter)
+        name = name_if_poseless(interpreter)
         if name is not None and None not in given:
             raise ConfigurationError(
                 f"calibration: expected results{of} to be localizations, as with "
@@ -412,7 +413,7 @@ _WITHOUT_POSES = ("raw", "record", "strings50", "table")
 """Built-in interpreters whose values never are localizations."""
 
 
-def name_without_poses(interpreter: Interpreter) -> str | None:
+def name_if_poseless(interpreter: Interpreter) -> str | None:
     """Return the interpreter's name if its values never are localizations, else None."""
     # exactly the built-in types, since a subclass may return any value
     names = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
@@ -444,11 +445,11 @@ def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class _ApplicationReader:
-    """The reader of one application's containers.
+class _ApplicationSetup:
+    """How one application's containers are interpreted.
 
     Attributes:
-        interpreter: reader of the containers.
+        interpreter: interpreter of the containers.
         plain_interpreter: the interpreter if it needs only the bytes, else None.
         sequenced: whether the interpreter may report a sequence number.
         numbering: form of the sequence number in the layout; None if it has none.
@@ -463,17 +464,17 @@ class _ApplicationReader:
 
 
 @functools.cache
-def _raw_reader(own: bool) -> _ApplicationReader:
-    """Return the reader of raw bytes, the same for all clients without a specification."""
-    return _make_reader(resolve(None), own)
+def _raw_setup(strict_calibration: bool) -> _ApplicationSetup:
+    """Return the setup for raw bytes, the same for all clients without a specification."""
+    return _make_setup(resolve(None), strict_calibration)
 
 
-def _numbered_layout_text(reader: _ApplicationReader) -> str | None:
-    layout = reader.interpreter.layout
-    return None if reader.numbering is None or layout is None else layout.text
+def _numbered_layout_text(setup: _ApplicationSetup) -> str | None:
+    layout = setup.interpreter.layout
+    return None if setup.numbering is None or layout is None else layout.text
 
 
-def _make_reader(interpreter: Interpreter, own: bool) -> _ApplicationReader:
+def _make_setup(interpreter: Interpreter, strict_calibration: bool) -> _ApplicationSetup:
     layout = interpreter.layout
     sequenced = type(interpreter).sequence is not Interpreter.sequence
     field = layout.sequence_field if layout is not None else None
@@ -481,10 +482,10 @@ def _make_reader(interpreter: Interpreter, own: bool) -> _ApplicationReader:
     if layout is not None and field is not None and field.wire.high is not None:
         always = field in layout.head or layout.repeat is None
         numbering = Numbering(min(field.wire.high, MAX_NUMBER), always)
-    return _ApplicationReader(
+    return _ApplicationSetup(
         interpreter,
         as_plain_interpreter(interpreter),
         sequenced or field is not None,
         numbering,
-        own or name_without_poses(interpreter) is None,
+        strict_calibration or name_if_poseless(interpreter) is None,
     )

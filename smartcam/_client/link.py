@@ -21,7 +21,7 @@ from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.doorbell import make_doorbell, wake
-from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed, second_socket
+from smartcam._datagrams import MAX_DATAGRAM_BYTES, limit_read_size, second_socket
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
@@ -144,9 +144,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     Attributes:
         loop: the event loop that the link is used in.
-        outcome: function that makes a future for which one task waits, and which the receive task
-            or another one sets.
-        wake_in_order: function that makes the callers of this delivery continue after subscribers.
+        make_future: function that makes a future for which one task waits, and which the receive
+            task or another one sets.
+        wake_after_subscribers: function by which the tasks whose answers came in this delivery
+            continue only after the subscribers.
         trace: trace of the link's frames; None if neither an observer nor the log wants them.
         last_byte_at: loop time of the last byte received.
     """
@@ -173,7 +174,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             "_transport",
         ),
         *("_writable", "deliveries", "last_byte_at", "host", "loop", "machine", "name"),
-        *("outcome", "port", "trace", "wake_in_order"),
+        *("make_future", "port", "trace", "wake_after_subscribers"),
     )
 
     def __init__(
@@ -211,8 +212,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._busy_since: float | None = None
         self._busy_frames = 0
         self._doorbell = bell = make_doorbell(self.loop)  # doorbell of the receive task
-        self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.make_outcome
-        self.wake_in_order: Callable[[], None] = bell.wake_in_order
+        self.make_future: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.make_future
+        self.wake_after_subscribers: Callable[[], None] = bell.wake_after_subscribers
         self._closed = False
         self._close_waiters: list[
             asyncio.Future[None]
@@ -369,11 +370,11 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._transport = transport
         self._loop_links.open += 1
         if self._is_udp:
-            read_no_more_than_needed(transport)
+            limit_read_size(transport)
             self._direct_socket = second_socket(transport)
         sock = transport.get_extra_info("socket")
         if sock is not None and not self._is_udp:
-            # the camera sets it, too, and its manual recommends it (SC manual p. 40: published)
+            # the camera sets it, too, and its manual recommends it (SC manual p. 40)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._liveness_timeout is not None:
                 for option in _keep_alive_options(self._liveness_timeout):

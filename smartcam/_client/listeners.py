@@ -28,9 +28,9 @@ class Listeners:
         observers: observers that get everything.
 
     Attributes:
-        results: subscriptions to results.
-        statuses: subscriptions to statuses.
-        events: subscriptions to events.
+        results: subscribers' streams of results.
+        statuses: subscribers' streams of statuses.
+        events: subscribers' streams of events.
         has_result_observer: True if an observer handles results.
         may_have_waiters: True if :meth:`next_result` was called after the last result; the caller
             may have gone since.
@@ -53,7 +53,7 @@ class Listeners:
         self.may_have_waiters: bool = False
 
     def streams(self) -> list[Queue[Any]]:
-        """Return every subscription that is still referred to."""
+        """Return every stream that is still referred to."""
         return [*self.results, *self.statuses, *self.events]
 
     def next_result(self) -> asyncio.Future[Result]:
@@ -64,7 +64,7 @@ class Listeners:
         return future
 
     @property
-    def only_streams_results(self) -> bool:
+    def results_only_streamed(self) -> bool:
         """True if results go to streams, and no caller waits for the next one."""
         return self._has_result_streams and not self._has_waiters
 
@@ -94,7 +94,7 @@ class Listeners:
 
     @property
     def needs_polling(self) -> bool:
-        """True if an open subscription to statuses or events needs the status to be polled."""
+        """True if an open stream of statuses or events needs the status to be polled."""
         streams: list[Queue[Any]] = [*self.statuses, *self.events]
         return any(not stream.ended for stream in streams)
 

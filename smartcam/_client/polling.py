@@ -1,4 +1,4 @@
-"""Request the status repeatedly while it is needed, if the camera does not send it (``bid``).
+"""Request the status repeatedly while it is needed, if the dialect does not send it (``bid``).
 
 One timer runs while a trigger or a wait for a status is pending, or while statuses or events are
 subscribed to. It sends a request only if no request for the status is open; an
@@ -46,7 +46,7 @@ class Polling:
     _answer_timeout: float  # seconds
 
     def __post_init__(self) -> None:
-        self._running = False
+        self._needs_polling = False
         self._trigger_is_pending = False
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0  # time at which the timer fires; a timer of uvloop does not have it
@@ -55,19 +55,19 @@ class Polling:
 
     def begin_session(self) -> None:
         """Begin to request the status, if the dialect does not send it by itself."""
-        self._running = self._connection.features.polled
+        self._needs_polling = self._connection.features.polled
         self._open_since = 0.0
         self._last_status_count = -1
         self.poll_soon()
 
     def end_session(self) -> None:
         """Stop requesting the status."""
-        self._running = False
+        self._needs_polling = False
         self._stop()
 
     def poll_soon(self) -> None:
         """Request the status now, and then repeatedly, since a task needs it."""
-        if not self._running:
+        if not self._needs_polling:
             return
         loop = self._connection.loop
         if self._timer is not None and self._timer_at - loop.time() <= PERIOD:
@@ -76,7 +76,7 @@ class Polling:
         self._set_timer(0.0)
 
     def begin_trigger(self, request_count: int) -> None:
-        """Note that a trigger is pending, which needs the status.
+        """Record that a trigger is pending, which needs the status.
 
         Args:
             request_count: number of requests for the status that were sent with the trigger.
@@ -87,7 +87,7 @@ class Polling:
         self.poll_soon()
 
     def end_trigger(self) -> None:
-        """Note that no trigger is pending any more."""
+        """Record that no trigger is pending any more."""
         self._trigger_is_pending = False
 
     def _stop(self) -> None:
@@ -110,7 +110,9 @@ class Polling:
             or self._is_silence_allowed
         ):
             self._last_status_count, self._open_since = status_count, now
-        elif self._connection.features.ordered and now - self._open_since >= self._answer_timeout:
+        elif (
+            self._connection.features.keeps_order and now - self._open_since >= self._answer_timeout
+        ):
             open_for = shown_time(now - self._open_since, coarse=True)
             silence = f"no status within {open_for} of being asked for"
             link.give_up(ResponseTimeoutError(f"{self._connection.name}: {silence}"))

@@ -51,8 +51,8 @@ class Requests:
     _waits: Waits
     _state: CameraState
     # seconds that an answer may take before the link is given up, also after a caller's deadline
-    patience: float
-    _switch_patience: float  # seconds that the answer to a switch may take
+    answer_timeout: float
+    _switch_timeout: float  # seconds that the answer to a switch may take
 
     def __post_init__(self) -> None:
         self.name: str = self._connection.name
@@ -80,7 +80,7 @@ class Requests:
         Args:
             message: the message.
             deadline: loop time.
-            answered: False for an unnamed message that is not answered.
+            answered: False if the camera answers messages of this class, but not this one.
 
         Raises:
             ResponseTimeoutError: the camera takes no bytes.
@@ -152,11 +152,13 @@ class Requests:
     async def exchange(
         self, message: m.Message, key: type[m.Message] | int, deadline: float
     ) -> m.Message:
-        """Send a request and return the answer registered under ``key``; as :meth:`ask`.
+        """Send a request and return its answer, as :meth:`ask` does.
+
+        ``key``: the answer's type; its id for a message that the dialect does not know.
 
         Raises:
-            ResponseTimeoutError: the answer did not come. It stays pending if it may still come; if
-                it is overdue, too, the link is given up.
+            ResponseTimeoutError: the answer did not come. It stays pending, since it may still
+                come; if ``request_timeout`` is over as well, the link is given up.
         """
         if self.is_free(key):  # same effect as post(), without a coroutine
             answer = self._send(message, key, deadline)
@@ -189,7 +191,7 @@ class Requests:
     def is_free(self, key: type[m.Message] | int) -> bool:
         """Return True if no answer of this kind is pending, and no such request waits in line."""
         waits = self._waits
-        any_pending = waits.pending_answers or waits.fences_open
+        any_pending = waits.pending_answers or waits.trigger_queries_open
         return not ((any_pending and waits.is_pending(key)) or self._locks[key].locked())
 
     async def await_turn(
@@ -229,23 +231,23 @@ class Requests:
     def _register_answer(
         self, link: Link, key: type[m.Message] | int, deadline: float
     ) -> PendingAnswer:
-        patience = self._switch_patience if key is m.SwitchAnswer else self.patience
+        timeout = self._switch_timeout if key is m.SwitchAnswer else self.answer_timeout
         now = link.loop.time()
-        due = now + patience
+        due = now + timeout
         self._due[key] = max(deadline, due)
-        return self._waits.next_answer(key, link.loop, now, after_delivery=link.deliveries)
+        return self._waits.expect_answer(key, link.loop, now, after_delivery=link.deliveries)
 
     # ------------------------------------------------------------------ Query and status
 
-    async def fence(self, deadline: float) -> None:
+    async def round_trip(self, deadline: float) -> None:
         """Wait for the answer to a Query: all that the camera sent before is received then."""
         await self.await_pending(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline)
 
-    def expect_fences(self, count: int, sent_at: float, deadline: float) -> None:
-        """Note that Queries were sent with a trigger; no task waits for their answers."""
-        self._waits.fences_open = count
-        due = sent_at + self.patience
+    def expect_query_answers(self, count: int, sent_at: float, deadline: float) -> None:
+        """Record that Queries were sent with a trigger; no task waits for their answers."""
+        self._waits.trigger_queries_open = count
+        due = sent_at + self.answer_timeout
         # max() takes twenty times as long
         self._due[m.QueryAnswer] = due if due > deadline else deadline  # noqa: FURB136
 
@@ -268,7 +270,7 @@ class Requests:
             return False
         features = self._connection.features
         # the status is requested, too; over UDP a pending answer to an earlier request may be lost
-        if features.polled and not (features.ordered and self._state.status_is_pending):
+        if features.polled and not (features.keeps_order and self._state.status_is_pending):
             self.ask_status()
         self._connection.require_link().send(m.Query())
         self.register_answer(m.QueryAnswer, deadline)
@@ -278,7 +280,7 @@ class Requests:
         """Send a Query after a switch by others, as soon as no earlier Query is open."""
         with contextlib.suppress(SmartCamError):  # the link is over: the receive task reports it
             if self.ask_sign_of_life(asyncio.get_running_loop().time()):
-                self._state.clear_active_doubt()
+                self._state.clear_application_doubt()
 
     def is_done(self, request: type[m.Message], answer: m.Acknowledgement) -> bool:
         """Return True if an answer is a success, so that :meth:`check` would not raise."""
@@ -328,7 +330,7 @@ class Requests:
         """
         if not answer.done():
             link = self._connection.require_link()
-            waiter: Waiter = link.outcome()
+            waiter: Waiter = link.make_future()
             answer.waiters.append(waiter)
             timer = None  # of several waits at the same time, only the first uses the shared timer
             if self._timed_waiter is None:

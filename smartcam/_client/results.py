@@ -103,8 +103,8 @@ class Results:
         self.correlation: Correlation = Correlation(random.random())  # noqa: S311
         self.input_in_doubt: bool = False
         self._pending: PendingTrigger | None = None
-        # interpretation that reads the numbers in results; None until a trigger had a number
-        self._numbering: Interpretation | None = None
+        # reads the sequence numbers in results; None until a trigger had a number
+        self._number_reader: Interpretation | None = None
         self._warned_extra = self._warned_others = False
         self._lossy = False  # whether a message may arrive twice or be lost (UDP)
         self._timer = DeadlineTimer(weak_callback(self, Results._time_out))
@@ -112,21 +112,21 @@ class Results:
     def _time_out(self) -> None:
         self.give_up(TimeoutError())
 
-    def begin_session(self, *, ordered: bool, complete: bool) -> None:
+    def begin_session(self, *, keeps_order: bool, gets_every_status: bool) -> None:
         """Begin a session.
 
         Args:
-            ordered: messages come in order and none is lost (TCP).
-            complete: every change of the status is sent, too.
+            keeps_order: messages come in order and none is lost (TCP).
+            gets_every_status: every change of the status is sent, in order.
         """
         self._warned_extra = self._warned_others = False
-        self._lossy = not ordered
-        self.correlation.begin_session(complete=complete)
+        self._lossy = not keeps_order
+        self.correlation.begin_session(gets_every_status=gets_every_status)
 
     def fail(self, error: SmartCamError) -> None:
         """End the session and the running trigger.
 
-        The trigger's results are owed, since they may still arrive in the next session.
+        The camera may still send the trigger's results in the next session; then they are late.
         """
         if self._pending is not None:
             self.give_up(copy_to_raise(error))
@@ -152,15 +152,15 @@ class Results:
         return None
 
     def begin_trigger(self, pending: PendingTrigger, deadline: float) -> None:
-        """Note that a trigger is sent; its results are late after ``deadline`` (loop time)."""
+        """Record that a trigger is sent; its results are late after ``deadline`` (loop time)."""
         self._pending = pending
         self._timer.set(deadline)
         if pending.number is not None:
-            self._numbering = pending.interpretation
+            self._number_reader = pending.interpretation
         self.correlation.begin_trigger(pending)
 
     def end_trigger(self) -> None:
-        """Note that the trigger's caller no longer waits."""
+        """Record that the trigger's caller no longer waits."""
         pending, self._pending = self._pending, None
         if pending is not None and pending.unproven:
             pending.ended = True
@@ -177,7 +177,7 @@ class Results:
             self._release_unproven(pending)
 
     def note_input_sent(self) -> None:
-        """Note that input data was sent with the trigger; the camera may not have used it."""
+        """Record that input data was sent with the trigger; the camera may not have used it."""
         self.input_in_doubt = True
 
     # ------------------------------------------------------------------ received messages
@@ -187,13 +187,13 @@ class Results:
         self.input_in_doubt = False
         self.correlation.forget_owed()
 
-    def on_query_answer(self, now: float) -> None:
-        """Note that the Query that was sent with the last trigger is answered."""
-        self.correlation.on_query_answer()
+    def on_trigger_query_answer(self, now: float) -> None:
+        """Record that the Query that was sent with the last trigger is answered."""
+        self.correlation.on_trigger_query_answer()
         self._decide(now)
 
     def on_trigger_answer(self, now: float) -> None:
-        """Note that the last trigger was acknowledged."""
+        """Record that the last trigger was acknowledged."""
         self.correlation.on_trigger_answer()
         self._decide(now)
 
@@ -206,8 +206,9 @@ class Results:
             self._fail(
                 pending,
                 OvertriggeredError(
-                    f"{self._name}: it cannot be told whose the result is: something else has "
-                    "triggered the camera at the same time, or an answer of the camera is missing"
+                    f"{self._name}: it is unknown to which trigger the result belongs: something "
+                    "else has triggered the camera at the same time, or an answer of the camera is "
+                    "missing"
                 ),
             )
         else:
@@ -228,7 +229,7 @@ class Results:
         if (bits ^ old_bits) & _FAILURE_BITS:
             self._fail_by_status(bits & ~old_bits, old_bits & ~bits)
         if self.correlation.on_status(previous, bits):
-            self._note_others()
+            self._note_foreign_inspection()
         if self._pending is not None:
             self._decide(now)
 
@@ -243,7 +244,7 @@ class Results:
         elif risen & Status.OVERTRIGGERED:
             error = OvertriggeredError(
                 f"{self._name}: the camera dropped a trigger while ours was under way; "
-                "it cannot be told whose trigger"
+                "it is unknown whether it dropped ours"
             )
         elif risen & Status.INPUT_CONTAINER and pending.has_input:
             error = InputContainerError(
@@ -299,19 +300,19 @@ class Results:
         No result can then belong to a trigger, be owed, or count as an extra result.
         """
         correlation = self.correlation
-        needed = self._pending or self._numbering or correlation.owed or correlation.satisfied
-        return not needed and self._listeners.only_streams_results
+        needed = self._pending or self._number_reader or correlation.owed or correlation.satisfied
+        return not needed and self._listeners.results_only_streamed
 
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None if they must be passed singly.
 
         They must if a trigger or a caller of ``next_result()`` may need one of them, if a result
-        may be owed, or if a container cannot be interpreted, so that the error is an item.
+        may be owed, or if a container cannot be interpreted: streams get the error in its place.
         """
         application = burst.application
-        if self._pending or self._numbering or self.correlation.owed:
+        if self._pending or self._number_reader or self.correlation.owed:
             return None
-        if not self._listeners.only_streams_results:
+        if not self._listeners.results_only_streamed:
             return None
         if self._state.expected not in {None, application}:
             return None
@@ -355,11 +356,15 @@ class Results:
             else:
                 counters.count("wrong_application")
             return
-        numbering = self._numbering
-        number = numbering.number(container, state.endian) if numbering is not None else None
+        reader = self._number_reader
+        number = None if reader is None else reader.sequence_number(container, state.endian)
         correlation = self.correlation
-        asked = container.asked
-        match = correlation.judge(number) if asked is None else correlation.judge_marked(asked)
+        requested = container.requested
+        match = (
+            correlation.judge(number)
+            if requested is None
+            else correlation.judge_requested(requested)
+        )
         if self._lossy and match.fate == "triggered" and self._is_repeated(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:
@@ -421,23 +426,27 @@ class Results:
             owner.received += 1
             self._complete(owner, now)
 
-    def take_usual_round(self, container: m.ResultContainer) -> PendingTrigger | None:
-        """Return the running trigger if a container between the trigger's answers is its result.
+    def match_usual_exchange(self, container: m.ResultContainer) -> PendingTrigger | None:
+        """Return the running trigger if a container between its Queries' answers is its result.
 
-        The answers are noted then, and the caller passes the container to :meth:`deliver`. None if
-        the answers do not suffice for the decision, or if the trigger already has a result.
+        Then the answers are recorded, and the caller passes the container to :meth:`deliver`. None
+        if the answers do not suffice for the decision, or if the trigger already has a result.
         """
         pending = self._pending
         if pending is None or pending.ended or pending.outcome.done() or pending.received:
             return None
-        if self._lossy or self._numbering is not None or container.asked is not None:
+        if self._lossy or self._number_reader is not None or container.requested is not None:
             return None
         expected = self._state.expected
         if expected is None:
             expected = pending.application
         if expected is not None and expected != container.application:
             return None
-        if pending.unproven or pending.given_up or not self.correlation.note_usual_round(pending):
+        if (
+            pending.unproven
+            or pending.given_up
+            or not self.correlation.note_usual_exchange(pending)
+        ):
             return None
         return pending
 
@@ -456,7 +465,7 @@ class Results:
                 self._name,
             )
 
-    def _note_others(self) -> None:
+    def _note_foreign_inspection(self) -> None:
         self._counters.note_foreign_inspection()
         if not self._warned_others:
             self._warned_others = True

@@ -25,7 +25,7 @@ BUSY_PAUSE = 0.02
 """Seconds until a request that the camera was too busy to handle is repeated."""
 
 
-def is_ready(status: Status) -> bool:
+def runs_not_busy(status: Status) -> bool:
     """Return True if the camera is Running and not BUSY."""
     return Status.RUNNING in status and Status.BUSY not in status
 
@@ -115,7 +115,7 @@ class StatusRequests:
             TimeoutError: at ``deadline``.
         """
         features = self._connection.features
-        if not features.ordered and not features.polled:
+        if not features.keeps_order and not features.polled:
             now = asyncio.get_running_loop().time()
             with contextlib.suppress(TimeoutError):
                 return await self.wait(predicate, now + 0.5 * (deadline - now))
@@ -133,7 +133,7 @@ class StatusRequests:
             self._requests.ask_status()
             return
         try:
-            await self._requests.fence(deadline)
+            await self._requests.round_trip(deadline)
             link.send(m.Connect())
         except ResponseTimeoutError:
             pass  # the caller may have time left; keepalive detects a lost camera
@@ -151,10 +151,11 @@ class StatusRequests:
         connection, state = self._connection, self._state
         if not connection.dialect.has(m.GetStatus):
             return
+        # answers to requests from before this call end at this count
         older_count, count = state.statuses_due, state.statuses_received
         while True:
             self._requests.ask_status()
-            await self._requests.fence(deadline)
+            await self._requests.round_trip(deadline)
             if state.statuses_received > older_count:
                 return
             if state.statuses_received == count:  # a datagram may be lost
@@ -170,7 +171,7 @@ class StatusRequests:
         now = asyncio.get_running_loop().time()
         if deadline - now <= BUSY_PAUSE:
             raise ResponseTimeoutError(
-                f"{self._connection.name}: waited until the time was over for {awaited}; "
+                f"{self._connection.name}: the time is over; waited for {awaited}; "
                 f"status: {self.last}"
             )
         with contextlib.suppress(TimeoutError):  # a loss ends the pause at once

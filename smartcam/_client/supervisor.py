@@ -88,7 +88,7 @@ class Supervisor:
         self._change_event: asyncio.Event | None = None  # set at a change of the connection
         self._closing = False
         self._closed_error: ConnectionClosedError | None = None  # error for all waits after close()
-        self._end_error: SmartCamError | None = None  # reason of the end, if not this program
+        self._end_error: SmartCamError | None = None  # why the client ended without a close()
         self._is_finished = False  # whether the task has ended, and all waits with it
         self._reading = False  # whether the task reads a link, and so detects its end
         self.on_taken: Callable[[], None] | None = None
@@ -182,7 +182,7 @@ class Supervisor:
         return True
 
     def _drop_link(self) -> None:
-        """Drop the link at once, after a Disconnect, and end the task."""
+        """Send a Disconnect without waiting, drop the link, and end the task."""
         if self.session is not None:
             self.session.link.give_up(ConnectionAbortedError("closed by this side"))
         if self._task is not None and not self._reading:
@@ -224,7 +224,7 @@ class Supervisor:
             self._take_back_requested.set()
 
     def expect_restart(self, link: Link) -> None:
-        """Note that a restart was requested: the link will end without a fault."""
+        """Record that a restart was requested: the link will end without a fault."""
         self._restarting_link = link
 
     def closed_error(self) -> ConnectionClosedError:
@@ -290,15 +290,17 @@ class Supervisor:
         while True:
             is_reconnect = self.session is not None
             error = await self._run_session(session)
-            made_at = session.early[0].received_at
+            made_at = session.early_chunks[0].received_at
             restarting, self._restarting_link = self._restarting_link is session.link, None
             if self._closing or self._settings.reconnect is None:
                 return error
-            ordered = session.link.machine.transport is Transport.TCP
+            keeps_order = session.link.machine.transport is Transport.TCP
             # over UDP the loss is noticed late, by silence
             now = asyncio.get_running_loop().time()
-            is_short = (now if ordered else session.link.last_byte_at) - made_at < TAKEN_WITHIN
-            may_be_taken = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
+            is_short = (now if keeps_order else session.link.last_byte_at) - made_at < TAKEN_WITHIN
+            may_be_taken = session.dialect.exclusive and _may_be_taken(
+                error, keeps_order=keeps_order
+            )
             if is_reconnect and is_short and not self._early_loss_expected and may_be_taken:
                 taken = self._taken_error(error)
                 if self.on_taken is None:
@@ -344,8 +346,8 @@ class Supervisor:
     def _adopt_session(self, session: Session) -> None:
         is_reconnect = self.session is not None
         self.session = session
-        ordered = session.link.machine.transport is Transport.TCP
-        self._dispatch.begin_session(session.dialect, ordered=ordered)
+        keeps_order = session.link.machine.transport is Transport.TCP
+        self._dispatch.begin_session(session.dialect, keeps_order=keeps_order)
         self._commands.begin_session(session.link)
         self._counters.begin_session(session.link.machine.counters)
         event_class = Reconnected if is_reconnect else Connected
@@ -354,7 +356,7 @@ class Supervisor:
         if self._listeners.wants_changes:
             url = session.address.url
             self._listeners.publish(event_class(camera=self._name, at=datetime.now(UTC), url=url))
-        self._dispatch.dispatch_early(session.early)
+        self._dispatch.dispatch_early(session.early_chunks)
         if self._first_session is not None and not self._first_session.done():
             self._first_session.set_result(None)
         self._wake_waiters()
@@ -365,9 +367,9 @@ class Supervisor:
             try:
                 chunk = await link.receive()
             except ConnectionLostError as error:
-                return error.with_traceback(None)  # else it would refer to this task's frames
+                return error.with_traceback(None)  # else it would refer to this task's stack
             if self._listeners.has_subscribers:
-                link.wake_in_order()
+                link.wake_after_subscribers()
             self._dispatch.dispatch(chunk)
             del chunk  # free it, since the next chunk may come much later
 
@@ -404,7 +406,7 @@ class Supervisor:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause):
                 await self._take_back_requested.wait()
-        # a camera that does not answer serves no client, so from then on it counts as lost
+        # a camera that does not answer now serves no client: it is treated like a lost one
         return await self._reconnect(taken, at_once=True)
 
     async def _reconnect(self, loss: LinkError, *, at_once: bool = False) -> Session:
@@ -466,14 +468,14 @@ class Supervisor:
             changed.set()
 
 
-def _may_be_taken(error: ConnectionLostError, *, ordered: bool) -> bool:
+def _may_be_taken(error: ConnectionLostError, *, keeps_order: bool) -> bool:
     """Return True if another client may have caused the loss.
 
     On TCP the camera closes the connection of the earlier client, so only a closed connection
-    counts. Over UDP the camera falls silent. A broken frame, a fault of this program, and an
-    unreachable network or port never count.
+    counts. Over UDP the camera falls silent. Bytes that break the protocol, a fault of this
+    program, and an unreachable network or port never count.
     """
     cause = error.__cause__
     if isinstance(cause, ConnectionRefusedError):
         return False
-    return isinstance(cause, ConnectionError if ordered else (ConnectionError, TimeoutError))
+    return isinstance(cause, ConnectionError if keeps_order else (ConnectionError, TimeoutError))

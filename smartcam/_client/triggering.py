@@ -18,12 +18,12 @@ from smartcam._arguments import shown_time
 from smartcam._client.correlation import (
     EvidenceByAcknowledgement,
     EvidenceByAnswer,
-    EvidenceByFence,
+    EvidenceByRoundTrip,
     EvidenceByStatus,
     TriggerEvidence,
 )
 from smartcam._client.results import PendingTrigger
-from smartcam._client.status import is_ready
+from smartcam._client.status import runs_not_busy
 from smartcam.exceptions import (
     CameraBusyError,
     CameraFaultError,
@@ -84,16 +84,19 @@ END_TRIGGER_SHARE = 0.8
 """Share of the time until a trigger's deadline after which the client ends the trigger, on a camera
 that would not end it by itself. In the remaining time the answer arrives."""
 
-_READY_HINT = "; it does not while it inspects, and an application that runs free never does"
+_READY_HINT = (
+    "; a camera does not wait for one while it inspects, or while an application runs free"
+)
 
 
 _SHOWS_TRIGGERS_HINT = (
-    "; where it never shows that, shows_triggers=no in its URL lets results do without"
+    "; if this camera never shows that, add shows_triggers=no to its URL: then results need no "
+    "such proof"
 )
 
 _QUERY, _TRIGGER, _GET_STATUS = m.Query(), m.Trigger(), m.GetStatus()
 
-FENCED_TRIGGER = (_QUERY, _TRIGGER, _QUERY)
+TRIGGER_BETWEEN_QUERIES = (_QUERY, _TRIGGER, _QUERY)
 """The messages of a trigger if statuses alone show its outcome. The machine recognizes them by this
 one object."""
 
@@ -108,7 +111,8 @@ class TriggerRequest:
         results: number of results expected.
         wait: whether to wait until the camera accepts a trigger; otherwise a busy camera is an
             error.
-        expected: id of the application that the results must come from; None: the wanted one.
+        expected: id of the application that the results must come from; None: the application that
+            this program loaded last, if any.
     """
 
     interpretation: Interpretation
@@ -123,7 +127,7 @@ def is_stopped(status: Status) -> bool:
     return not status & (Status.RUNNING | Status.BUSY)
 
 
-def takes_trigger(status: Status) -> bool:
+def waits_for_trigger(status: Status) -> bool:
     """Return True if the camera waits for a trigger and is not BUSY."""
     return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
 
@@ -151,7 +155,7 @@ class Triggers:
         self._end_timer: asyncio.TimerHandle | None = None  # timer of the trigger under way
 
     def set_next_number(self, number: int) -> None:
-        """Note that the user has set the number of the next run."""
+        """Record that the user has set the number of the next run."""
         self._correlation.set_next_number(number)
 
     def _check_time_left(self, time_left: float, timeout: float) -> None:
@@ -169,8 +173,8 @@ class Triggers:
         if time_left < needed:
             waited = timeout - time_left
             raise ResponseTimeoutError(
-                f"{self._name}: the camera took the trigger after {waited:.3g} s of {timeout:g} s "
-                f"only, and a result takes {needed:.3g} s at least",
+                f"{self._name}: the camera was ready for the trigger only after {waited:.3g} s of "
+                f"{timeout:g} s, and its result needs at least {needed:.3g} s",
                 waited=waited,
             )
 
@@ -221,7 +225,7 @@ class Triggers:
         connection, state, correlation = self._connection, self._state, self._correlation
         features, interpretation = connection.features, request.interpretation
         expected = state.expected if request.expected is None else request.expected
-        if not self._is_ready(request, expected):
+        if not self._can_send_now(request, expected):
             await self._get_ready(request, expected, deadline)
         numbering = interpretation.numbering(state.active) if features.numbered else None
         link = connection.require_link()
@@ -232,18 +236,18 @@ class Triggers:
         pending = PendingTrigger(
             request.results,
             number,
-            EvidenceByStatus() if features.tells_all else _evidence(features),
-            link.outcome(),
+            EvidenceByStatus() if features.statuses_suffice else _evidence(features),
+            link.make_future(),
             interpretation,
             request.input_data is not None,
             now,
             datetime.now(UTC),
-            # if each application has its own interpreter, no result is read with another's layout
+            # application: any, if each has its own interpreter, so that no layout can be wrong
             request.expected if interpretation.by_application else state.active,
             [],
         )
-        messages: Sequence[m.Message] = FENCED_TRIGGER
-        if not features.tells_all or number is not None or request.input_data is not None:
+        messages: Sequence[m.Message] = TRIGGER_BETWEEN_QUERIES
+        if not features.statuses_suffice or number is not None or request.input_data is not None:
             messages = await self._prepare(pending, link, request.input_data, deadline)
             await self._await_turn(deadline)
         self._results.begin_trigger(pending, deadline)
@@ -277,16 +281,16 @@ class Triggers:
                 self._polling.end_trigger()
             self._results.end_trigger()
 
-    def _is_ready(self, request: TriggerRequest, expected: int | None) -> bool:
+    def _can_send_now(self, request: TriggerRequest, expected: int | None) -> bool:
         """Return True if :meth:`_get_ready` has certainly nothing to do."""
         correlation = self._correlation
         return (
-            self._connection.features.tells_all
+            self._connection.features.statuses_suffice
             and self._state.bits & _READY_BITS == _WAITING
             and (expected is None or expected == self._state.active)
             and request.input_data is None
             and self._doubtful_link is None
-            and not correlation.doubted
+            and not correlation.status_may_be_old
             and not correlation.owed
             and not self._commands.is_halted()
             and self._requests.is_free(m.QueryAnswer)
@@ -318,26 +322,26 @@ class Triggers:
         if self._doubtful_link is not None and self._doubtful_link is connection.link:
             await self._status.make_camera_send(deadline)
             # afterwards a status has arrived, or was lost again
-            await self._requests.fence(deadline)
+            await self._requests.round_trip(deadline)
             self._doubtful_link = None
             correlation.note_query_answered()
         interpretation = request.interpretation
         numbering = interpretation.numbering(state.active) if features.numbered else None
         # if each container has a number, it identifies older results
         numbers_suffice = numbering is not None and numbering.always
-        if correlation.doubted:  # the status may not show the earlier trigger yet
-            await self._requests.fence(deadline)
+        if correlation.status_may_be_old:  # the status may not show the earlier trigger yet
+            await self._requests.round_trip(deadline)
             correlation.note_query_answered()
         if correlation.owed or self._commands.is_halted():
             await self._settle_owed(deadline, wait=request.wait, numbers_suffice=numbers_suffice)
-        waited = False  # at most once in line with Queries, so that these do not delay it for long
+        waited = False  # wait for a turn among Queries only once: many would delay the trigger long
         while True:
             status = state.bits
             if status & _WAITS_BITS != _WAITING:
                 await self._wait_until_accepting(deadline, wait=request.wait)
             elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
-            elif features.fences and (
+            elif features.sends_queries and (
                 self._waits.is_pending(m.QueryAnswer)  # only one Query can be open
                 if waited
                 else not self._requests.is_free(m.QueryAnswer)
@@ -353,7 +357,7 @@ class Triggers:
         while True:
             if features.acknowledged and self._waits.is_pending(m.TriggerAnswer):
                 await requests.await_pending(m.TriggerAnswer, _TRIGGER, deadline)
-            elif features.fences and self._waits.is_pending(m.QueryAnswer):
+            elif features.sends_queries and self._waits.is_pending(m.QueryAnswer):
                 await requests.await_turn(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
@@ -364,14 +368,14 @@ class Triggers:
         """Write a trigger with its other messages; note the pending answers."""
         requests, features = self._requests, self._connection.features
         link.send_all(messages)
-        if features.tells_all and messages is FENCED_TRIGGER:
-            requests.expect_fences(2, pending.sent_at, deadline)
+        if features.statuses_suffice and messages is TRIGGER_BETWEEN_QUERIES:
+            requests.expect_query_answers(2, pending.sent_at, deadline)
             return
         if features.ends_triggers:
             end = pending.sent_at + END_TRIGGER_SHARE * (deadline - pending.sent_at)
             self._end_timer = link.loop.call_at(end, self._send_end_trigger, link)
-        if features.fences:
-            requests.expect_fences(messages.count(_QUERY), pending.sent_at, deadline)
+        if features.sends_queries:
+            requests.expect_query_answers(messages.count(_QUERY), pending.sent_at, deadline)
         if features.acknowledged:
             self._expect_acknowledgement(pending, deadline)
         elif pending.has_input:
@@ -385,7 +389,7 @@ class Triggers:
         """Give up a trigger at its deadline; return the error."""
         self._correlation.give_up(pending)
         # over UDP the status at the beginning of the inspection may have been lost
-        was_seen = self._connection.features.ordered or pending.evidence.begin_count
+        was_seen = self._connection.features.keeps_order or pending.evidence.begin_count
         self._doubtful_link = None if was_seen else link
         waited = max(0.0, deadline - pending.sent_at)
         arrived = f"{len(pending.results)} of {pending.wanted} results"
@@ -401,8 +405,8 @@ class Triggers:
     ) -> list[m.Message]:
         """Return the messages of a trigger; send its input data now if the camera answers that."""
         requests, features = self._requests, self._connection.features
-        asks_status = features.fences and features.polled and features.shows_triggers
-        messages: list[m.Message] = [_QUERY] if features.fences else []
+        asks_status = features.sends_queries and features.polled and features.shows_triggers
+        messages: list[m.Message] = [_QUERY] if features.sends_queries else []
         if asks_status:
             messages.append(_GET_STATUS)
         if pending.number is not None:
@@ -414,7 +418,7 @@ class Triggers:
         elif input_data is not None:
             messages.append(m.SetInput(data=input_data))
         messages.append(_TRIGGER)
-        if features.fences and features.shows_triggers:
+        if features.sends_queries and features.shows_triggers:
             messages.append(_GET_STATUS if asks_status else _QUERY)
         return messages
 
@@ -434,7 +438,7 @@ class Triggers:
                 self._requests.check(m.Trigger, reply)
             except (CommandRejectedError, UnsupportedError) as exc:
                 busy = isinstance(reply, m.Acknowledgement) and self._requests.is_busy(reply)
-                if not self._connection.features.ordered:  # perhaps an earlier trigger's answer
+                if not self._connection.features.keeps_order:  # perhaps an earlier trigger's answer
                     self._correlation.give_up(pending)
                 pending.fail(CameraBusyError(str(exc)) if busy else exc)
             except SmartCamError as exc:  # the link is over
@@ -448,7 +452,7 @@ class Triggers:
         Raises:
             WrongApplicationError: somebody else has switched; only a Query was sent.
         """
-        await self._requests.fence(deadline)  # the known status may be old
+        await self._requests.round_trip(deadline)  # the known status may be old
         active = self._state.active
         if active != expected:
             raise WrongApplicationError(
@@ -463,12 +467,12 @@ class Triggers:
         begin = asyncio.get_running_loop().time()
         end_foreign_at = math.inf  # time at which another program's trigger is ended
         if self._connection.features.ends_triggers:
-            end_foreign_at = begin + min(self._requests.patience, 0.5 * (deadline - begin))
+            end_foreign_at = begin + min(self._requests.answer_timeout, 0.5 * (deadline - begin))
         while True:
             if self._state.bits & _SYSTEM_ERROR:
                 raise self._fault_error()
             status = self._status.last
-            if takes_trigger(status):
+            if waits_for_trigger(status):
                 return
             if is_stopped(status):
                 raise NotRunningError(
@@ -486,7 +490,7 @@ class Triggers:
                     end_foreign_at = math.inf
                     await self._end_foreign_trigger(deadline)
                     continue
-                hint = _READY_HINT if is_ready(status) else ""
+                hint = _READY_HINT if runs_not_busy(status) else ""
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
                     f"{self._name}: the camera did not wait for a trigger within "
@@ -500,7 +504,7 @@ class Triggers:
         if Status.BUSY in self._status.last and not ours:
             self._send_end_trigger(self._connection.require_link())
             # afterwards no line of that trigger can be taken for the next one's
-            await self._requests.fence(deadline)
+            await self._requests.round_trip(deadline)
 
     def _fault_error(self) -> CameraFaultError:
         return CameraFaultError(f"{self._name}: the camera reports System Error")
@@ -508,18 +512,18 @@ class Triggers:
     async def _settle_owed(self, deadline: float, *, wait: bool, numbers_suffice: bool) -> None:
         """Await the owed result of an earlier trigger, or make it impossible.
 
-        Stop voids the running inspection (inferred); containers before the answer to a later Query
-        are older. On a camera without Stop this waits until the camera waits for a trigger again,
-        and for the answer to a Query. With ``numbers_suffice`` nothing is done, since sequence
-        numbers identify older results.
+        After Stop the running inspection has no result (inferred); containers before the answer to
+        a later Query are of earlier triggers. On a camera without Stop this waits until the camera
+        waits for a trigger again, and for the answer to a Query. With ``numbers_suffice`` only an
+        interrupted stop is finished, since sequence numbers identify older results.
         """
         correlation, commands = self._correlation, self._commands
         if not commands.is_halted() and (numbers_suffice or correlation.owed_fate is None):
             return
         dialect = self._connection.dialect
-        if dialect.in_order or not dialect.has(m.Stop):
+        if dialect.results_are_attributable or not dialect.has(m.Stop):
             await self._wait_until_accepting(deadline, wait=wait)
-            await self._requests.fence(deadline)
+            await self._requests.round_trip(deadline)
             correlation.forget_owed()
             return
         now = asyncio.get_running_loop().time()
@@ -531,7 +535,7 @@ class Triggers:
                 return
         if commands.is_in_run_mode:
             # if this is interrupted, the next trigger does it again
-            await commands.void_inspection(deadline)
+            await commands.discard_inspection(deadline)
         correlation.forget_owed()
 
     async def _clear_overtriggered(self, deadline: float) -> None:
@@ -564,12 +568,12 @@ def _is_not_overtriggered(status: Status) -> bool:
 
 def _evidence(features: Features) -> TriggerEvidence:
     """Return a new object for the evidence that a trigger's results need in this protocol."""
-    if not features.fences:
+    if not features.sends_queries:
         # over UDP an answer may be lost or late
-        acknowledged = features.acknowledged and features.ordered
+        acknowledged = features.acknowledged and features.keeps_order
         return EvidenceByAcknowledgement() if acknowledged else TriggerEvidence()
     if not features.shows_triggers:
-        return EvidenceByFence()
+        return EvidenceByRoundTrip()
     return EvidenceByAnswer() if features.polled else EvidenceByStatus()
 
 
@@ -579,7 +583,7 @@ def _missing_messages_text(pending: PendingTrigger) -> str:
     if pending.early_count:
         results = "1 result" if pending.early_count == 1 else f"{pending.early_count} results"
         early = f"; {results} came before the camera had shown that it took the trigger"
-    if not evidence.reached:
+    if not evidence.takes_containers:
         hint = _SHOWS_TRIGGERS_HINT if early else ""
         return f"; the camera has not shown that it took the trigger{early}{hint}"
     if not evidence.proven:
@@ -588,4 +592,4 @@ def _missing_messages_text(pending: PendingTrigger) -> str:
 
 
 def _is_decisive(status: Status) -> bool:
-    return takes_trigger(status) or is_stopped(status) or Status.SYSTEM_ERROR in status
+    return waits_for_trigger(status) or is_stopped(status) or Status.SYSTEM_ERROR in status

@@ -79,7 +79,7 @@ class Waits:
         end_reason: reason why there is no session, None while there is one.
         pending_answers: futures of answers, by the type of the answer; by id for a message that
             the dialect does not know.
-        fences_open: number of Queries that were sent with the last trigger and are not answered.
+        trigger_queries_open: number of unanswered Queries that were sent with the last trigger.
         status_waiters: callers that wait for a status, in order.
     """
 
@@ -90,16 +90,16 @@ class Waits:
         self._asked_at: dict[object, float] = {}
         # number of the last delivery before each request was sent, by the key of its answer
         self._last_delivery_before: dict[object, int] = {}
-        self.fences_open: int = 0
+        self.trigger_queries_open: int = 0
         self.status_waiters: dict[StatusWaiter, None] = {}  # a dict: each is removed in one step
 
     def begin_session(self) -> None:
         """Begin a session, without a pending request."""
         self.end_reason = None
-        self.fences_open = 0
+        self.trigger_queries_open = 0
 
     def fail(self, error: SmartCamError) -> bool:
-        """End every wait with an error, also one that begins before the next session.
+        """End every wait with an error; waits that begin before the next session raise it, too.
 
         Returns:
             True if it is the first error of this session; a later one is ignored.
@@ -114,7 +114,7 @@ class Waits:
         self.pending_answers.clear()
         self._asked_at.clear()
         self._last_delivery_before.clear()
-        self.fences_open = 0
+        self.trigger_queries_open = 0
         for waiter in self.status_waiters:
             if not waiter.outcome.done():
                 waiter.outcome.set_result(error)
@@ -122,11 +122,11 @@ class Waits:
         return True
 
     def finish(self, error: SmartCamError) -> None:
-        """Note the reason why there will be no session any more."""
+        """Record the reason why there will be no session any more."""
         self.end_reason = error
 
     def raise_end(self) -> None:
-        """Raise the reason why there is no session; return if there is one.
+        """Raise the reason why there is no session; do nothing during a session.
 
         Raises:
             LinkError: the reason why there is no session.
@@ -136,7 +136,7 @@ class Waits:
 
     # ------------------------------------------------------------------ answers
 
-    def next_answer(
+    def expect_answer(
         self,
         key: type[m.Message] | int,
         loop: asyncio.AbstractEventLoop,
@@ -144,7 +144,7 @@ class Waits:
         *,
         after_delivery: int = 0,
     ) -> PendingAnswer:
-        """Register for the next answer of this kind; an error is the future's result.
+        """Register for the next answer of this kind; an error comes as the future's result, too.
 
         Messages in the link's delivery number ``after_delivery`` or an earlier one are no answer:
         they were received before the request was sent, and wait to be dispatched.
@@ -157,30 +157,39 @@ class Waits:
         return future
 
     def pending_answer(self, key: type[m.Message] | int) -> PendingAnswer:
-        """Return the future of a pending answer (:meth:`is_pending`)."""
+        """Return the future of a pending answer (:meth:`is_pending`).
+
+        It is registered now if only an answer to a trigger's Query is pending.
+        """
         answer = self.pending_answers.get(key)
         if answer is None:
             loop = asyncio.get_running_loop()
-            answer = self.next_answer(key, loop, loop.time())
+            answer = self.expect_answer(key, loop, loop.time())
         return answer
 
     def is_pending(self, key: type[m.Message] | int) -> bool:
         """Return True if an answer of this kind is pending."""
-        return key in self.pending_answers or (key is m.QueryAnswer and self.fences_open > 0)
+        return key in self.pending_answers or (
+            key is m.QueryAnswer and self.trigger_queries_open > 0
+        )
 
-    def expect_fences(self, count: int) -> None:
-        """Note that Queries went out with a trigger; no task waits for their answers."""
-        self.fences_open = count
+    def expect_query_answers(self, count: int) -> None:
+        """Record that Queries went out with a trigger; no task waits for their answers."""
+        self.trigger_queries_open = count
 
-    def awaits_fences(self, count: int) -> bool:
+    def awaits_only_queries(self, count: int) -> bool:
         """Return True if ``count`` Queries of a trigger are open, and no task awaits anything."""
-        return self.fences_open == count and not self.pending_answers and not self.status_waiters
+        return (
+            self.trigger_queries_open == count
+            and not self.pending_answers
+            and not self.status_waiters
+        )
 
-    def count_fence_answer(self) -> bool:
+    def count_query_answer(self) -> bool:
         """Count an answer to Query for the last trigger; return False if none is expected."""
-        if not self.fences_open:
+        if not self.trigger_queries_open:
             return False
-        self.fences_open -= 1
+        self.trigger_queries_open -= 1
         return True
 
     def on_message(self, message: m.Message, now: float, delivery: int) -> None:
@@ -219,7 +228,7 @@ class Waits:
             raise outcome
         return outcome
 
-    def show_status(self, status: Status) -> None:
+    def offer_status(self, status: Status) -> None:
         """Call the predicate of every waiter with a status."""
         for waiter in tuple(self.status_waiters):
             if waiter.outcome.done():

@@ -303,7 +303,7 @@ async def _try_way(
 
 def _camera_answer(session: Session) -> CameraAnswer:
     status, application = None, None
-    for event in (event for chunk in session.early for event in chunk.events):
+    for event in (event for chunk in session.early_chunks for event in chunk.events):
         if isinstance(event, StatusReport) and status is None:
             status = event.status
         elif isinstance(event, QueryAnswer):

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from smartcam._accepting import HANDSHAKE_TIMEOUT, RESERVED_BY_CAMERAS, Acceptor, Places
-from smartcam._datagrams import read_no_more_than_needed
+from smartcam._datagrams import limit_read_size
 from smartcam.emulator._client_link import ClientLink
 from smartcam.protocols import State, Transport
 
@@ -343,7 +343,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Limit the reads of the new endpoint."""
-        read_no_more_than_needed(transport)
+        limit_read_size(transport)
 
     def _close_socket(self) -> None:
         transport, self._transport = self._transport, None

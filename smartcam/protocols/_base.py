@@ -157,7 +157,7 @@ class Dialect(ABC):
     quirks: tuple[str, ...] = ()
     shows_triggers: bool = True
 
-    in_order: ClassVar[bool] = False
+    results_are_attributable: ClassVar[bool] = False
     """True if the camera handles one request after the other, so that an answer shows that all
     earlier requests are finished and their results were sent. Also True if each result names its
     trigger, so that the order does not matter."""

@@ -162,7 +162,7 @@ class LineDialect(Dialect):
     names_application: bool = True
     make: str = ""
 
-    in_order: ClassVar[bool] = True
+    results_are_attributable: ClassVar[bool] = True
     exclusive: ClassVar[bool] = False
 
     @property
@@ -390,8 +390,8 @@ class LineMachine:
     never taken for a lost one. A line is the answer to the open request, unless a row says that the
     camera sends such a line unasked. If answers name their request, they may come in any order.
 
-    Containers that answer a Trigger have ``asked=True``, containers that come unasked
-    ``asked=False``, so that the client does not confuse them.
+    Containers that answer a Trigger have ``requested=True``, containers that come unasked
+    ``requested=False``, so that the client does not confuse them.
 
     Args:
         dialect: the dialect of the camera.
@@ -588,7 +588,7 @@ class LineMachine:
         messages = reported if isinstance(reported, tuple) else (reported,)
         if self._marks_results:
             messages = tuple(
-                replace(message, asked=is_answer)
+                replace(message, requested=is_answer)
                 if isinstance(message, m.ResultContainer)
                 else message
                 for message in messages

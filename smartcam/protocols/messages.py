@@ -177,7 +177,7 @@ class ResultContainer(Report):
         cells: the values of which ``data`` was made, if the protocol sends them as texts. The
             fields of a layout are these values, in order.
         fault: reason why the values cannot come from one inspection, None if there is none.
-        asked: True if the wire shows that the container answers a trigger of this client, the
+        requested: True if the wire shows that the container answers a trigger of this client, the
             running one or the last one that was given up; False if it answers no trigger of this
             client; None if the wire does not show it.
     """
@@ -186,7 +186,7 @@ class ResultContainer(Report):
     data: Data
     cells: tuple[CellValue, ...] | None = None
     fault: str | None = None
-    asked: bool | None = field(default=None, compare=False, repr=False)
+    requested: bool | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

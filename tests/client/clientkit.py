@@ -142,7 +142,7 @@ SOON = 5.0
 OPENING = [DISCONNECT, CONNECT, QUERY]
 """Messages that a client says first in a session."""
 
-FENCED = [QUERY, TRIGGER, QUERY]
+TRIGGER_IDS = [QUERY, TRIGGER, QUERY]
 """Messages that a client says for a trigger over TCP, in one write."""
 
 
@@ -186,8 +186,8 @@ def only(times: int, answer: Callable[[bytes], bytes]) -> Callable[[bytes], byte
     return lambda payload: b"" if next(left, None) is None else answer(payload)
 
 
-async def cancelled_at_its_fence(box: HandmadeCamera, camera: Camera) -> None:
-    """Lose a trigger's result, then cancel the next trigger while its fence is not answered.
+async def cancelled_at_its_query(box: HandmadeCamera, camera: Camera) -> None:
+    """Lose a trigger's result, then cancel the next trigger while its Query is not answered.
 
     The camera answers Query again from then on, and takes triggers without a result.
     """

@@ -6,7 +6,7 @@ from smartcam import Status
 from tests.client.inside import (
     Correlation,
     EvidenceByAnswer,
-    EvidenceByFence,
+    EvidenceByRoundTrip,
     EvidenceByStatus,
     Match,
     OwedFate,
@@ -25,21 +25,24 @@ class Line:
     """A correlation with what the rest of the client does around it.
 
     Args:
-        complete: every status comes, and in order.
+        gets_every_status: every status comes, and in order.
         polled: statuses are asked for, triggers are answered (``bid`` over TCP).
-        fenced: a Query goes out in front of a trigger, which nothing shows (``shows_triggers=no``).
+        by_round_trip: a Query is sent before a trigger, which nothing shows
+            (``shows_triggers=no``).
     """
 
     def __init__(
-        self, *, complete: bool = True, polled: bool = False, fenced: bool = False
+        self, *, gets_every_status: bool = True, polled: bool = False, by_round_trip: bool = False
     ) -> None:
-        self.is_complete = complete
+        self.is_complete = gets_every_status
         self.is_polled = polled
-        self.is_fenced = fenced
-        self.at = Correlation(chance=0.5)
-        self.at.begin_session(complete=complete)
+        self.is_by_round_trip = by_round_trip
+        self.at = Correlation(first_number_share=0.5)
+        self.at.begin_session(gets_every_status=gets_every_status)
         self.status: Status | None = None
-        self.fences_open = 0  # Queries that were written with the trigger and are not answered
+        self.trigger_queries_open = (
+            0  # Queries that were written with the trigger and are not answered
+        )
         self.numbered = False  # a trigger had a number: a container's is read
         self.cancelled = False  # the trigger's caller, who was not woken yet
         self.doubts = 0  # triggers that ended since nobody can tell which one the camera took
@@ -58,11 +61,11 @@ class Line:
         """Send a trigger; the Queries in front of it and behind it are not answered yet."""
         evidence = TriggerEvidence()
         if self.is_polled:
-            evidence, self.fences_open = EvidenceByAnswer(), 1
+            evidence, self.trigger_queries_open = EvidenceByAnswer(), 1
         elif self.is_complete:
-            evidence, self.fences_open = EvidenceByStatus(), 2
-        elif self.is_fenced:
-            evidence, self.fences_open = EvidenceByFence(), 1
+            evidence, self.trigger_queries_open = EvidenceByStatus(), 2
+        elif self.is_by_round_trip:
+            evidence, self.trigger_queries_open = EvidenceByRoundTrip(), 1
         pending = SentTrigger(wanted, number, evidence)
         self.numbered = self.numbered or number is not None
         self.results = []
@@ -112,17 +115,17 @@ class Line:
         self.look()
         if self.pending is not None and not self.pending.ended:
             self.fail("late")
-        self.fences_open = 0
+        self.trigger_queries_open = 0
         self.leave()
-        self.at.begin_session(complete=self.is_complete)
+        self.at.begin_session(gets_every_status=self.is_complete)
         self.status = None
 
     # -- what comes
 
     def answer(self) -> None:
         """A Query that was written with the trigger is answered."""
-        self.fences_open -= 1
-        self.at.on_query_answer()
+        self.trigger_queries_open -= 1
+        self.at.on_trigger_query_answer()
         self.decide()
 
     def trigger_answer(self) -> None:
@@ -173,18 +176,18 @@ class Line:
             self.returned = self.results
 
 
-def ready(*, complete: bool = True) -> Line:
+def ready(*, gets_every_status: bool = True) -> Line:
     """A camera that waits for a trigger."""
-    line = Line(complete=complete)
+    line = Line(gets_every_status=gets_every_status)
     line.hear(READY)
     return line
 
 
-def after_one(*, complete: bool = True) -> Line:
+def after_one(*, gets_every_status: bool = True) -> Line:
     """A camera that waits again behind a trigger that had its result."""
-    line = ready(complete=complete)
+    line = ready(gets_every_status=gets_every_status)
     line.send()
-    if complete:
+    if gets_every_status:
         line.answer()
         line.hear(WORKING)
         line.answer()

@@ -7,7 +7,7 @@ from smartcam._client.connection import Connection
 from smartcam._client.correlation import (
     Correlation,
     EvidenceByAnswer,
-    EvidenceByFence,
+    EvidenceByRoundTrip,
     EvidenceByStatus,
     Match,
     OwedFate,
@@ -21,5 +21,5 @@ from smartcam._client.handshake import establish
 from smartcam._client.link import MAX_CHUNK_FRAMES, Chunk, Link, LinksOfLoop, open_link, split_chunk
 from smartcam._client.requests import Requests
 from smartcam._client.results import PendingTrigger, Results
-from smartcam._client.triggering import FENCED_TRIGGER, TriggerRequest
+from smartcam._client.triggering import TRIGGER_BETWEEN_QUERIES, TriggerRequest
 from smartcam._client.waits import StatusWaiter, Waits

@@ -39,7 +39,7 @@ AT_THE_WIRE: dict[str, tuple[str, ...]] = {
         "test_close_while_a_command_of_before_still_has_the_turn_is_immediate",
         "test_debt_is_of_all_results_that_are_missing",
         "test_dialect_found_out_once_is_kept",
-        "test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
+        "test_settling_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
         "test_next_result_cancelled_in_the_same_step_takes_nothing",
         "test_only_what_another_client_can_have_caused_is_taken_for_it",
         "test_next_session_waits_for_a_command_of_before_not_for_ever",
@@ -146,7 +146,7 @@ OVER_TCP_ON_A_BUS = frozenset({"test_call_cancelled_at_any_step_leaves_a_camera_
 
 IN_TIME_OF_THEIR_OWN = frozenset(
     {
-        "test_fence_that_was_cancelled_after_its_stop_is_finished_by_the_next",
+        "test_settling_that_was_cancelled_after_its_stop_is_finished_by_the_next",
         "test_switch_cancelled_in_any_phase_leaves_a_camera_that_works",
         "test_request_cancelled_in_line_sends_nothing",
         "test_trigger_whose_turn_comes_too_late_is_not_sent",
@@ -166,7 +166,7 @@ IN_TIME_OF_THEIR_OWN = frozenset(
         "test_call_cancelled_at_any_step_leaves_a_camera_whose_state_is_known",
         "test_close_at_any_step_of_a_trigger_in_another_application_ends_it",
         "test_close_cancelled_at_any_step_leaves_nothing",
-        "test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
+        "test_settling_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
         "test_open_cancelled_at_any_step_leaves_a_camera_for_the_next",
         "test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
     }

@@ -271,7 +271,9 @@ async def test_one_event_of_a_sensor_shifts_nothing(dialect: str) -> None:
 
         box.between = sensor
         hit = one.call()
-        with pytest.raises(OvertriggeredError, match="it cannot be told whose the result is"):
+        with pytest.raises(
+            OvertriggeredError, match="it is unknown to which trigger the result belongs"
+        ):
             await shifted(one, hit)
         assert [await shifted(one) for _ in range(10)] == [False] * 10
         box.back.release()

@@ -266,7 +266,9 @@ async def test_bid_trigger_of_a_camera_that_does_not_wait_as_its_status_says_is_
             return box.said(TRIGGER, OK) + box.result_frame(b"sensor's")
 
         box.script[TRIGGER] = at_trigger
-        with pytest.raises(OvertriggeredError, match="it cannot be told whose the result is"):
+        with pytest.raises(
+            OvertriggeredError, match="it is unknown to which trigger the result belongs"
+        ):
             await camera.trigger()
         box.script[TRIGGER] = lambda _: box.said(TRIGGER, OK) + box.result_frame(b"own")
         assert (await camera.trigger()).raw == b"own"

@@ -807,7 +807,7 @@ async def test_closed_client_leaves_no_timer_of_a_trigger() -> None:
 @pytest.mark.parametrize("one_each", [True, False])
 def test_answer_of_a_trigger_and_its_result_are_never_cut_apart(one_each: bool) -> None:
     """Whoever waits for the answer would send the next trigger before the result is judged."""
-    answer, result = m.TriggerAnswer(), m.ResultContainer(application=1, data=b"x", asked=True)
+    answer, result = m.TriggerAnswer(), m.ResultContainer(application=1, data=b"x", requested=True)
     events = [m.StatusReport(status=Status(0))] * 3 + [answer, result] + [m.GetStatus()] * 3
     frames = len(events) if one_each else len(events) - 1
     first, rest = split_chunk(Chunk(0.0, [*events], frames, 1), 4)

@@ -409,7 +409,10 @@ async def test_calibration_mapping_that_lacks_the_application_raises() -> None:
     [
         (CALIBRATION, "expected results of application 5 to be localizations, .* 'record'"),
         ({7: CALIBRATION, 5: CALIBRATION}, "expected results of application 5 to be localizations"),
-        ({7: CALIBRATION}, r"expected one of application 5, or None .* the mapping has \[7\]"),
+        (
+            {7: CALIBRATION},
+            r"expected a calibration of application 5, or None .* the mapping has \[7\]",
+        ),
     ],
 )
 def test_calibration_that_does_not_go_with_the_interpreters_is_refused(

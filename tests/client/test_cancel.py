@@ -234,7 +234,7 @@ def _owe(camera: Camera) -> None:
 
 
 @pytest.mark.parametrize("dialect", ["handbook", "bid"])
-async def test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_result(
+async def test_settling_cancelled_at_any_step_leaves_the_next_trigger_its_own_result(
     dialect: str,
 ) -> None:
     async with emulator(dialect=dialect) as box, connect(box) as camera:

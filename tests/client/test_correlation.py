@@ -162,7 +162,7 @@ def test_application_that_is_stopped_ends_the_trigger() -> None:
 
 @pytest.mark.parametrize("number", [None, 41])
 def test_trigger_over_udp_needs_no_evidence(number: int | None) -> None:
-    line = ready(complete=False)
+    line = ready(gets_every_status=False)
     pending = line.send(number)
     assert line.result(number) == OURS
     assert pending.ended
@@ -184,7 +184,7 @@ def test_answers_of_a_trigger_that_is_settled_say_nothing() -> None:
 
 def polled() -> Line:
     """A camera of ``bid`` over TCP."""
-    line = Line(complete=False, polled=True)
+    line = Line(gets_every_status=False, polled=True)
     line.hear(READY)
     return line
 
@@ -272,9 +272,9 @@ def test_overtriggered_behind_the_answer_to_the_trigger_is_in_doubt(*, result: b
 def test_answer_without_a_trigger_says_nothing() -> None:
     line = polled()
     line.at.on_trigger_answer()
-    line.at.on_query_answer()
+    line.at.on_trigger_query_answer()
     pending = line.trigger()
-    assert not pending.evidence.reached
+    assert not pending.evidence.takes_containers
 
 
 def test_answer_of_the_trigger_before_says_nothing_of_the_next() -> None:
@@ -292,7 +292,7 @@ def test_answer_of_the_trigger_before_says_nothing_of_the_next() -> None:
 
 
 def test_container_behind_the_answer_in_front_is_the_triggers_where_nothing_shows_it() -> None:
-    line = Line(complete=False, fenced=True)
+    line = Line(gets_every_status=False, by_round_trip=True)
     pending = line.send()
     assert line.result() == NOBODY
     line.answer()
@@ -350,7 +350,7 @@ def test_debts_are_paid_in_the_order_of_their_triggers() -> None:
 
 
 def test_trigger_given_up_owes_the_results_that_it_has_not() -> None:
-    line = Line(complete=False)
+    line = Line(gets_every_status=False)
     line.send(wanted=3)
     line.result()
     line.give_up()
@@ -358,7 +358,7 @@ def test_trigger_given_up_owes_the_results_that_it_has_not() -> None:
 
 
 def test_container_that_came_and_was_not_read_is_not_owed() -> None:
-    line = Line(complete=False)
+    line = Line(gets_every_status=False)
     pending = line.send(wanted=2)
     line.at.give_up(pending, unread=1)
     line.leave()
@@ -389,7 +389,7 @@ def test_trigger_that_has_its_results_owes_nothing() -> None:
     line.result()
     line.give_up()
     assert line.at.owed_fate is None
-    assert not line.at.doubted
+    assert not line.at.status_may_be_old
 
 
 def test_trigger_whose_results_were_not_proven_owes_them_still() -> None:
@@ -407,23 +407,27 @@ def test_settled_means_that_nothing_of_before_can_come() -> None:
     line.trigger()
     line.give_up()
     line.at.forget_owed()
-    assert (line.at.owed_fate, line.at.doubted, line.at.judge(None).extra) == (None, False, False)
+    assert (line.at.owed_fate, line.at.status_may_be_old, line.at.judge(None).extra) == (
+        None,
+        False,
+        False,
+    )
     assert line.result() == NOBODY
 
 
-# ---------------------------------------------------------------------- doubted, and what is heard
+# ---------------------------------------------------------------------- status_may_be_old
 
 
 def test_status_is_in_doubt_behind_a_trigger_that_was_given_up_before_it_began() -> None:
     line = ready()
     line.trigger()
-    assert not line.at.doubted
+    assert not line.at.status_may_be_old
     line.give_up()
-    assert line.at.doubted
+    assert line.at.status_may_be_old
     line.hear(READY)
-    assert line.at.doubted
+    assert line.at.status_may_be_old
     line.hear(WORKING)
-    assert not line.at.doubted
+    assert not line.at.status_may_be_old
     assert line.others == 0  # it is that trigger's
 
 
@@ -431,7 +435,7 @@ def test_status_is_in_no_doubt_behind_a_trigger_that_has_begun() -> None:
     line = ready()
     line.begin()
     line.give_up()
-    assert not line.at.doubted
+    assert not line.at.status_may_be_old
 
 
 def test_debt_of_a_trigger_that_never_began_is_dropped_when_all_is_heard() -> None:
@@ -444,7 +448,7 @@ def test_debt_of_a_trigger_that_never_began_is_dropped_when_all_is_heard() -> No
     line.answer()
     line.answer()
     line.at.note_query_answered()
-    assert not line.at.doubted
+    assert not line.at.status_may_be_old
     assert [one.fate for one in line.at.owed] == ["late"]
     line.hear(WORKING)
     assert line.others == 1  # no trigger of ours is left that it could be
@@ -452,14 +456,14 @@ def test_debt_of_a_trigger_that_never_began_is_dropped_when_all_is_heard() -> No
 
 @pytest.mark.parametrize("kind", ["udp", "polled"])
 def test_debt_stays_where_not_every_status_is_told(kind: str) -> None:
-    line = ready(complete=False) if kind == "udp" else polled()
+    line = ready(gets_every_status=False) if kind == "udp" else polled()
     line.trigger() if kind == "polled" else line.send()
     if kind == "polled":
         line.hear(READY)
         line.trigger_answer()
     line.give_up()
     line.at.note_query_answered()
-    assert not line.at.doubted
+    assert not line.at.status_may_be_old
     assert line.result() == LATE
 
 
@@ -563,7 +567,7 @@ def test_first_status_of_a_session_tells_of_no_drop() -> None:
 @pytest.mark.parametrize("complete", [True, False])
 def test_second_inspection_behind_a_trigger_is_somebody_elses(*, complete: bool) -> None:
     """Nothing is told of others' inspections where a status may be lost."""
-    line = ready(complete=complete)
+    line = ready(gets_every_status=complete)
     line.begin() if complete else line.send()
     line.hear(WORKING, READY, WORKING)
     assert line.others == int(complete)
@@ -591,7 +595,7 @@ def test_somebody_elses_inspection_has_the_number_that_the_user_has_set() -> Non
 
 @pytest.mark.parametrize("complete", [True, False])
 def test_container_with_another_number_is_nobodys(*, complete: bool) -> None:
-    line = ready(complete=complete)
+    line = ready(gets_every_status=complete)
     line.begin(5000) if complete else line.send(5000)
     assert line.result(4999) == NOBODY
     assert line.result(5001) == NOBODY
@@ -623,7 +627,7 @@ def test_container_with_the_number_of_a_trigger_given_up_is_known(debt: OwedFate
 
 
 def test_containers_of_several_triggers_given_up_may_come_in_any_order() -> None:
-    line = Line(complete=False)
+    line = Line(gets_every_status=False)
     fates: list[OwedFate] = ["late", "streamed", "late"]
     for number, debt in enumerate(fates, 1):
         line.send(number * 1000)
@@ -737,10 +741,10 @@ def test_session_begins_without_doubt_and_without_answers_of_before() -> None:
     line = ready()
     pending = line.trigger()
     line.give_up()
-    assert line.at.doubted
+    assert line.at.status_may_be_old
     line.reconnect()
-    assert (line.at.doubted, line.at.judge(None).extra) == (False, False)
-    line.at.on_query_answer()
+    assert (line.at.status_may_be_old, line.at.judge(None).extra) == (False, False)
+    line.at.on_trigger_query_answer()
     line.at.on_trigger_answer()
     line.hear(READY, WORKING)
     assert (pending.evidence.begin_count, pending.evidence.proven) == (0, False)
@@ -783,12 +787,12 @@ def test_numbering_of_a_field_is_as_wide_as_it_and_the_wire(field_type: str, hig
     assert interpretation.numbering(7) == (highest, True)
     size = int(field_type.lstrip("uint")) // 8
     container = ResultContainer(application=7, data=highest.to_bytes(size, "little"))
-    assert interpretation.number(container, 0) == highest
+    assert interpretation.sequence_number(container, 0) == highest
 
 
 @pytest.mark.parametrize("highest", sorted(set(FIELDS.values())))
 def test_numbers_fit_and_do_not_come_again_soon(highest: int) -> None:
-    attribution = Correlation(chance=0.5)
+    attribution = Correlation(first_number_share=0.5)
     numbers = [attribution.take_number(highest) for _ in range(4 * FEWEST_NUMBERS)]
     assert all(0 <= number <= highest for number in numbers)
     for first in range(len(numbers) - FEWEST_NUMBERS):
@@ -818,20 +822,20 @@ def test_runs_of_others_count_away_from_the_next_number(highest: int, chance: fl
 
 
 def test_number_wraps_around_below_zero() -> None:
-    attribution = Correlation(chance=0.0)
+    attribution = Correlation(first_number_share=0.0)
     assert attribution.take_number(MAX_NUMBER) == MAX_NUMBER + 1 - NUMBER_STEP
     assert attribution.take_number(MAX_NUMBER) == MAX_NUMBER + 1 - 2 * NUMBER_STEP
 
 
 def test_number_the_user_has_set_is_taken_once() -> None:
-    attribution = Correlation(chance=0.5)
+    attribution = Correlation(first_number_share=0.5)
     attribution.set_next_number(41)
     assert attribution.take_number(MAX_NUMBER) == 41
     assert attribution.take_number(MAX_NUMBER) != 41
 
 
 def test_number_the_user_has_set_that_does_not_fit_the_field_is_not_taken() -> None:
-    attribution = Correlation(chance=0.5)
+    attribution = Correlation(first_number_share=0.5)
     attribution.set_next_number(200)
     assert 0 <= attribution.take_number(127) <= 127
     assert attribution.take_number(MAX_NUMBER) != 200
@@ -839,7 +843,7 @@ def test_number_the_user_has_set_that_does_not_fit_the_field_is_not_taken() -> N
 
 @pytest.mark.parametrize("highest", [127, MAX_NUMBER])
 def test_number_the_user_has_set_may_be_the_highest(highest: int) -> None:
-    attribution = Correlation(chance=0.5)
+    attribution = Correlation(first_number_share=0.5)
     attribution.set_next_number(highest)
     assert attribution.take_number(highest) == highest
 
@@ -894,13 +898,13 @@ def test_field_in_a_record_that_may_be_missing_does_not_always_decide() -> None:
         assert numbering == (MAX_NUMBER, always), layout
     nothing = ResultContainer(application=7, data=b"")
     missing = Interpretation("(n: int32 @sequence)*", lenient=False, y_down=False)
-    assert missing.number(nothing, 0) is None
+    assert missing.sequence_number(nothing, 0) is None
 
 
 @given(st.binary(max_size=12), st.integers(0, 3))
 def test_number_of_any_bytes_is_a_number_or_none(data: bytes, endian: int) -> None:
     layout = Interpretation("n: int16 @sequence, (x: int8)*", lenient=False, y_down=False)
-    number = layout.number(ResultContainer(application=7, data=data), endian)
+    number = layout.sequence_number(ResultContainer(application=7, data=data), endian)
     if endian > 1 or len(data) < 2:
         assert number is None
     else:

@@ -174,7 +174,7 @@ class CameraAndClient(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.camera = ModelCamera(shows=self.shows, late=self.late, bits=self.bits)
-        self.line = Line(complete=self.ordered)
+        self.line = Line(gets_every_status=self.ordered)
         self.sent = 0
         self.lefts: dict[int, list[Status | None]] = {}  # of each trigger under way
         self.taken: set[int] = set()  # triggers that the camera took
@@ -190,7 +190,7 @@ class CameraAndClient(RuleBasedStateMachine):
     @property
     def gives(self) -> bool:
         """A trigger gets its result from such a camera."""
-        return self.shows or self.line.is_fenced
+        return self.shows or self.line.is_by_round_trip
 
     @initialize(data=st.data())
     def connect(self, data: st.DataObject) -> None:
@@ -227,7 +227,7 @@ class CameraAndClient(RuleBasedStateMachine):
     @property
     def owes(self) -> bool:
         """True if an answer to a Query is open."""
-        return self.asked or self.line.fences_open > 0
+        return self.asked or self.line.trigger_queries_open > 0
 
     def say_to_camera(self, *words: Word) -> None:
         self.camera.heard += words
@@ -238,7 +238,7 @@ class CameraAndClient(RuleBasedStateMachine):
         at = self.line.at
         self.wake()
         kind = data.draw(st.sampled_from(self.kinds), "kind")
-        if at.doubted:
+        if at.status_may_be_old:
             self.round_trip(data)
             at.note_query_answered()
         if at.owed_fate is not None and kind != "number":
@@ -255,13 +255,13 @@ class CameraAndClient(RuleBasedStateMachine):
         self.number = number
         self.lefts[self.sent] = self.draw_left(data)
         self.line.send(number, data.draw(st.integers(1, min(self.results)), "wanted"))
-        fences = self.line.fences_open
-        if fences:
+        queries = self.line.trigger_queries_open
+        if queries:
             self.say_to_camera(Word("query", self.sent))
         if number is not None:
             self.say_to_camera(Word("number", self.sent, number))
         self.say_to_camera(Word("trigger", self.sent))
-        if fences > 1:
+        if queries > 1:
             self.say_to_camera(Word("query", self.sent))
 
     @precondition(lambda self: self.sensors and self.idle and self.line.status == READY)
@@ -434,7 +434,7 @@ class CameraAndClient(RuleBasedStateMachine):
         match what:
             case Container():
                 line.result(what.number if line.numbered else None, what)
-            case "answer" if line.fences_open:
+            case "answer" if line.trigger_queries_open:
                 line.answer()
             case "answer":
                 self.asked = False
@@ -516,7 +516,7 @@ class CameraAndClientThatKnowsThatNothingShows(CameraAndClientAlone):
 
     def __init__(self) -> None:
         super().__init__()
-        self.line = Line(complete=False, fenced=True)
+        self.line = Line(gets_every_status=False, by_round_trip=True)
 
 
 class CameraAndClientByNumber(CameraAndClient):
@@ -614,7 +614,7 @@ class CameraAndClientThatAnswers(CameraAndClient):
     def __init__(self) -> None:
         super().__init__()
         self.camera.polled = self.camera.latches = True
-        self.line = Line(complete=False, polled=True)
+        self.line = Line(gets_every_status=False, polled=True)
         self.unanswered = False  # a trigger
 
     @initialize(data=st.data())

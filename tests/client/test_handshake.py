@@ -114,7 +114,7 @@ async def silent(peer: Peer, number: int) -> None:
 
 
 def events(session: Session) -> list[Event]:
-    return [event for chunk in session.early for event in chunk.events]
+    return [event for chunk in session.early_chunks for event in chunk.events]
 
 
 # ---------------------------------------------------------------------- a session

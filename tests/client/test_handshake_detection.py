@@ -64,7 +64,7 @@ def statuses(session: Session) -> list[Status]:
     """Return those that came while the session was made."""
     return [
         event.status
-        for chunk in session.early
+        for chunk in session.early_chunks
         for event in chunk.events
         if isinstance(event, m.StatusReport)
     ]

@@ -25,11 +25,11 @@ from tests.client.camera_by_hand import (
     words,
 )
 from tests.client.clientkit import (
-    FENCED,
     SHORT,
     SOON,
+    TRIGGER_IDS,
     by_hand,
-    cancelled_at_its_fence,
+    cancelled_at_its_query,
     emulated,
     gone,
     quiet,
@@ -52,7 +52,7 @@ def counting(box: HandmadeCamera) -> None:
     box.script[TRIGGER] = lambda _: box.inspects(numbered(last(box)))
 
 
-def fenced(transport: str, *ids: int) -> list[int]:
+def with_queries(transport: str, *ids: int) -> list[int]:
     """Return what is said around a trigger, in one write, with what is said for it."""
     return [QUERY, *ids, QUERY] if transport == "tcp" else [*ids]
 
@@ -79,7 +79,7 @@ async def test_number_is_set_right_before_each_trigger(transport: str) -> None:
         mark = len(box.ids)
         results = [await camera.trigger(), await camera.trigger(input=b"part")]
         first, second = (NUMBER, TRIGGER), (NUMBER, INPUT, TRIGGER)
-        assert box.since(mark) == fenced(transport, *first) + fenced(transport, *second)
+        assert box.since(mark) == with_queries(transport, *first) + with_queries(transport, *second)
         assert [one.sequence for one in results] == [one.value.n for one in results]
         assert results[0].sequence != results[1].sequence == last(box)
 
@@ -106,7 +106,7 @@ async def test_late_result_of_an_earlier_number_is_known_without_stopping(transp
         assert (await following).value.part == "own"
         # over UDP the status that tells of a Stop may have been lost as well
         asked_for_status = [QUERY, CONNECT, QUERY] if transport == "udp" else []
-        assert box.since(mark) == asked_for_status + fenced(transport, NUMBER, TRIGGER)
+        assert box.since(mark) == asked_for_status + with_queries(transport, NUMBER, TRIGGER)
         assert [(await anext(results)).value.part for _ in range(4)] == ["old"] * 3 + ["own"]
         statistics = camera.statistics()
         assert (statistics.late, statistics.triggered, statistics.streamed) == (3, 1, 0)
@@ -149,7 +149,7 @@ async def test_number_the_user_has_set_is_used_once(transport: str) -> None:
         await box.wait_for(NUMBER)
         mark = len(box.ids)
         assert (await camera.trigger()).sequence == 41
-        assert box.since(mark) == fenced(transport, NUMBER, TRIGGER)
+        assert box.since(mark) == with_queries(transport, NUMBER, TRIGGER)
         assert (await camera.trigger()).sequence != 41
 
 
@@ -202,7 +202,7 @@ async def test_records_that_may_be_missing_are_settled_as_without_a_number() -> 
         box.script[TRIGGER], box.container = box._trigger, b""
         result = await camera.trigger()
         assert (list(result.value), result.sequence) == ([], None)
-        assert box.since(mark) == [STOP, QUERY, START, *fenced("tcp", NUMBER, TRIGGER)]
+        assert box.since(mark) == [STOP, QUERY, START, *with_queries("tcp", NUMBER, TRIGGER)]
 
 
 @TRANSPORTS
@@ -243,7 +243,7 @@ async def test_late_result_within_the_grace_needs_no_stop(order: str) -> None:
         late, ready = box.result_frame(b"late"), box.status_frame(READY)
         box.send(late + ready if order == "result first" else ready + late)
         assert (await triggering).raw == b"found"
-        assert box.since(mark) == FENCED
+        assert box.since(mark) == TRIGGER_IDS
         statistics = camera.statistics()
         assert (statistics.late, statistics.triggered) == (1, 1)
 
@@ -255,7 +255,7 @@ async def test_late_result_that_does_not_come_is_made_impossible_after_the_grace
         begin = loop.time()
         assert (await camera.trigger()).raw == b"found"
         assert loop.time() - begin >= 0.2
-        assert box.since(mark) == [STOP, QUERY, START, *FENCED]
+        assert box.since(mark) == [STOP, QUERY, START, *TRIGGER_IDS]
 
 
 async def test_grace_is_half_the_time_of_a_short_trigger() -> None:
@@ -265,9 +265,9 @@ async def test_grace_is_half_the_time_of_a_short_trigger() -> None:
             assert (await camera.trigger(timeout=0.2)).raw == b"found"
 
 
-async def test_fence_that_was_cancelled_after_its_stop_is_finished_by_the_next() -> None:
+async def test_settling_that_was_cancelled_after_its_stop_is_finished_by_the_next() -> None:
     async with by_hand() as (box, camera):
-        await cancelled_at_its_fence(box, camera)
+        await cancelled_at_its_query(box, camera)
         box.script[TRIGGER] = box._trigger
         paid = box.result_frame(b"late")
         box.send(paid + box.script[QUERY](b""))  # the camera has stopped
@@ -297,7 +297,7 @@ async def test_sensors_result_in_flight_is_not_the_triggers() -> None:
         assert [await anext(statuses) for _ in range(2)] == [RUNNING, READY]
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"found"
-        assert box.since(mark) == FENCED
+        assert box.since(mark) == TRIGGER_IDS
         assert [(await anext(results)).raw for _ in range(2)] == [b"sensor's", b"found"]
         assert camera.statistics().streamed == 1
 

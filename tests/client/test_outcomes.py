@@ -139,7 +139,7 @@ SILENT = answers()
 FAST: dict[str, Any] = {"reconnect": Backoff(initial=0.001, jitter=0.0)}
 BY_HAND = {
     "overtriggered": DirectFuture(
-        OvertriggeredError, "it cannot be told whose", answers(RUNNING | OVERTRIGGERED)
+        OvertriggeredError, "it is unknown whether it", answers(RUNNING | OVERTRIGGERED)
     ),
     "stopped": DirectFuture(NotRunningError, "application 7 is stopped", status=0),
     "stopped meanwhile": DirectFuture(

@@ -429,7 +429,7 @@ async def delivered(bell: Doorbell, do: Callable[[], object], heard: list[str]) 
 
 async def test_outcome_of_a_delivery_wakes_its_caller_at_once(bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: DirectFuture[str] = bell.make_outcome()
+    outcome: DirectFuture[str] = bell.make_future()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
     assert await delivered(bell, lambda: outcome.set_result("here"), heard) == ["here"]
@@ -438,12 +438,12 @@ async def test_outcome_of_a_delivery_wakes_its_caller_at_once(bell: Doorbell) ->
 
 async def test_outcome_that_is_given_wakes_its_caller_at_once(bell: Doorbell) -> None:
     heard, said = list[str](), asyncio.get_running_loop().create_future()
-    outcome: DirectFuture[str] = bell.make_outcome()
+    outcome: DirectFuture[str] = bell.make_future()
     asking = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
 
     def give() -> None:
-        bell.set_outcome(outcome, "it")
+        bell.set_future(outcome, "it")
         said.set_result([*heard])
 
     asyncio.get_running_loop().call_soon(give)
@@ -453,17 +453,17 @@ async def test_outcome_that_is_given_wakes_its_caller_at_once(bell: Doorbell) ->
 
 async def test_outcome_that_a_task_gives_wakes_its_caller_by_the_loop(bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: DirectFuture[str] = bell.make_outcome()
+    outcome: DirectFuture[str] = bell.make_future()
     asking = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
-    bell.set_outcome(outcome, "it")
+    bell.set_future(outcome, "it")
     assert heard == []
     assert await asking == "it"
 
 
 async def test_error_of_a_delivery_reaches_its_caller(bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: DirectFuture[str] = bell.make_outcome()
+    outcome: DirectFuture[str] = bell.make_future()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
     await delivered(bell, lambda: outcome.set_exception(ZeroDivisionError()), heard)
@@ -475,7 +475,7 @@ async def test_error_of_a_delivery_reaches_its_caller(bell: Doorbell) -> None:
 
 async def test_outcome_that_comes_otherwise_wakes_by_the_loop(bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: DirectFuture[str] = bell.make_outcome()
+    outcome: DirectFuture[str] = bell.make_future()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
     outcome.set_result("here")
@@ -487,7 +487,7 @@ async def test_outcome_that_comes_otherwise_wakes_by_the_loop(bell: Doorbell) ->
 @pytest.mark.parametrize("first", ["cancel", "result"])
 async def test_cancelled_caller_of_an_outcome_is_cancelled_once(first: str, bell: Doorbell) -> None:
     heard = list[str]()
-    outcome: DirectFuture[str] = bell.make_outcome()
+    outcome: DirectFuture[str] = bell.make_future()
     caller = asyncio.create_task(ask(outcome, heard))
     await asyncio.sleep(0)
 

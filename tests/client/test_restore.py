@@ -21,10 +21,10 @@ from smartcam import (
 from tests.client.camera_by_hand import QUERY, READY, RUNNING, START, STOP, SWITCH, TRIGGER
 from tests.client.clientkit import (
     FAST,
-    FENCED,
     OPENING,
     SHORT,
     SOON,
+    TRIGGER_IDS,
     by_hand,
     gone,
     lose_and_come_back,
@@ -117,7 +117,7 @@ async def test_restore_with_nothing_wanted_changes_nothing() -> None:
 async def test_restore_has_nothing_to_do_in_the_first_session() -> None:
     async with by_hand(application=7, restore=True, reconnect=FAST) as (box, camera):
         await camera.trigger()
-        assert box.ids == [*OPENING, QUERY, *FENCED]
+        assert box.ids == [*OPENING, QUERY, *TRIGGER_IDS]
 
 
 async def test_wait_connected_waits_for_what_is_restored() -> None:
@@ -212,7 +212,7 @@ async def test_command_waits_for_going_back_in_the_next_session() -> None:
     async with lost_inside(3) as (box, camera):
         await until(lambda: camera.connected)
         assert (await camera.trigger()).application == 7
-        assert box.ids[-3:] == FENCED
+        assert box.ids[-3:] == TRIGGER_IDS
 
 
 async def test_trigger_in_another_application_that_is_lost_is_gone_back_from() -> None:
@@ -326,7 +326,7 @@ async def test_result_of_the_lost_session_that_never_comes_is_made_impossible() 
         await gone(triggering)
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"found"
-        assert box.since(mark) == [STOP, QUERY, START, *FENCED]
+        assert box.since(mark) == [STOP, QUERY, START, *TRIGGER_IDS]
 
 
 async def test_result_of_the_lost_session_is_not_taken_by_next_result() -> None:
@@ -342,7 +342,7 @@ async def test_result_of_the_lost_session_is_not_taken_by_next_result() -> None:
         assert (await following).raw == b"new"
 
 
-async def test_fence_that_a_loss_interrupted_leaves_no_stopped_camera() -> None:
+async def test_settling_that_a_loss_interrupted_leaves_no_stopped_camera() -> None:
     async with by_hand(reconnect=FAST) as (box, camera):
         script = dict(box.script)
         box.script |= {TRIGGER: box.takes, START: quiet}

@@ -38,7 +38,7 @@ from tests.client.camera_by_hand import (
     WAITING,
     HandmadeCamera,
 )
-from tests.client.clientkit import FENCED, SHORT, balance, by_hand, cancelled, emulated, steps
+from tests.client.clientkit import SHORT, TRIGGER_IDS, balance, by_hand, cancelled, emulated, steps
 from tests.client.inside import Chunk
 from tests.handmade import until
 from tests.insides import inside
@@ -471,7 +471,7 @@ class Story:
         box, heard = self.box, self.camera.statistics().frames_received
         box.script[TRIGGER] = lambda _: box.inspects()  # its result comes later
         task = asyncio.create_task(self.camera.trigger(timeout=60))
-        await until(lambda: box.ids[-3:] == FENCED and box.status == READY)
+        await until(lambda: box.ids[-3:] == TRIGGER_IDS and box.status == READY)
         await until(lambda: self.camera.statistics().frames_received >= heard + 4)
         await cancelled(task)
         self.owed = True

@@ -49,12 +49,12 @@ from tests.client.camera_by_hand import (
     HandmadeCamera,
 )
 from tests.client.clientkit import (
-    FENCED,
     SHORT,
+    TRIGGER_IDS,
     balance,
     by_hand,
     cancelled,
-    cancelled_at_its_fence,
+    cancelled_at_its_query,
     emulated,
     gone,
     only,
@@ -211,7 +211,7 @@ async def test_trigger_of_a_camera_busy_for_ever_times_out() -> None:
 
 async def test_trigger_of_a_free_running_application_says_so() -> None:
     async with by_hand(box={"status": RUNNING}) as (box, camera):
-        with pytest.raises(TriggerTimeoutError, match="an application that runs free never does"):
+        with pytest.raises(TriggerTimeoutError, match="or while an application runs free"):
             await camera.trigger(timeout=SHORT)
         assert TRIGGER not in box.ids
 
@@ -269,7 +269,7 @@ async def test_trigger_whose_turn_comes_too_late_is_not_sent(takes: float, neede
         await asyncio.sleep(4.96 if takes < 1 else 4.0)
         box.send(box.result_frame() + box.status_frame(READY))
         await first
-        text = rf"and a result takes {needed} s at least; no trigger was sent"
+        text = rf"and its result needs at least {needed} s; no trigger was sent"
         with pytest.raises(TriggerTimeoutError, match=text):
             await second
         assert box.ids.count(TRIGGER) == 2
@@ -284,7 +284,7 @@ async def test_trigger_overtriggered_raises_and_the_result_is_streamed() -> None
     async with by_hand() as (box, camera):
         results = camera.results()
         box.script[TRIGGER] = lambda _: box.status_frame(RUNNING | OVERTRIGGERED)
-        with pytest.raises(OvertriggeredError, match="it cannot be told whose"):
+        with pytest.raises(OvertriggeredError, match="it is unknown whether"):
             await camera.trigger()
         box.send(box.result_frame(b"whose"))
         result = await anext(results)
@@ -390,7 +390,9 @@ async def test_result_of_a_trigger_that_is_in_doubt_is_nobodys_in_a_stream() -> 
             + box.status_frame(RUNNING)
             + box.status_frame(READY)
         )
-        with pytest.raises(OvertriggeredError, match="it cannot be told whose the result is"):
+        with pytest.raises(
+            OvertriggeredError, match="it is unknown to which trigger the result belongs"
+        ):
             await camera.trigger()
         result = await anext(results)
         assert (result.raw, result.triggered_at, result.latency) == (b"whose", None, None)
@@ -427,7 +429,9 @@ async def test_two_inspections_between_the_answers_end_the_call(
     """A sensor's began and was over between the Query and the Trigger."""
     async with by_hand(box={"dialect": dialect}, interpret_as=layout) as (box, camera):
         box.script[TRIGGER] = lambda _: 2 * box.inspects(as_set(box, layout))
-        with pytest.raises(OvertriggeredError, match="it cannot be told whose the result is"):
+        with pytest.raises(
+            OvertriggeredError, match="it is unknown to which trigger the result belongs"
+        ):
             await camera.trigger()
         box.script[TRIGGER] = lambda _: box.inspects(as_set(box, layout))
         await camera.trigger()
@@ -585,20 +589,24 @@ async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
         doubts = [*itertools.product((False, True), ([], [None]), (None, 0), (0, 1))]
         usual = state.status, state.bits, correlation.owed
         straight = 0
-        for said, (doubted, owed, halted, open_) in itertools.product(bits, doubts):
+        for said, (status_may_be_old, owed, halted, open_) in itertools.product(bits, doubts):
             for data, expected in itertools.product((None, b"1"), (None, state.active, 99)):
                 state.status, state.bits = Status(said), said
-                correlation.doubted, correlation.owed = doubted, owed  # type: ignore[assignment]
-                commands._loads_when_halted, waits.fences_open = halted, open_
+                correlation.status_may_be_old, correlation.owed = status_may_be_old, owed  # type: ignore[assignment]
+                commands._loads_when_halted, waits.trigger_queries_open = halted, open_
                 request = TriggerRequest(client._default, data, 1, wait=True)
-                if triggers._is_ready(request, expected):
+                if triggers._can_send_now(request, expected):
                     straight += 1
                     written = link.machine.counters.frames_sent
                     with pytest.raises(StopIteration):
                         triggers._get_ready(request, expected, link.loop.time() + 1.0).send(None)
                     assert link.machine.counters.frames_sent == written
         state.status, state.bits, correlation.owed = usual
-        correlation.doubted, commands._loads_when_halted, waits.fences_open = False, None, 0
+        correlation.status_may_be_old, commands._loads_when_halted, waits.trigger_queries_open = (
+            False,
+            None,
+            0,
+        )
     assert straight == 4  # with Running or without, whichever application is expected
 
 
@@ -627,7 +635,7 @@ async def test_trigger_cancelled_owes_a_result_that_the_next_one_never_gets() ->
         box.script[STOP] = lambda _: box.result_frame(b"late") + box.status_frame(0)
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"found"
-        assert box.since(mark) == [STOP, QUERY, START, *FENCED]
+        assert box.since(mark) == [STOP, QUERY, START, *TRIGGER_IDS]
         statistics = camera.statistics()
         assert (statistics.late, statistics.triggered) == (1, 1)
 
@@ -643,7 +651,7 @@ async def test_trigger_timed_out_owes_a_result_that_the_next_one_never_gets() ->
         box.script[TRIGGER], box.container = box._trigger, b"ours"
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"ours"
-        assert box.since(mark) == FENCED  # the debt was paid
+        assert box.since(mark) == TRIGGER_IDS  # the debt was paid
         assert camera.statistics().late == 1
 
 
@@ -669,7 +677,7 @@ async def test_trigger_cancelled_at_the_emulator_is_voided_by_the_next() -> None
         clock.advance(0.05)
         assert (await following).raw.startswith(b"Hello World")
         sent = [entry.message_id for entry in emulator.log if entry.direction == "in"]
-        assert sent[-9:] == [*FENCED, STOP, QUERY, START, *FENCED]
+        assert sent[-9:] == [*TRIGGER_IDS, STOP, QUERY, START, *TRIGGER_IDS]
         statistics = camera.statistics()
         assert (statistics.received, statistics.triggered) == (1, 1)
 
@@ -685,7 +693,7 @@ async def test_debt_of_a_stopped_application_is_forgotten() -> None:
         await camera.start()
         mark = len(box.ids)
         await camera.trigger()
-        assert box.since(mark) == FENCED
+        assert box.since(mark) == TRIGGER_IDS
 
 
 async def test_debt_is_paid_by_a_switch() -> None:
@@ -696,11 +704,11 @@ async def test_debt_is_paid_by_a_switch() -> None:
         await camera.switch_application(3)
         mark = len(box.ids)
         assert (await camera.trigger()).application == 3
-        assert box.since(mark) == FENCED
+        assert box.since(mark) == TRIGGER_IDS
 
 
 @pytest.mark.parametrize("phase", [STOP, QUERY, START])
-async def test_fence_cancelled_half_way_is_put_up_again(phase: int) -> None:
+async def test_settling_cancelled_half_way_is_put_up_again(phase: int) -> None:
     async with by_hand() as (box, camera):
         script = dict(box.script)
         box.script |= {TRIGGER: box.takes}
@@ -715,24 +723,24 @@ async def test_fence_cancelled_half_way_is_put_up_again(phase: int) -> None:
         assert camera.status == Status(READY)
 
 
-async def test_fence_cancelled_leaves_the_stop_that_the_user_wants() -> None:
+async def test_settling_cancelled_leaves_the_stop_that_the_user_wants() -> None:
     async with by_hand() as (box, camera):
-        await cancelled_at_its_fence(box, camera)
+        await cancelled_at_its_query(box, camera)
         box.send(box.script[QUERY](b""))
         await camera.stop()
         with pytest.raises(NotRunningError):
             await camera.trigger()
 
 
-async def test_fence_cancelled_then_switched_runs_again() -> None:
+async def test_settling_cancelled_then_switched_runs_again() -> None:
     async with by_hand() as (box, camera):
-        await cancelled_at_its_fence(box, camera)
+        await cancelled_at_its_query(box, camera)
         box.send(box.script[QUERY](b""))
         await camera.switch_application(3)
         assert camera.status == Status(READY)
 
 
-async def test_fence_too_slow_for_a_short_trigger_leaves_the_link() -> None:
+async def test_settling_too_slow_for_a_short_trigger_leaves_the_link() -> None:
     async with by_hand() as (box, camera):
         script = dict(box.script)
         box.script[TRIGGER] = box.takes
@@ -746,7 +754,7 @@ async def test_fence_too_slow_for_a_short_trigger_leaves_the_link() -> None:
         assert (await camera.trigger()).raw == b"found"
 
 
-async def test_fence_never_answered_gives_the_link_up_in_the_end() -> None:
+async def test_settling_never_answered_gives_the_link_up_in_the_end() -> None:
     async with by_hand(request_timeout=SHORT) as (box, camera):
         box.script[TRIGGER] = box.takes
         await gone(camera.trigger(timeout=SHORT))
@@ -756,9 +764,9 @@ async def test_fence_never_answered_gives_the_link_up_in_the_end() -> None:
         await until(lambda: not camera.connected)
 
 
-async def test_fence_cancelled_then_a_switch_refused_runs_again() -> None:
+async def test_settling_cancelled_then_a_switch_refused_runs_again() -> None:
     async with by_hand() as (box, camera):
-        await cancelled_at_its_fence(box, camera)
+        await cancelled_at_its_query(box, camera)
         box.send(box.script[QUERY](b""))
         with pytest.raises(CommandRejectedError):
             await camera.switch_application(99)
@@ -782,7 +790,7 @@ async def test_result_that_comes_while_its_caller_is_being_cancelled_is_late() -
         box.script[TRIGGER] = trigger
         mark = len(box.ids)
         await camera.trigger()
-        assert box.since(mark) == FENCED  # nothing is owed
+        assert box.since(mark) == TRIGGER_IDS  # nothing is owed
 
 
 async def test_result_that_comes_before_its_caller_is_cancelled_owes_nothing() -> None:
@@ -801,7 +809,7 @@ async def test_result_that_comes_before_its_caller_is_cancelled_owes_nothing() -
         box.script[TRIGGER] = trigger
         mark = len(box.ids)
         await camera.trigger()
-        assert box.since(mark) == FENCED
+        assert box.since(mark) == TRIGGER_IDS
 
 
 @pytest.mark.parametrize("waiting", ["trigger", "next_result"])

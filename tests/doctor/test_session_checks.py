@@ -110,7 +110,7 @@ async def test_nothing_listens_on_udp_is_reported() -> None:
 async def test_host_without_a_route_is_unreachable() -> None:
     findings = await examined("bvs://255.255.255.255", timeout=SHORT)
     found = finding_of(findings, "session")
-    assert found.text.startswith("there is no way to 255.255.255.255:36701 (TCP): ")
+    assert found.text.startswith("255.255.255.255:36701 (TCP) cannot be reached: ")
     assert "both must be in one network" in found.cure
 
 

@@ -145,7 +145,7 @@ class AdversaryStorm(Storm[Adversary]):
         ("extra", lambda one: one.extra),
         ("clients", lambda one: one.lives),
         ("sessions", lambda one: one.sessions),
-        ("stops", lambda one: one.fenced),
+        ("stops", lambda one: one.stopped),
         ("queries", lambda one: one.queries),
         ("dropped", lambda one: one.overtriggers),
         ("fresh", lambda one: one.fresh),

@@ -170,8 +170,8 @@ class LateStorm(Storm[LateVariant]):
         ("seconds", lambda one: f"{one.seconds:.1f}"),
         ("grace", lambda one: len(one.waited_ms)),
         ("ms", lambda one: _median(one.waited_ms)),
-        ("fenced", lambda one: len(one.fenced_ms)),
-        ("ms", lambda one: _median(one.fenced_ms)),
+        ("stopped", lambda one: len(one.stopped_ms)),
+        ("ms", lambda one: _median(one.stopped_ms)),
     )
     _pace = 0.01
     _owing = False
@@ -263,7 +263,7 @@ class LateStorm(Storm[LateVariant]):
         if sendings:
             cost = 1000 * (sendings[-1].at - self._begun)
             if self.ear.said["Stop"] > self._stops:
-                figures.fenced_ms.append(cost)
+                figures.stopped_ms.append(cost)
             elif self._owing:
                 figures.waited_ms.append(cost)
         if outcome in {"cancelled", "TriggerTimeoutError"}:

@@ -77,7 +77,7 @@ class Figures:
     triggers: int = 0
     sent: int = 0
     overtriggers: int = 0
-    fenced: int = 0  # times the client stopped the application for a trigger
+    stopped: int = 0  # times the client stopped the application for a trigger
     queries: int = 0  # that the client sent
     late: int = 0
     extra: int = 0
@@ -87,7 +87,7 @@ class Figures:
     given_up: set[tuple[int, int]] = field(default_factory=set)
     # how much later a trigger was sent for a debt that its late result has paid
     waited_ms: list[float] = field(default_factory=list)
-    fenced_ms: list[float] = field(default_factory=list)  # and where it took Stop, Query and Start
+    stopped_ms: list[float] = field(default_factory=list)  # and where it took Stop, Query and Start
     violations: list[str] = field(default_factory=list)  # what must not be, in words
     seconds: float = 0.0
 
@@ -143,7 +143,7 @@ class Storm(Generic[VariantT]):
         figures.sent = len(self.camera.sent)
         figures.triggers = self.camera.triggers
         figures.overtriggers = self.camera.overtriggers
-        figures.fenced, figures.queries = self.ear.said["Stop"], self.ear.said["Query"]
+        figures.stopped, figures.queries = self.ear.said["Stop"], self.ear.said["Query"]
         return figures
 
     # ------------------------------------------------------------------ what chance decides

@@ -58,7 +58,7 @@ async def test_storm_where_nothing_is_promised_counts_wrong_results() -> None:
     assert done.wrong > 0
 
 
-async def test_debt_that_is_paid_soon_costs_no_fence() -> None:
+async def test_debt_that_is_paid_soon_costs_no_stop() -> None:
     assert await late_storm.debt_cost(0.01) < await late_storm.debt_cost(1.0)
 
 

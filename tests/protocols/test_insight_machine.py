@@ -624,7 +624,7 @@ def test_parameters_that_cannot_work_are_refused(parameters: dict[str, str], tex
 def test_dialect_says_what_it_can() -> None:
     can = ["switch", "load_file", "start_stop", "result_codes", "get_status", "read_image"]
     assert NATIVE.capabilities.names == can
-    assert (NATIVE.in_order, NATIVE.application_ids) == (True, range(1000))
+    assert (NATIVE.results_are_attributable, NATIVE.application_ids) == (True, range(1000))
     assert all(
         NATIVE.message_id(kind) == 0 for kind in (m.Connect, m.Trigger, m.Image, m.StopAnswer)
     )

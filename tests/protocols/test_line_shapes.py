@@ -211,7 +211,7 @@ def test_containers_say_whether_a_trigger_has_asked_for_them() -> None:
     made = machine(AT_ONCE)
     made.send(m.Trigger())
     made.receive_data(b"||0>older\n||2>own\n||0>newer\n")
-    assert [one.asked for one in made.events()] == [False, True, False]  # type: ignore[union-attr]
+    assert [one.requested for one in made.events()] == [False, True, False]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

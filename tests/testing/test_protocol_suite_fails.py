@@ -138,7 +138,7 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"label": "x"}, "label"),
         ({"application_ids": range(0)}, "at least one"),
         ({"application_ids": range(0, 9, 2)}, "step of 1"),
-        ({"in_order": 1}, "in_order: expected a bool"),
+        ({"results_are_attributable": 1}, "results_are_attributable: expected a bool"),
         ({"has_login": True}, "no parameter 'user'"),
         ({"capabilities": Capabilities(dialect="texts")}, "capabilities.dialect: 'texts'"),
     ],

@@ -108,7 +108,7 @@ class AgentListeners(Listeners):
     callbacks: AgentCallbacks | None = None
 
     @property
-    def only_streams_results(self) -> bool:
+    def results_only_streamed(self) -> bool:
         return True
 
     @property

@@ -34,7 +34,7 @@ from smartcam.fleet._security.certificates import may_command
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from smartcam._client._inside import Outcome, TriggerRequest
+    from smartcam._client._inside import AnyFuture, TriggerRequest
     from smartcam.fleet._bus.bus import Handle
     from smartcam.fleet._program.program import Program, Reply
     from smartcam.protocols._inside import Counters
@@ -618,12 +618,12 @@ class Caller:
         """
         program, met = self.program, self.agent
 
-        def send() -> tuple[int, Outcome]:
+        def send() -> tuple[int, AnyFuture]:
             number = program.next_call()
             program.send(key, {"call": number, **fields})
             return number, program.expect_reply(number, self)
 
-        async def repeat(number: int, answer: Outcome) -> None:
+        async def repeat(number: int, answer: AnyFuture) -> None:
             while True:
                 try:
                     async with asyncio.timeout(RESEND_DELAY):

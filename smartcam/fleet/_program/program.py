@@ -7,7 +7,7 @@ import logging
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from smartcam._client._inside import DeadlineTimer, Outcome, make_doorbell, new_tuple
+from smartcam._client._inside import AnyFuture, DeadlineTimer, make_doorbell, new_tuple
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import (
     ConfigurationError,
@@ -61,7 +61,7 @@ class Pending(NamedTuple):
     """
 
     camera: CalledCamera
-    reply: Outcome
+    reply: AnyFuture
     deadline: float
 
 
@@ -201,12 +201,12 @@ class Program:
 
     def expect_reply(
         self, number: int, camera: CalledCamera, deadline: float = math.inf
-    ) -> Outcome:
+    ) -> AnyFuture:
         """Return the future of the reply to a call; :meth:`forget_call` must follow in the end.
 
         Without a reply by ``deadline`` (loop time) the future raises :exc:`TimeoutError`.
         """
-        reply = self._bell.make_outcome()
+        reply = self._bell.make_future()
         self._pending_calls[number] = new_tuple(Pending, (camera, reply, deadline))
         if deadline < self._timer_at:
             self._timer_at = deadline
@@ -258,4 +258,4 @@ class Program:
         if pending.camera.streams_results:
             pending.reply.set_result(message)
         else:
-            self._bell.set_outcome(pending.reply, message)
+            self._bell.set_future(pending.reply, message)

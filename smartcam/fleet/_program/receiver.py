@@ -454,7 +454,7 @@ class Receiver:
             if expected is not None and run.application != expected:
                 self._counters.count("wrong_application", len(run.payloads))
                 return
-            if listeners.only_streams_results and self._pass_burst(run, now):
+            if listeners.results_only_streamed and self._pass_burst(run, now):
                 return
             for single in split_run(run):
                 fate = "late" if run.flags & LATE else "streamed"

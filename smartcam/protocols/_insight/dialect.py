@@ -103,7 +103,7 @@ class InSightDialect(Dialect):
     cells: tuple[str, ...] = ()
     counter: str = ""
 
-    in_order: ClassVar[bool] = True
+    results_are_attributable: ClassVar[bool] = True
     exclusive: ClassVar[bool] = False  # several users may be connected at a time (published)
     has_login: ClassVar[bool] = True
 

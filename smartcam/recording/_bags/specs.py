@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client._inside import has_pixel_positions, localizations_of, name_without_poses
+from smartcam._client._inside import has_pixel_positions, localizations_of, name_if_poseless
 from smartcam.exceptions import SmartCamError
 from smartcam.interpreters import resolve
 
@@ -45,9 +45,7 @@ class RecordedInterpreters:
             self._with_localizations.add(application)
             calibrated = found[0].pose.header.frame_id != result.camera
             return None if pixels and not calibrated else found
-        has_poses = (
-            interpreter is not None and name_without_poses(interpreter) is None and not pixels
-        )
+        has_poses = interpreter is not None and name_if_poseless(interpreter) is None and not pixels
         return found if has_poses or application in self._with_localizations else None
 
 

@@ -8,7 +8,7 @@ from smartcam._client._inside import (
     camera_interpreter,
     has_pixel_positions,
     localizations_of,
-    name_without_poses,
+    name_if_poseless,
 )
 from smartcam.interpreters import resolve
 
@@ -70,5 +70,5 @@ def localizations_in_metres(
     if has_pixel_positions(reader):
         return None
     # an empty list of an interpreter without poses is a list of texts, or of records
-    is_other_list = not parts and reader is not None and name_without_poses(reader) is not None
+    is_other_list = not parts and reader is not None and name_if_poseless(reader) is not None
     return None if is_other_list else parts

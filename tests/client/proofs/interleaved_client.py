@@ -35,7 +35,7 @@ from smartcam.protocols import messages as m
 from tests.client.inside import (
     Correlation,
     EvidenceByAnswer,
-    EvidenceByFence,
+    EvidenceByRoundTrip,
     EvidenceByStatus,
     PendingTrigger,
     Results,
@@ -49,14 +49,14 @@ NOW, DEADLINE = 0.0, 1.0
 AT = datetime(2026, 1, 1, tzinfo=UTC)
 NO_STATUSES: frozenset[object] = frozenset()
 
-Family = Literal["status", "answer", "fence", "nothing"]
+Family = Literal["status", "answer", "round trip", "nothing"]
 Shared = TypeVar("Shared")
 Arguments = TypeVarTuple("Arguments")
 
 EVIDENCE: dict[Family, type[TriggerEvidence]] = {
     "status": EvidenceByStatus,
     "answer": EvidenceByAnswer,
-    "fence": EvidenceByFence,
+    "round trip": EvidenceByRoundTrip,
     "nothing": TriggerEvidence,
 }
 FIELDS = {8: ("uint8", "B"), 16: ("uint16", "H"), 32: ("int32", "i")}
@@ -219,8 +219,10 @@ class Client:
         self.results = kind(
             "camera", reading(bits, numbered=numbered), self.state, LISTENERS, COUNTERS
         )
-        self.results.correlation = Correlation(chance=0.5)
-        self.results.begin_session(ordered=family != "nothing", complete=family == "status")
+        self.results.correlation = Correlation(first_number_share=0.5)
+        self.results.begin_session(
+            keeps_order=family != "nothing", gets_every_status=family == "status"
+        )
         self.results._warned_extra = self.results._warned_others = True  # in each copy anew
 
     # The timer has a callback of its results, so they are put together anew in each copy.
@@ -297,7 +299,7 @@ class Client:
 
     def answer(self) -> None:
         """A Query that was written with the trigger is answered."""
-        self.results.on_query_answer(NOW)
+        self.results.on_trigger_query_answer(NOW)
 
     def trigger_answer(self) -> None:
         """The trigger itself is answered: it was heard."""
@@ -374,7 +376,7 @@ class Client:
         last = of(at._last)
         evidence = tuple(
             (
-                *(min(one.begin_count, 2), one.reached, one.proven, one.doubtful),
+                *(min(one.begin_count, 2), one.takes_containers, one.proven, one.doubtful),
                 *(getattr(one, name) for name in type(one).__slots__ if name.startswith("_")),
             )
             for one in known
@@ -382,12 +384,12 @@ class Client:
         memory = (
             last,
             evidence,
-            at.doubted,
+            at.status_may_be_old,
             at.satisfied,
             at._last_number,
             at._last_own_number,
             at._user_number,
         )
         given_up = tuple(at._given_up_fates.items())
-        numbered = self.results._numbering is not None
+        numbered = self.results._number_reader is not None
         return self.state._last_status, numbered, call, waiting, owed, memory, given_up

@@ -55,7 +55,7 @@ SENSOR = 0
 GIVEN_NUMBER = 41
 """Sequence number that the user sets by hand."""
 
-FENCES: dict[Family, int] = {"status": 2, "answer": 1, "fence": 1, "nothing": 0}
+QUERIES: dict[Family, int] = {"status": 2, "answer": 1, "round trip": 1, "nothing": 0}
 """Queries that go out with a trigger."""
 
 Move = tuple[Any, ...]
@@ -70,8 +70,8 @@ class Variant:
     Attributes:
         name: for people.
         family: what shows that a trigger was taken: ``status`` (``handbook``, ``thesis`` and
-            ``b16`` over TCP), ``answer`` (``bid`` over TCP), ``fence`` (``shows_triggers=no``),
-            ``nothing`` (UDP).
+            ``b16`` over TCP), ``answer`` (``bid`` over TCP), ``round trip``
+            (``shows_triggers=no``), ``nothing`` (UDP).
         number: whose sequence number a trigger has: ``own``, ``given`` by the user, or none.
         bits: of the number.
         collides: runs of a sensor carry our next number, too.
@@ -345,7 +345,7 @@ class World:
         client = self.client
         match item:
             case ("answer",):
-                if self.asked.popleft() == "fence":
+                if self.asked.popleft() == "query":
                     client.answer()
             case ("trigger answer",):
                 client.trigger_answer()
@@ -383,7 +383,7 @@ class World:
             case "refreshed" | "prepare":
                 if self.variant.family == "answer":
                     at.note_query_answered()
-                if at.doubted:
+                if at.status_may_be_old:
                     self.ask("heard")
                 elif at.owed and self.variant.number != "own":
                     self.settle()
@@ -436,9 +436,9 @@ class World:
         client.send(number, variant.wanted)
         self.written += 1
         self.phase = "sent"
-        fences = FENCES[variant.family]
-        self.asked += ["fence"] * fences
-        if fences:
+        queries = QUERIES[variant.family]
+        self.asked += ["query"] * queries
+        if queries:
             self.words.append(("query",))
         if variant.family == "answer":
             self.words.append(("get status",))
@@ -673,7 +673,7 @@ ROWS = (
     Row(
         where=FRAMED,
         what="the same with `shows_triggers=no` in the URL",
-        cases=({**EXACT, "shows": False, "family": "fence"},),
+        cases=({**EXACT, "shows": False, "family": "round trip"},),
         depth=9,
         long=14,
     ),

@@ -2,7 +2,7 @@
 
 Two clients get the same random triggers, questions, subscribers, ends and bytes. One takes what
 came before as a whole (:meth:`Machine.buffer_updated`, :meth:`Machine.send_all`) and the usual
-answers to a trigger in one step (``Dispatch._handle_usual_round``); the other one, which judges,
+answers to a trigger in one step (``Dispatch._handle_usual_exchange``); the other one, which judges,
 reads each frame by itself and hands on one event after the other. After each step everything that
 either knows has to be the same: the bytes written, the events, what is owed, the camera's state,
 the evidence, every account, every outcome, every subscriber's items.
@@ -48,7 +48,7 @@ from tests.client.camera_by_hand import (
     words,
 )
 from tests.client.inside import (
-    FENCED_TRIGGER,
+    TRIGGER_BETWEEN_QUERIES,
     Chunk,
     Connection,
     Correlation,
@@ -81,7 +81,7 @@ _QUERY = m.Query()
 class JudgingDispatch(Dispatch):
     """Hands on each event by itself."""
 
-    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
+    def _handle_usual_exchange(self, events: list[Any], now: float, at: datetime) -> bool:
         return False
 
 
@@ -90,8 +90,8 @@ class ShortDispatch(Dispatch):
 
     taken = 0
 
-    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
-        taken = super()._handle_usual_round(events, now, at)
+    def _handle_usual_exchange(self, events: list[Any], now: float, at: datetime) -> bool:
+        taken = super()._handle_usual_exchange(events, now, at)
         ShortDispatch.taken += taken
         return taken
 
@@ -126,7 +126,7 @@ class Client:
         requests = Requests(connection, self.waits, self.state, 1.0, 1.0)
         reading = Interpretation(layout, lenient=False, y_down=False)
         self.results = Results("camera", reading, self.state, self.listeners, self.counters)
-        self.results.correlation = Correlation(chance=0.5)
+        self.results.correlation = Correlation(first_number_share=0.5)
         self.dispatch = dispatch(
             *("camera", self.state, self.waits, self.results, self.listeners, requests),
             self.counters,
@@ -142,7 +142,7 @@ class Client:
         """Begin a session."""
         self.machine = self._machine_kind(HANDBOOK, Role.CLIENT, Transport.TCP)
         self.frames = self.deliveries = 0
-        self.dispatch.begin_session(HANDBOOK, ordered=True)
+        self.dispatch.begin_session(HANDBOOK, keeps_order=True)
         self.counters.begin_session(self.machine.counters)
         self.machine.send(m.Connect())
         self.written += b"".join(self.machine.data_to_send())
@@ -160,13 +160,13 @@ class Client:
         number = None if numbering is None else correlation.take_number(numbering.highest)
         reading, evidence = self.results.interpretation, EvidenceByStatus()
         pending = PendingTrigger(
-            *(wanted, number, evidence, self.bell.make_outcome(), reading, has_input, 0.0, AT),
+            *(wanted, number, evidence, self.bell.make_future(), reading, has_input, 0.0, AT),
             application,
             [],
         )
         self.results.begin_trigger(pending, 1e9)
-        self.machine.send_all(FENCED_TRIGGER)
-        self.waits.expect_fences(2)
+        self.machine.send_all(TRIGGER_BETWEEN_QUERIES)
+        self.waits.expect_query_answers(2)
         self.written += b"".join(self.machine.data_to_send())
 
     def wake(self) -> None:
@@ -190,7 +190,9 @@ class Client:
         answer = request.answer
         if self.machine.state is State.CONNECTED and answer and not self.waits.is_pending(answer):
             self.machine.send(request)
-            owed = self.waits.next_answer(answer, LOOP, LOOP.time(), after_delivery=self.deliveries)
+            owed = self.waits.expect_answer(
+                answer, LOOP, LOOP.time(), after_delivery=self.deliveries
+            )
             self.awaited.append(owed)
             self.written += b"".join(self.machine.data_to_send())
 
@@ -253,7 +255,7 @@ class Client:
         yield (
             [*waits.pending_answers],
             waits._last_delivery_before,
-            waits.fences_open,
+            waits.trigger_queries_open,
             len(waits.status_waiters),
         )
         correlation = results.correlation
@@ -286,7 +288,13 @@ def _slots(evidence: Any) -> object:
     if evidence is None:
         return None
     answers = getattr(evidence, "_answer_count", None)
-    return evidence.begin_count, evidence.reached, evidence.proven, evidence.doubtful, answers
+    return (
+        evidence.begin_count,
+        evidence.takes_containers,
+        evidence.proven,
+        evidence.doubtful,
+        answers,
+    )
 
 
 def _told(one: object) -> object:
@@ -519,7 +527,7 @@ def _compare_one(short: Client, judge: Client, chance: Chance, counts: Counter[s
             if not sleeps:
                 client.wake()
             client.awaited = [one for one in client.awaited if not one.done()]
-        stuck = short.waits.fences_open if short.results._pending is None else 0
+        stuck = short.waits.trigger_queries_open if short.results._pending is None else 0
         if stuck and chance.random.random() < 0.8:  # the answers that are missing come, too
             for client in both:
                 client.hear(chance.rest + _answer() * stuck, 0.0)
@@ -540,7 +548,7 @@ def _open(both: Sequence[Client], chance: Chance) -> None:
         client.hear(b"".join(OPENING), 0.0)
     if chance.random.random() < 0.1:
         for client in both:
-            client.dispatch.begin_session(HANDBOOK, ordered=True)  # all told is forgotten
+            client.dispatch.begin_session(HANDBOOK, keeps_order=True)  # all told is forgotten
 
 
 def _see_same(short: Client, judge: Client, told: list[str]) -> None:

@@ -85,7 +85,7 @@ def test_visit_finds_a_container_without_a_fate() -> None:
 def test_visit_finds_what_goes_wrong_where_an_assumption_does() -> None:
     """Else it would find nothing anywhere."""
     shown = Variant(name="", in_order=False, exact=True, triggers=1, sensors=1, depth=13)
-    hidden = replace(shown, family="fence", in_order=True, shows=False, depth=9)
+    hidden = replace(shown, family="round trip", in_order=True, shows=False, depth=9)
     assert visit(shown).worst == visit(hidden).worst == "older"
 
 

@@ -23,21 +23,21 @@ def test_short_way_gives_what_the_long_one_gives(caplog: pytest.LogCaptureFixtur
 class ForgetsStatuses(ShortDispatch):
     """Does not count the statuses around a result."""
 
-    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
+    def _handle_usual_exchange(self, events: list[Any], now: float, at: datetime) -> bool:
         heard = self._state.statuses_received
-        taken = super()._handle_usual_round(events, now, at)
+        taken = super()._handle_usual_exchange(events, now, at)
         if taken:
             self._state.statuses_received = heard
         return taken
 
 
-class KeepsFences(ShortDispatch):
+class KeepsQueries(ShortDispatch):
     """Still waits for the answers that it has taken."""
 
-    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
-        taken = super()._handle_usual_round(events, now, at)
+    def _handle_usual_exchange(self, events: list[Any], now: float, at: datetime) -> bool:
+        taken = super()._handle_usual_exchange(events, now, at)
         if taken:
-            self._waits.expect_fences(2)
+            self._waits.expect_query_answers(2)
         return taken
 
 
@@ -63,7 +63,7 @@ class IsOwedAnything(ShortMachine):
     ("machine", "dispatch"),
     [
         (ShortMachine, ForgetsStatuses),
-        (ShortMachine, KeepsFences),
+        (ShortMachine, KeepsQueries),
         (LooksAtSizes, ShortDispatch),
         (IsOwedAnything, ShortDispatch),
     ],

@@ -130,7 +130,7 @@ class DialectChecks(SuiteBase):
         assert ids, "application_ids: expected at least one"
         assert ids.step == 1, f"application_ids: expected a step of 1, got {ids!r}"
         assert ids.start >= 0, f"application_ids: expected no negative one, got {ids!r}"
-        for name in ("in_order", "exclusive", "has_login"):
+        for name in ("results_are_attributable", "exclusive", "has_login"):
             assert isinstance(getattr(dialect, name), bool), f"{name}: expected a bool"
         if dialect.has_login:
             assert "user" in self.protocol.parameters, "has_login, but no parameter 'user'"

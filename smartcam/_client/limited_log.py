@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
-MAX_REMARKS = 20
+MAX_LINES = 20
 """Largest number of lines of one kind that a camera may cause in each period."""
 
 PERIOD = 60.0
@@ -22,10 +22,10 @@ class _Logged:
     count: int = 0
 
 
-class Remarks:
+class LimitedLog:
     """The log lines that one camera causes; each kind has its own count.
 
-    Callers use a handful of kinds, never a text from the camera.
+    Callers name a kind by a text of their own, never by one that the camera sent.
 
     Args:
         name: the camera's name, which begins each line.
@@ -41,8 +41,8 @@ class Remarks:
         Args:
             kind: name of the kind, for people.
             level: level of the line.
-            text: form of the line.
-            values: values for the form.
+            text: format string of the line, with ``%``.
+            values: values for the format string.
             now: seconds of any clock that does not jump.
         """
         logged = self._kinds.setdefault(kind, _Logged(now))
@@ -50,11 +50,11 @@ class Remarks:
             self._log_left_out(kind, level, logged)
             logged.begun_at, logged.count = now, 0
         logged.count += 1
-        if logged.count <= MAX_REMARKS:
+        if logged.count <= MAX_LINES:
             logger.log(level, "%s %s", self._name, text % values)
-        elif logged.count == MAX_REMARKS + 1:
+        elif logged.count == MAX_LINES + 1:
             more = "%s ! more than %d lines of the kind %r in %g s: the others are only counted"
-            logger.log(level, more, self._name, MAX_REMARKS, kind, PERIOD)
+            logger.log(level, more, self._name, MAX_LINES, kind, PERIOD)
 
     def end(self) -> None:
         """Log the number of left-out lines at the session's end."""
@@ -63,7 +63,7 @@ class Remarks:
         self._kinds.clear()
 
     def _log_left_out(self, kind: str, level: int, logged: _Logged) -> None:
-        left_out = logged.count - MAX_REMARKS
+        left_out = logged.count - MAX_LINES
         if left_out > 0:
             text = "%s ! %d of the kind %r were not logged"
             logger.log(level, text, self._name, left_out, kind)
