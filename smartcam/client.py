@@ -298,9 +298,9 @@ class SmartCamera(Camera[ValueT]):
         dialect = self._connection.dialect
         raw = dialect.raw_request(message_id, payload)
         deadline = self._connection.deadline(timeout)
-        if raw.answered if answered is None else answered:
+        if raw.expects_answer if answered is None else answered:
             return dialect.body(await self._requests.exchange(raw.message, raw.answer, deadline))
-        if raw.answered and raw.known:
+        if raw.expects_answer and raw.known:
             # the camera still answers, and its answer must not be taken for the next request's
             await self._requests.post(raw.message, raw.answer, deadline)
         else:

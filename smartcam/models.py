@@ -361,7 +361,7 @@ class Capabilities:
         input_data: take input data for an inspection.
         sequence_number: set the number of the next run.
         result_codes: commands are acknowledged, or refused with a code.
-        status_by_itself: the status comes with the session and at every change.
+        unasked_status: the status comes with the session and at every change.
         get_status: the status can be asked for.
         reset_errors: error bits stay set until they are reset.
         unasked_results: results come without a trigger of this client.
@@ -378,7 +378,7 @@ class Capabilities:
     input_data: bool = False
     sequence_number: bool = False
     result_codes: bool = False
-    status_by_itself: bool = False
+    unasked_status: bool = False
     get_status: bool = False
     reset_errors: bool = False
     unasked_results: bool = False

@@ -80,7 +80,7 @@ class RawFrame(NamedTuple):
         frame = self.frame
         if isinstance(frame, TraceEntry):
             return frame
-        message_id, message, fields, data = self.dialect.spell(self.sender, frame)
+        message_id, message, fields, data = self.dialect.make_readable(self.sender, frame)
         direction = ">" if self.sender.value == "client" else "<"
         return TraceEntry(self.at, self.camera, direction, message_id, message, fields, data.hex())
 

@@ -72,7 +72,7 @@ def test_tables_quirks_put_together_are_the_dialect_with_all_of_them() -> None:
                 assert entry["fields"] == [[name, wire.value] for name, wire in row.fields]
                 assert (entry["size"], entry["data"]) == (codec.size, codec.has_data)
                 assert entry["big_endian"] is (row.byte_order == ">")
-                assert entry["code_alone"] is codec.may_be_a_code
+                assert entry["code_alone"] is codec.may_be_code_only
 
 
 # ---------------------------------------------------------------------- messages

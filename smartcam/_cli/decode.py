@@ -129,9 +129,9 @@ def _decode_frames(
     if framer.buffered:
         raise FrameError(
             f"decode: the last {framer.buffered} bytes, from offset {offset}, are no whole frame: "
-            f"{hex_excerpt(framer.pending)}",
+            f"{hex_excerpt(framer.unfinished_bytes)}",
             offset=offset,
-            data=framer.pending,
+            data=framer.unfinished_bytes,
         )
 
 

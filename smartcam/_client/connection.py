@@ -61,7 +61,7 @@ class Features:
 
     @staticmethod
     def _of(dialect: Dialect, *, keeps_order: bool) -> Features:
-        polled = not dialect.capabilities.status_by_itself
+        polled = not dialect.capabilities.unasked_status
         acknowledged = dialect.has(m.TriggerAnswer)
         ends = dialect.has(m.EndTrigger)
         # a camera that answers in order needs no Query: the trigger's answer is enough

@@ -124,7 +124,7 @@ class Dispatch:
         self._waits.begin_session()
         self._state.begin_session()
         # if the status comes only on request, changes of it are missed
-        gets_all = keeps_order and dialect.capabilities.status_by_itself and dialect.shows_triggers
+        gets_all = keeps_order and dialect.capabilities.unasked_status and dialect.shows_triggers
         self._results.begin_session(keeps_order=keeps_order, gets_every_status=gets_all)
 
     def dispatch_early(self, chunks: Iterable[Chunk]) -> None:

@@ -251,7 +251,7 @@ async def attempt(
         dialect = link.machine.dialect
         progress.dialect = dialect.label
         progress.reach("waiting for the first status")
-        if not collector.statuses and not dialect.capabilities.status_by_itself:
+        if not collector.statuses and not dialect.capabilities.unasked_status:
             link.send(GetStatus(), answered=False)
         while not collector.statuses:
             await collector.receive_chunk()

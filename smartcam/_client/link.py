@@ -168,7 +168,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             "_loss_reason",
             "_max_frames",
             "_paused",
-            "_machine_replies",
+            "_machine_may_reply",
             "_get_buffer",
             "_send_all",
             "_transport",
@@ -198,7 +198,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._is_udp = machine.transport is Transport.UDP
         # socket for reading waiting datagrams directly
         self._direct_socket: socket.socket | None = None
-        self._machine_replies = machine.replies
+        self._machine_may_reply = machine.may_reply
         self._get_buffer = machine.get_buffer
         # a method of the machine, if it can send several messages at once
         send_singly: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
@@ -389,7 +389,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.last_byte_at = self.loop.time()
         if self.machine.buffer_updated(nbytes, self.last_byte_at):
             self._queue_events()
-        if self._machine_replies and self._loss_reason is None:
+        if self._machine_may_reply and self._loss_reason is None:
             self._flush()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
@@ -570,7 +570,7 @@ class FrameTrace:
     def note_unfinished_frame(self) -> None:
         """Add and pass on the bytes of an unfinished frame when the link ends; only once."""
         was_noted, self._rest_noted = self._rest_noted, True
-        rest = b"" if was_noted else self.machine.pending
+        rest = b"" if was_noted else self.machine.unfinished_bytes
         if rest:
             text = f"{len(rest)} bytes that make no whole frame"
             hexed = rest[:MAX_REST_BYTES].hex()

@@ -45,7 +45,7 @@ def lua_tables() -> dict[str, Any]:
     """Return the tables of the Lua code, as plain values by the names of the Lua variables."""
     dialects = BVS.dialects
     rows = [row for dialect in dialects.values() for row in dialect.table]
-    first_tries = BVS.detection[Transport.TCP]
+    groups = BVS.detection[Transport.TCP]
     return {
         "PORT": DEFAULT_PORT,
         "MAX_LENGTH": DEFAULT_MAX_LENGTH,
@@ -53,7 +53,7 @@ def lua_tables() -> dict[str, Any]:
         "STATUSES": [_status_name(member) for member in Status],
         "IDS": _names_by_id(rows),
         "DIALECTS": [_dialect_table(dialect) for dialect in dialects.values()],
-        "KIN": [[dialect.name, *dialect.quirks] for group in first_tries for dialect in group],
+        "TRIED_TOGETHER": [[one.name, *one.quirks] for group in groups for one in group],
     }
 
 
@@ -68,7 +68,7 @@ def _dialect_table(dialect: FramedDialect) -> dict[str, Any]:
         "number": 4 if header.code == "I" else 2,
         "id_first": header.id_first,
         "length_includes": header.length_includes,
-        "status_by_itself": dialect.status_by_itself,
+        "unasked_status": dialect.unasked_status,
         "status": _status_table(dialect.status_bits),
         "codes": _code_table(dialect.codes),
         "messages": rows_without_quirk,
@@ -114,7 +114,7 @@ def _row_table(row: MessageRow, dialect: FramedDialect) -> dict[str, Any]:
         "size": codec.size,
         "data": codec.has_data,
         "big_endian": row.byte_order == ">",
-        "code_alone": codec.may_be_a_code,
+        "code_alone": codec.may_be_code_only,
         "answered": issubclass(row.type, Request) and dialect.answers(row.type),
     }
 
@@ -130,8 +130,7 @@ def _status_name(status: Status) -> str:
 def _status_table(bits: StatusBits) -> dict[str, Any]:
     """Return the statuses of the wire's bits; the keys are attributes of StatusBits.
 
-    A bit of the wire that ``named`` does not have is the status with this value, shifted up by
-    ``unnamed_shift``.
+    A wire bit that ``named`` does not have means the status bit ``bit << unnamed_shift``.
     """
     if bits.unnamed_shift:
         status_by_bit = {member.value >> bits.unnamed_shift: member for member in Status}

@@ -171,12 +171,12 @@ local function set_candidates()
     add(pinned.name, quirks)
     return
   end
-  for _, kin in ipairs(KIN) do
+  for _, name_and_quirks in ipairs(TRIED_TOGETHER) do
     local wanted = merged(quirks, {})
-    for number = 2, #kin do
-      wanted[kin[number]] = true
+    for number = 2, #name_and_quirks do
+      wanted[name_and_quirks[number]] = true
     end
-    add(kin[1], wanted)
+    add(name_and_quirks[1], wanted)
   end
 end
 
@@ -259,7 +259,7 @@ local function learn(stream, sender, id, size)
     end
     -- behind the answer to Connect, and nobody has asked for it
     local by_itself = row and row.name == "StatusReport" and stream.fresh and not stream.asked
-    if fits(one, sender, id, size) and (one.status_by_itself or not by_itself) then
+    if fits(one, sender, id, size) and (one.unasked_status or not by_itself) then
       table.insert(left, one)
     end
   end
@@ -295,11 +295,11 @@ end
 -- Return where a mask's bits stand in a word, as Wireshark draws it.
 local function picture(word, mask, size)
   local text = ""
-  for place = 8 * size - 1, 0, -1 do
-    local weight = 2 ^ place
+  for bit = 8 * size - 1, 0, -1 do
+    local weight = 2 ^ bit
     local inside = math.floor(mask / weight) % 2 == 1
     text = text .. (inside and (math.floor(word / weight) % 2 == 1 and "1" or "0") or ".")
-      .. (place % 4 == 0 and place > 0 and " " or "")
+      .. (bit % 4 == 0 and bit > 0 and " " or "")
   end
   return text
 end
@@ -425,8 +425,8 @@ local function add_frame(stream, pinfo, tree, range, head, key)
   end
   local id_item
   for number, what in ipairs(dialect.id_first and {"id", "length"} or {"length", "id"}) do
-    local place = dialect.lead + (number - 1) * dialect.number
-    local item = frame:add_le(f[what], range(place, dialect.number))
+    local offset = dialect.lead + (number - 1) * dialect.number
+    local item = frame:add_le(f[what], range(offset, dialect.number))
     id_item = what == "id" and item or id_item
   end
   id_item:set_text(string.format("Message id: 0x%02x (%s)", id, title))
@@ -465,7 +465,7 @@ local function add_frame(stream, pinfo, tree, range, head, key)
   return name .. "(" .. text .. ")"
 end
 
--- Return the header at a place: dialect, id, size, whether it has a magic number. Without one: nil
+-- Return the header at an offset: dialect, id, size, whether it has a magic number. Without one: nil
 -- and "more" where bytes are missing, nil and "none" where no frame begins here.
 local function head_at(stream, tvb, offset)
   local left = tvb:len() - offset
@@ -490,9 +490,9 @@ local function head_at(stream, tvb, offset)
   if not dialect then
     return nil, "none"
   end
-  local place = offset + dialect.lead
-  local first = tvb(place, dialect.number):le_uint()
-  local second = tvb(place + dialect.number, dialect.number):le_uint()
+  local start = offset + dialect.lead
+  local first = tvb(start, dialect.number):le_uint()
+  local second = tvb(start + dialect.number, dialect.number):le_uint()
   local id = dialect.id_first and first or second
   local size = (dialect.id_first and second or first) - dialect.length_includes
   if size < 0 or size > bvs.prefs.max_length then
@@ -511,16 +511,16 @@ local function head_at(stream, tvb, offset)
   return {dialect = dialect, id = id, size = size, magic = magic}
 end
 
--- Return where the next magic number begins behind a place, or the end.
+-- Return where the next magic number begins behind an offset, or the end.
 local function next_magic(tvb, offset)
   local data, found = tvb:raw(offset + 1), nil
   for _, one in ipairs(with_magic) do
     local magic = one.magic:gsub("..", function(two)
       return string.char(tonumber(two, 16))
     end)
-    local place = data:find(magic, 1, true)
-    if place and (not found or place < found) then
-      found = place
+    local position = data:find(magic, 1, true)
+    if position and (not found or position < found) then
+      found = position
     end
   end
   return found and offset + found or tvb:len()
@@ -577,7 +577,7 @@ local function dissect(tvb, pinfo, tree, datagram)
   return length
 end
 
--- ------------------------------------------------------------------ places in Wireshark
+-- ------------------------------------------------------------------ registration in Wireshark
 
 local tables = {tcp = DissectorTable.get("tcp.port"), udp = DissectorTable.get("udp.port")}
 local registered = 0

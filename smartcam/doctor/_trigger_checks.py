@@ -153,7 +153,7 @@ def _report_failure(exam: Examination, error: SmartCamError, result_count: int) 
     elif fell:
         text = f"the inspection of {trigger_text} was not done within {timeout:g} s"
         cure = "Give it more time: --timeout, or trigger(timeout=...)."
-    elif not exam.connected_camera.capabilities.status_by_itself:
+    elif not exam.connected_camera.capabilities.unasked_status:
         text = f"{trigger_text} was taken, and no result came within {timeout:g} s"
         cure = (
             'Does the application send results to the process interface ("send results", '

@@ -363,7 +363,7 @@ class FaultyLink:
         """Pass an unfinished frame's bytes to the machine, if no fault needs the whole frame."""
         faults_wait = self._owner.queue.client_wire_faults
         if self._framer is not None and not faults_wait and not self._incoming:
-            pending, self._framer = self._framer.pending, None
+            pending, self._framer = self._framer.unfinished_bytes, None
             self._link.feed(pending)
 
     def _finish_frame(self, data: bytes) -> bytes:

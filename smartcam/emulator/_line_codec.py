@@ -78,7 +78,7 @@ class LineCodec:
         self.table: tuple[MessageRow, ...] = tuple(
             MessageRow(number, kind, row.line, "")
             for number, row in enumerate(rows, start=1)
-            for kind in dict.fromkeys((row.request, row.answer, *row.also))
+            for kind in dict.fromkeys((row.request, row.answer, *row.other_answers))
             if kind is not None
         )
         self._rows = rows
@@ -107,7 +107,9 @@ class LineCodec:
 
     def row_of_word(self, word: str) -> int:
         """Return the number of the row with a word, 0 for none."""
-        return next((number for number, row in enumerate(self._rows, 1) if row.word == word), 0)
+        return next(
+            (number for number, row in enumerate(self._rows, 1) if row.answer_word == word), 0
+        )
 
     def request_key(self, data: bytes) -> str:
         """Return the word or ticket of the answer to a line, "" if only the order shows it."""
@@ -115,7 +117,7 @@ class LineCodec:
             return ""
         text = self.text(data)
         row = self._rows[self.row_of(text) - 1] if self.row_of(text) else None
-        word = None if row is None else row.word
+        word = None if row is None else row.answer_word
         return text.partition(",")[0] if word is None else word
 
     def answer_key(self, data: bytes) -> str:
@@ -133,7 +135,9 @@ class LineCodec:
 
     def has(self, message_type: type[m.Message], /) -> bool:
         """Return True if a row has the message as a request or an answer."""
-        return any(message_type in {row.request, row.answer, *row.also} for row in self._rows)
+        return any(
+            message_type in {row.request, row.answer, *row.other_answers} for row in self._rows
+        )
 
     def message_id(self, message: m.Message, /) -> int:
         """Return the number of its row."""
@@ -251,7 +255,7 @@ class LineFramer:
         self._search_start = 0  # offset where the search for a line end goes on
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Bytes that are not cut into lines yet."""
         return bytes(self._buffer)
 

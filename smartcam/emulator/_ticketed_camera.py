@@ -71,7 +71,7 @@ class TicketedClient(LineClient):
         """Return a frame in the client's dialect."""
         dialect = self.dialect
         content = text.encode(dialect.encoding, "replace")
-        return dialect.frame(content, ticket[: dialect.width], length=dialect.digits > 0)
+        return dialect.frame(content, ticket[: dialect.width], with_length=dialect.digits > 0)
 
 
 class TicketedCodec(LineCodec):

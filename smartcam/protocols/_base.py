@@ -105,8 +105,8 @@ UNDOCUMENTED = CodeMeaning("not documented", Verdict.REFUSED)
 """Meaning of a result code that no document explains."""
 
 
-class Spelled(NamedTuple):
-    """A frame in readable form.
+class ReadableFrame(NamedTuple):
+    """A frame in readable form, for traces.
 
     Attributes:
         message_id: id on the wire, None if the dialect has no such ids.
@@ -127,14 +127,14 @@ class RawRequest(NamedTuple):
     Attributes:
         message: the message to send.
         answer: the answer's message type, or its id.
-        answered: True if the documents say that the camera answers the request, or if the id is
-            unknown.
+        expects_answer: True if the documents say that the camera answers the request, or if the id
+            is unknown.
         known: True if the dialect knows the id.
     """
 
     message: Message
     answer: type[Message] | int
-    answered: bool
+    expects_answer: bool
     known: bool
 
 
@@ -145,7 +145,8 @@ class Dialect(ABC):
     Args:
         name: name as in ``?dialect=``.
         about: one line for people.
-        source: document that describes the dialect, with its grade.
+        source: document that describes the dialect, and whether that is published, derived or
+            inferred.
         quirks: names of this dialect's deviations, as in ``?quirks=``.
         shows_triggers: True if the status shows each accepted trigger: the bit Waiting for
             Trigger is cleared.
@@ -158,9 +159,9 @@ class Dialect(ABC):
     shows_triggers: bool = True
 
     results_are_attributable: ClassVar[bool] = False
-    """True if the camera handles one request after the other, so that an answer shows that all
-    earlier requests are finished and their results were sent. Also True if each result names its
-    trigger, so that the order does not matter."""
+    """True if it is known without a Query to which trigger a result belongs: the camera handles one
+    request after the other, so that an answer shows that all earlier requests are finished and
+    their results were sent; or each result names its trigger."""
     exclusive: ClassVar[bool] = True
     """True if the camera serves one client at a time, and a new client displaces the old one."""
     has_login: ClassVar[bool] = False
@@ -214,20 +215,20 @@ class Dialect(ABC):
         """Return the names of the fields that a message has on the wire."""
         return tuple(name for name, _ in wire_fields(message_type))
 
-    def reinterpret_status(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status, read by the dialect ``reader``, as this dialect reads the same bits."""
+    def reinterpret_status(self, report: StatusReport, source_dialect: Dialect) -> StatusReport:
+        """Return a status, decoded by ``source_dialect``, as this dialect decodes the same bits."""
         return report
 
     def data_begins(self, sender: Sender, message_id: int) -> int | None:
         """Return the number of bytes of a body before its ``data``; None if there is no such field.
 
-        ``data`` is the last field. :meth:`spell` needs only the bytes before it and the body's
-        length.
+        ``data`` is the last field. :meth:`make_readable` needs only the bytes before it and the
+        body's length.
         """
         return None
 
     @abstractmethod
-    def spell(self, sender: Sender, frame: Frame) -> Spelled:
+    def make_readable(self, sender: Sender, frame: Frame) -> ReadableFrame:
         """Return a frame in readable form, for a trace; it never raises."""
 
     @abstractmethod

@@ -60,7 +60,7 @@ class HeldResults:
         self._applications_since: set[int] | None = None
 
     def add_question(self, *, trigger: bool = False) -> int:
-        """Note a new question, and return its number; ``trigger``: a trigger follows it."""
+        """Record a new question, and return its number; ``trigger``: a trigger follows it."""
         self._last_question += 1
         self._unanswered.add(self._last_question)
         if trigger:
@@ -99,7 +99,7 @@ class HeldResults:
         self._ready += events
 
     def note_application(self, application: int, question: int = 0) -> bool:
-        """Note the application that the camera names as active now.
+        """Record the application that the camera names as active now.
 
         Args:
             application: id of the application.
@@ -127,7 +127,7 @@ class HeldResults:
         return ready
 
     def end_link(self) -> None:
-        """Note that no more answers come: the waiting results are reported with an error text."""
+        """Record that no more answers come: the waiting results are reported with an error text."""
         self._release(ended=True)
 
     def _release(self, *, ended: bool = False) -> None:

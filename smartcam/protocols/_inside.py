@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.protocols._base import POLICIES, Policy, Spelled, load_protocol
+    from smartcam.protocols._base import POLICIES, Policy, ReadableFrame, load_protocol
     from smartcam.protocols._bvs import DEFAULT_PORT, HANDBOOK, MessageId, ResultCode
     from smartcam.protocols._framed.constructs import view_fields
     from smartcam.protocols._framed.dialect import SHOWS_TRIGGERS
@@ -33,9 +33,9 @@ __all__ = [
     "Framer",
     "MessageId",
     "Policy",
+    "ReadableFrame",
     "ResultBurst",
     "ResultCode",
-    "Spelled",
     "StatusCode",
     "load_protocol",
     "refuse_line",
@@ -50,7 +50,7 @@ if not TYPE_CHECKING:
         {
             "_lines": "refuse_line",
             "_insight.dialect": "INSIGHT",
-            "_base": "Spelled POLICIES Policy load_protocol",
+            "_base": "ReadableFrame POLICIES Policy load_protocol",
             "_bvs": "DEFAULT_PORT HANDBOOK MessageId ResultCode",
             "_framed.constructs": "view_fields",
             "_framed.dialect": "SHOWS_TRIGGERS",

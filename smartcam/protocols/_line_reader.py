@@ -31,7 +31,7 @@ class LineReader:
         return len(self._buffer)
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Copy of the bytes that are kept."""
         return bytes(self._buffer)
 

@@ -27,8 +27,8 @@ from smartcam.protocols._base import (
     CodeMeaning,
     Dialect,
     RawRequest,
+    ReadableFrame,
     Role,
-    Spelled,
     Transport,
     Verdict,
 )
@@ -79,14 +79,14 @@ class LineRow(NamedTuple):
         answer: message type of the answer; None for a request without an answer.
         read: function that makes one or several messages of the answer's line; a ValueError
             or LookupError means that the line is no answer.
-        word: word by which the answer is recognized, if the dialect splits answers; "" for an
-            answer without a word; None: the first word of the request's line. Answers to later
+        answer_word: word by which the answer is recognized, if the dialect splits answers; "" for
+            an answer without a word; None: the first word of the request's line. Answers to later
             lines of a script are always recognized by the first word of the line. A dialect with
-            tickets needs ``word`` only for unasked lines.
+            tickets needs it only for unasked lines.
         echo: line that comes before the answer.
         until: possible first words of the last line of an answer of several lines. ``read`` gets
             these lines joined by line feeds.
-        also: further message types that ``read`` may return.
+        other_answers: further message types that ``read`` may return.
         script: function for a request of several lines; it gets the dialect and the message, yields
             lines and receives the answer to each. ``line`` is then the line for error texts.
     """
@@ -95,10 +95,10 @@ class LineRow(NamedTuple):
     line: str
     answer: type[m.Report] | None
     read: Callable[[str], Reported]
-    word: str | None = None
+    answer_word: str | None = None
     echo: str = ""
     until: tuple[str, ...] = ()
-    also: tuple[type[m.Report], ...] = ()
+    other_answers: tuple[type[m.Report], ...] = ()
     script: Callable[[Any, Any], Script] | None = None
 
 
@@ -142,7 +142,7 @@ class LineDialect(Dialect):
             ``read``; None if answers come in order and do not name their request.
         tickets: numbers of which each request carries the next one, in place of ``{ticket}`` in a
             row's line or added by :meth:`pack`; empty for a dialect without tickets.
-        at_once: requests are sent without waiting for earlier answers; needs ``split``.
+        pipelined: True if requests are sent without waiting for earlier answers; needs ``split``.
         codes: the meaning of each result code of the answers; without codes, every answer is a
             success.
         names_application: results name their application, or there is only one. Otherwise the
@@ -157,7 +157,7 @@ class LineDialect(Dialect):
     encoding: str = "utf-8"
     split: Callable[[str], tuple[str, str]] | None = None
     tickets: range = range(0)
-    at_once: bool = False
+    pipelined: bool = False
     codes: Mapping[int, CodeMeaning] = field(default_factory=dict[int, CodeMeaning])
     names_application: bool = True
     make: str = ""
@@ -179,7 +179,7 @@ class LineDialect(Dialect):
             dialect=self.name,
             start_stop=self.row(m.Start) is not None and self.row(m.Stop) is not None,
             result_codes=bool(self.codes),
-            status_by_itself=self.row(m.GetStatus) is None,
+            unasked_status=self.row(m.GetStatus) is None,
             unasked_results=m.ResultContainer in unasked,
             **abilities,
         )
@@ -196,7 +196,9 @@ class LineDialect(Dialect):
         """Return True if the dialect has a message of this type."""
         if message_type is m.Disconnect:
             return True
-        return any(message_type in {row.request, row.answer, *row.also} for row in self.rows)
+        return any(
+            message_type in {row.request, row.answer, *row.other_answers} for row in self.rows
+        )
 
     def message_id(self, message: m.Message | type[m.Message]) -> int:
         """Return 0, since lines have no ids; raise UnsupportedError without such a message."""
@@ -246,7 +248,8 @@ class LineDialect(Dialect):
         data = line.replace("{ticket}", ticket).encode(self.encoding, "replace")
         if len(data) > self.max_line or any(byte in self.line_end for byte in data):
             raise ConfigurationError(
-                f"dialect {self.name}: {line[:64]!r} is no line of {self.max_line} bytes"
+                f"dialect {self.name}: {line[:64]!r} is longer than {self.max_line} bytes, or "
+                "contains a line end"
             )
         return data + self.line_end
 
@@ -259,10 +262,10 @@ class LineDialect(Dialect):
         ends = re.compile(re.escape(self.line_end))
         return LineReader(ends, max_line=self.max_line, encoding=self.encoding)
 
-    def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
+    def make_readable(self, sender: m.Sender, frame: Frame) -> ReadableFrame:
         """Return a line in readable form."""
         text = frame.payload.decode(self.encoding, "replace")
-        return Spelled(None, "line", {"text": text}, frame.payload + self.line_end)
+        return ReadableFrame(None, "line", {"text": text}, frame.payload + self.line_end)
 
     def command(self, line: str) -> str:
         """Check a line that the user writes, and return it; a subclass may refuse some lines.
@@ -292,11 +295,11 @@ class LineDialect(Dialect):
             and not self.tickets
         ):
             raise LocalProtocolError(
-                f"{self.make or self.name}: {line[:32]!r} is the client's own: its result could "
-                "not be told from a trigger's; call trigger()"
+                f"{self.make or self.name}: {line[:32]!r} triggers the camera: its result could "
+                "not be distinguished from that of trigger(); call trigger()"
             )
-        answered = equivalent is None or equivalent.answer is not None
-        return RawRequest(message, LineReply, answered=answered, known=True)
+        expects_answer = equivalent is None or equivalent.answer is not None
+        return RawRequest(message, LineReply, expects_answer=expects_answer, known=True)
 
     def _equivalent_row(self, message: LineCommand) -> LineRow | None:
         """Return the row of a client's request that sends the same command as a user's line."""
@@ -315,8 +318,10 @@ class LineDialect(Dialect):
         if row is None or equivalent is None:
             return row
         answer = None if equivalent.answer is None else row.answer
-        word = None if equivalent.script is not None else equivalent.word
-        return row._replace(answer=answer, word=word, echo=equivalent.echo, until=equivalent.until)
+        word = None if equivalent.script is not None else equivalent.answer_word
+        return row._replace(
+            answer=answer, answer_word=word, echo=equivalent.echo, until=equivalent.until
+        )
 
     def body(self, answer: m.Message) -> bytes:
         """Return the bytes of the answer to a line of the user's own.
@@ -421,7 +426,7 @@ class LineMachine:
         self.dialect: LineDialect = dialect
         self.candidates: Sequence[Dialect] = (dialect,)
         self.transport: Transport = transport
-        self.replies: bool = True
+        self.may_reply: bool = True
         self.counters: Counters = Counters()
         self.state: State = State.IDLE
         self._trace = trace
@@ -443,9 +448,9 @@ class LineMachine:
     # ------------------------------------------------------------------ bytes in
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Copy of the bytes of an unfinished line."""
-        return self._reader.pending
+        return self._reader.unfinished_bytes
 
     def get_buffer(self) -> memoryview:
         """Return the buffer for the next bytes; call :meth:`buffer_updated` next."""
@@ -473,7 +478,7 @@ class LineMachine:
             self._end_link(State.FAILED, LinkFailed(error=error))
 
     def receive_eof(self) -> None:
-        """Note that the camera will send no more; call :meth:`events` next."""
+        """Record that the camera will send no more; call :meth:`events` next."""
         if self.state not in {State.FAILED, State.CLOSED}:
             self._end_link(State.CLOSED, LinkEnded(pending=len(self._reader)))
 
@@ -525,7 +530,7 @@ class LineMachine:
             by_word: try only the rows with this word; otherwise only the rows without a word.
         """
         for row in self._unasked:
-            if by_word != bool(row.word) or (by_word and row.word != word):
+            if by_word != bool(row.answer_word) or (by_word and row.answer_word != word):
                 continue
             try:
                 reported = row.read(text)
@@ -601,7 +606,7 @@ class LineMachine:
         self._note_application(messages)
 
     def _note_application(self, reported: Reported, question: int = 0) -> None:
-        """Note which application is active; ask again if results came after the question."""
+        """Record which application is active; ask again if results came after the question."""
         for message in reported if isinstance(reported, tuple) else (reported,):
             if not isinstance(message, m.QueryAnswer | m.SwitchAnswer):
                 continue
@@ -670,8 +675,8 @@ class LineMachine:
     def _start_request(self, row: LineRow, message: m.Message, *, question: int = 0) -> None:
         """Send the first line of a request, or queue the request."""
         script = self.dialect.script(row, message)
-        request = _OpenRequest(row, script, next(script), row.word, question=question)
-        if row.answer is None or self.dialect.at_once or not self._open_requests:
+        request = _OpenRequest(row, script, next(script), row.answer_word, question=question)
+        if row.answer is None or self.dialect.pipelined or not self._open_requests:
             self._send_line(request)
         else:
             self.dialect.pack(request.line, "")  # if this raises, nothing has changed

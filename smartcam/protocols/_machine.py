@@ -104,7 +104,7 @@ class LinkMachine(Protocol):
 
     transport: Transport
     """The transport of the link."""
-    replies: bool
+    may_reply: bool
     """True if receiving bytes may give the machine bytes to send, such as a queued request."""
     counters: Counters
     """The counters of bytes and messages."""
@@ -125,7 +125,7 @@ class LinkMachine(Protocol):
         ...
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Copy of the received bytes of an unfinished frame."""
         ...
 
@@ -148,7 +148,7 @@ class LinkMachine(Protocol):
         """Add bytes of a stream, or one whole datagram; never raises for bad bytes."""
 
     def receive_eof(self) -> None:
-        """Note that the peer will send no more."""
+        """Record that the peer will send no more."""
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; the caller owns the list."""
@@ -177,7 +177,7 @@ def send_each(machine: LinkMachine, messages: Iterable[m.Message]) -> None:
     not wait for an answer, since the camera also sends statuses by itself.
 
     Raises:
-        LocalProtocolError: the link's state forbids a message; the messages before it are sent.
+        LocalProtocolError: the link's state forbids a message; ``data_to_send()`` has those before.
     """
     has_query = False
     for message in messages:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ConfigurationError, FrameError
-from smartcam.protocols._base import Spelled
+from smartcam.protocols._base import ReadableFrame
 from smartcam.protocols._line_reader import LineReader
 from smartcam.protocols._lines import LineDialect
 
@@ -43,7 +43,7 @@ class TicketedDialect(LineDialect):
     line_end: bytes = b"\r\n"
     max_line: int = 1 << 16
     tickets: range = range(1000, 10000)
-    at_once: bool = True
+    pipelined: bool = True
 
     def __post_init__(self) -> None:
         if self.split is None and self.tickets:
@@ -61,10 +61,10 @@ class TicketedDialect(LineDialect):
             raise ValueError(line)
         return ticket, line[self.width :]
 
-    def frame(self, content: bytes, ticket: str, *, length: bool) -> bytes:
+    def frame(self, content: bytes, ticket: str, *, with_length: bool) -> bytes:
         """Return the bytes of a frame, with or without the length."""
         body = ticket.encode() + content + self.line_end
-        if not length:
+        if not with_length:
             return body
         return f"{ticket}L{len(body):0{self.digits}}".encode() + self.line_end + body
 
@@ -77,9 +77,10 @@ class TicketedDialect(LineDialect):
         data = line.encode(ENCODING, "replace")
         if len(data) > self.max_line or (not self.asks_with_length and b"\r\n" in data):
             raise ConfigurationError(
-                f"dialect {self.name}: {line[:64]!r} is no request of {self.max_line} bytes"
+                f"dialect {self.name}: {line[:64]!r} is longer than {self.max_line} bytes, or "
+                "contains CR LF"
             )
-        return self.frame(data, ticket, length=self.asks_with_length)
+        return self.frame(data, ticket, with_length=self.asks_with_length)
 
     def reader(self, max_length: int = 0) -> LineReader:
         """Return a new reader that cuts a stream into contents, each with its ticket."""
@@ -88,7 +89,7 @@ class TicketedDialect(LineDialect):
         line_end = re.compile(re.escape(self.line_end))
         return LineReader(line_end, max_line=max_length, encoding=ENCODING)
 
-    def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
+    def make_readable(self, sender: m.Sender, frame: Frame) -> ReadableFrame:
         """Return a frame in readable form."""
         from_client = sender.value == "client"  # the client's frames are traced with their header
         has_header = from_client and self.asks_with_length
@@ -96,8 +97,10 @@ class TicketedDialect(LineDialect):
         ticket, content = body[: self.width].decode(ENCODING), body[self.width :]
         data = frame.payload + self.line_end
         if not from_client:
-            data = self.frame(content, ticket, length=self.digits > 0)
-        return Spelled(None, "frame", {"ticket": ticket, "text": content.decode(ENCODING)}, data)
+            data = self.frame(content, ticket, with_length=self.digits > 0)
+        return ReadableFrame(
+            None, "frame", {"ticket": ticket, "text": content.decode(ENCODING)}, data
+        )
 
 
 class HeaderReader(LineReader):
@@ -130,9 +133,11 @@ class HeaderReader(LineReader):
         if form is None:
             raise FrameError(f"{header!r} came, no frame begins so", data=header)
         length = int(form[2])
-        if not self._ticket_digits + 2 <= length <= self._ticket_digits + 2 + self._max_length:
+        shortest = self._ticket_digits + 2
+        longest = shortest + self._max_length
+        if not shortest <= length <= longest:
             raise FrameError(
-                f"a frame of {length} bytes came, at most {self._max_length} are accepted",
+                f"a frame announces {length} bytes; {shortest} to {longest} are accepted",
                 data=header,
             )
         if len(self._buffer) < self._header_bytes + length:

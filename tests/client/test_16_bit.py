@@ -286,7 +286,7 @@ async def test_b16_request_it_lacks_names_dialect_and_abilities() -> None:
             await camera.reset_errors()
         assert str(caught.value) == (
             "dialect b16 has no ResetErrors; it can: switch, start_stop, reboot, get_clock, "
-            "set_clock, input_data, sequence_number, status_by_itself, unasked_results"
+            "set_clock, input_data, sequence_number, unasked_status, unasked_results"
         )
         with pytest.raises(UnsupportedError, match="dialect b16 has no GetStatus"):
             await camera.query_status()

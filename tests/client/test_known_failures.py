@@ -272,7 +272,7 @@ async def test_false_length_of_a_result_ends_the_link_when_others_come(
 async def test_frame_that_trickles_ends_the_link(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    give_frames(monkeypatch, HINT_TIME=0.0, FRAME_TIME=0.0, FRAME_RATE=float("inf"))
+    give_frames(monkeypatch, HINT_TIME=0.0, FRAME_TIME=0.0, MIN_BYTES_PER_SECOND=float("inf"))
     box_of: Any = {"dialect": kind} if kind != "bid" else {}
     opening: Any = by_hand if kind != "bid" else bid_by_hand
     async with opening(box=box_of, reconnect=FAST) as (box, camera):

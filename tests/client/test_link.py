@@ -686,7 +686,7 @@ async def test_trace_shows_what_is_left_of_an_unfinished_frame(server: Listener,
     entries = Entries()
     link, peer = await session(server, entries.take)
     peer.write(STATUS[:15])
-    await until(lambda: len(link.machine.pending) == 15)
+    await until(lambda: len(link.machine.unfinished_bytes) == 15)
     if how == "the camera closes":
         peer.close()
         await until(lambda: link.lost)

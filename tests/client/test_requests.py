@@ -305,7 +305,9 @@ async def test_request_sends_the_payload_as_it_is(payload: bytes) -> None:
 @pytest.mark.parametrize("payload", [b"", b"more"])
 async def test_request_of_a_session_is_refused(message_id: int, payload: bytes) -> None:
     async with by_hand() as (box, camera):
-        with pytest.raises(LocalProtocolError, match="the session is the client's own"):
+        with pytest.raises(
+            LocalProtocolError, match="only the client itself sends Connect and Disconnect"
+        ):
             await camera.request(message_id, payload)
         assert box.ids == [DISCONNECT, CONNECT, QUERY]
 

@@ -206,7 +206,7 @@ def test_cutting_gives_back_every_byte(dialect: Any) -> None:
     for at in range(len(data)):
         framer = Framer(dialect.header, 100)
         messages = parse(data[:at], framer, dialect) + parse(data[at:], framer, dialect)
-        assert b"".join(one.original for one in messages) + framer.pending == data
+        assert b"".join(one.original for one in messages) + framer.unfinished_bytes == data
         assert [one.content for one in messages if isinstance(one.content, Frame)] == [
             Frame(0x31, b"\x15\0\0\0")
         ] * 3

@@ -58,7 +58,7 @@ def check_framer(data: bytes) -> None:
                 frame = framer.next_frame()
             except FrameError as error:
                 before = stream[done:fed]
-                assert framer.pending == before, "a FrameError consumed something"
+                assert framer.unfinished_bytes == before, "a FrameError consumed something"
                 assert 0 <= error.offset < header.size
                 assert error.data == before[: len(error.data)]
                 assert len(error.data) <= 64
@@ -76,7 +76,7 @@ def check_framer(data: bytes) -> None:
         assert framer.buffered == fed - done
         assert framer.buffered < header.size + max(limit, 1), "more is kept than one frame"
     assert found == frames
-    assert framer.pending == rest
+    assert framer.unfinished_bytes == rest
     for frame in found:
         again = Framer(header, limit)
         again.feed(header.pack(frame.message_id, len(frame.payload)) + frame.payload)

@@ -89,6 +89,6 @@ def _told(
                 type(event.error).__name__ if isinstance(event, LinkFailed) else repr(event)
             )
             owned += isinstance(event, m.ResultContainer) and event.requested is True
-        assert len(machine.pending) <= 2 * MAX_LENGTH + dialect.max_line
+        assert len(machine.unfinished_bytes) <= 2 * MAX_LENGTH + dialect.max_line
     assert owned <= triggers, "a container is a trigger's that nobody has sent"
     return told

@@ -188,7 +188,7 @@ async def next_of(stream: Subscription[Any]) -> object:
 async def streams(bench: Bench) -> None:
     camera = bench.camera
     subscribed: list[Subscription[Any]] = [camera.results(), camera.statuses()]
-    if camera.capabilities.status_by_itself:  # else a change may fall between two questions
+    if camera.capabilities.unasked_status:  # else a change may fall between two questions
         subscribed.append(camera.events())
     async with asyncio.TaskGroup() as group:
         for stream in subscribed:
@@ -205,14 +205,14 @@ async def lost(bench: Bench) -> None:
 
 async def status_of_a_run(bench: Bench) -> None:
     bench.box.device.trigger()
-    if bench.camera.capabilities.status_by_itself:
+    if bench.camera.capabilities.unasked_status:
         await bench.camera.wait_status(lambda status: Status.WAITING_FOR_TRIGGER not in status)
     await bench.camera.wait_status(lambda status: Status.WAITING_FOR_TRIGGER in status)
 
 
 async def ready_after_a_switch(bench: Bench) -> None:
     bench.box.device.switch_application(AWAY, running=True)
-    if bench.camera.capabilities.status_by_itself:
+    if bench.camera.capabilities.unasked_status:
         await bench.camera.wait_status(lambda status: Status.BUSY in status)
     await bench.camera.wait_ready()
 
@@ -531,7 +531,7 @@ async def _check_state(bench: Bench, call: Call) -> None:
     assert active == camera.active_application == device.active_application
     assert active in call.homes
     assert inside(camera)._state.wanted.application in {None, active}
-    if not camera.capabilities.status_by_itself:
+    if not camera.capabilities.unasked_status:
         await camera.query_status()
     bits = bench.box.wire_dialect.status_bits
     assert camera.status == bits.read(bits.write(device.status))

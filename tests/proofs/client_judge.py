@@ -441,7 +441,7 @@ class ClientJudge:
         camera, device = self.camera, self.box.device
         assert camera is not None
         try:
-            if not camera.capabilities.status_by_itself:
+            if not camera.capabilities.unasked_status:
                 self.run(camera.query_status())
             active = self.run(camera.query_application())
         except (smartcam.ResponseTimeoutError, *LINK_LOST):

@@ -70,7 +70,7 @@ class World(NamedTuple):
     @property
     def is_asked(self) -> bool:
         """True if the status comes when it is asked for, and not by itself."""
-        return not self.spoken.status_by_itself
+        return not self.spoken.unasked_status
 
     @property
     def layout(self) -> str:

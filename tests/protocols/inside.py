@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from smartcam.protocols._base import UNDOCUMENTED
 from smartcam.protocols._framed import frame_age, framing, machine
-from smartcam.protocols._framed.frame_age import FRAME_RATE, FRAME_TIME, HINT_TIME, UnfinishedFrame
+from smartcam.protocols._framed.frame_age import (
+    FRAME_TIME,
+    HINT_TIME,
+    MIN_BYTES_PER_SECOND,
+    UnfinishedFrame,
+)
 from smartcam.protocols._framed.machine import Machine
 from smartcam.protocols._insight.answers import MAX_IMAGE_BYTES, AnswerReader, CommandAnswer
 from smartcam.protocols._insight.dialect import NATIVE, InSightDialect

@@ -23,7 +23,7 @@ from smartcam.protocols import (
     Verdict,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy, Spelled
+from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy, ReadableFrame
 from tests.machines import B16, BID, CODE, NO_ID, THESIS
 from tests.protocols.inside import UNDOCUMENTED
 
@@ -82,11 +82,11 @@ class Spoken(Dialect):
     def message_id(self, message: m.Message | type[m.Message]) -> int:
         raise self.unsupported(message if isinstance(message, type) else type(message))
 
-    def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
-        return Spelled(None, frame.payload.decode(), None, frame.payload)
+    def make_readable(self, sender: m.Sender, frame: Frame) -> ReadableFrame:
+        return ReadableFrame(None, frame.payload.decode(), None, frame.payload)
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        return RawRequest(m.Query(), m.QueryAnswer, answered=True, known=True)
+        return RawRequest(m.Query(), m.QueryAnswer, expects_answer=True, known=True)
 
     def body(self, answer: m.Message) -> bytes:
         return b""

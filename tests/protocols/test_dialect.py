@@ -16,7 +16,7 @@ from smartcam.exceptions import (
 from smartcam.models import Status
 from smartcam.protocols import CodeMeaning, Frame, FramedDialect, RawRequest, StatusBits, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import HANDBOOK, ResultCode, Spelled
+from smartcam.protocols._inside import HANDBOOK, ReadableFrame, ResultCode
 from tests.machines import (
     B16,
     BID,
@@ -173,7 +173,7 @@ def test_encode_message_that_the_dialect_lacks_is_unsupported() -> None:
         WITHOUT_SWITCH.encode(m.SwitchApplication(application=1))
     assert str(caught.value) == (
         "dialect small has no SwitchApplication; it can: start_stop, reboot, get_clock, set_clock, "
-        "input_data, sequence_number, status_by_itself, unasked_results"
+        "input_data, sequence_number, unasked_status, unasked_results"
     )
 
 
@@ -201,7 +201,7 @@ BVS_SC = ["switch", "start_stop", "reboot", "get_clock", "set_clock", "input_dat
     ("dialect", "names"),
     [
         *(
-            (one, [*BVS_SC, "sequence_number", "status_by_itself", "unasked_results"])
+            (one, [*BVS_SC, "sequence_number", "unasked_status", "unasked_results"])
             for one in DIALECTS
             if one is not BID
         ),
@@ -532,11 +532,13 @@ def test_spell_has_the_fields_on_the_wire_and_none_where_they_cannot_be_read(
     frame: Frame,
     spelled: tuple[int, str, dict[str, object] | None],
 ) -> None:
-    assert dialect.spell(sender, frame) == Spelled(*spelled, data=dialect.encode_frame(frame))
+    assert dialect.make_readable(sender, frame) == ReadableFrame(
+        *spelled, data=dialect.encode_frame(frame)
+    )
 
 
 def test_spell_status_has_the_names_of_its_bits() -> None:
-    fields = BID.spell(CAMERA, Frame(0x12, bytes.fromhex("2001"))).fields
+    fields = BID.make_readable(CAMERA, Frame(0x12, bytes.fromhex("2001"))).fields
     assert fields is not None
     assert fields == {"status": ["RUNNING", "OVERTRIGGERED"]}
 
@@ -545,7 +547,7 @@ def test_spell_status_has_the_names_of_its_bits() -> None:
 def test_spell_every_message_has_the_dialects_fields(
     dialect: FramedDialect, message: m.Message
 ) -> None:
-    spelled = dialect.spell(message.sender, dialect.to_frame(message))
+    spelled = dialect.make_readable(message.sender, dialect.to_frame(message))
     assert spelled.message == type(message).__name__
     assert spelled.fields is not None
     assert tuple(spelled.fields) == dialect.fields(type(message))
@@ -578,7 +580,7 @@ def test_raw_request_is_the_message_where_it_is_one_and_its_bytes_elsewhere(
     known: bool,
 ) -> None:
     sent = message or m.UnknownMessage(message_id=message_id, payload=payload)
-    expected = RawRequest(sent, answer, answered=answered, known=known)
+    expected = RawRequest(sent, answer, expects_answer=answered, known=known)
     assert dialect.raw_request(message_id, payload) == expected
     assert dialect.to_frame(sent) == Frame(message_id, payload)
 
@@ -588,7 +590,7 @@ def test_raw_request_of_the_session_is_refused(dialect: FramedDialect) -> None:
     for message_id in (0x01, 0x02):
         with pytest.raises(LocalProtocolError) as caught:
             dialect.raw_request(message_id, b"")
-        assert str(caught.value) == "the session is the client's own"
+        assert str(caught.value) == "only the client itself sends Connect and Disconnect"
 
 
 def test_raw_request_with_a_word_for_an_id_is_unsupported() -> None:

@@ -11,7 +11,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._framed.dialect import MAX_SURPLUS_BYTES
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event
 from tests.machines import B16, DIALECTS, THESIS, camera, client, label
-from tests.protocols.inside import FRAME_RATE, FRAME_TIME, HINT_TIME, UnfinishedFrame
+from tests.protocols.inside import FRAME_TIME, HINT_TIME, MIN_BYTES_PER_SECOND, UnfinishedFrame
 from tests.strategies import over
 
 RESULT, UNKNOWN = 0x20, 0x77
@@ -128,7 +128,7 @@ def test_frame_that_trickles_is_refused_in_the_end(
     dialect: FramedDialect, number: int, size: int | None
 ) -> None:
     size = size or large(dialect)
-    made, bound = client(dialect), FRAME_TIME + (size + dialect.header.size) / FRAME_RATE
+    made, bound = client(dialect), FRAME_TIME + (size + dialect.header.size) / MIN_BYTES_PER_SECOND
     begun = dialect.encode(STATUS) + dialect.header.pack(number, size)
     assert read(made, begun, 100.0) == [STATUS]
     events: list[Event] = []
@@ -157,11 +157,11 @@ def test_header_that_trickles_is_refused_in_the_end(dialect: FramedDialect) -> N
 def test_frame_may_take_the_time_of_its_length(dialect: FramedDialect) -> None:
     made, data = client(dialect), bytes(large(dialect) - 4)
     frame = whole(dialect, data)
-    step = FRAME_RATE // 4
+    step = MIN_BYTES_PER_SECOND // 4
     for place in range(0, len(frame) - step, step):
-        assert read(made, frame[place : place + step], place / FRAME_RATE) == []
+        assert read(made, frame[place : place + step], place / MIN_BYTES_PER_SECOND) == []
     last = len(frame) - 1 - (len(frame) - 1) % step
-    assert len(read(made, frame[last:], last / FRAME_RATE + FRAME_TIME)) == 1
+    assert len(read(made, frame[last:], last / MIN_BYTES_PER_SECOND + FRAME_TIME)) == 1
 
 
 @each_dialect

@@ -92,14 +92,14 @@ def test_framer_one_frame_gives_it_and_keeps_nothing() -> None:
     framer = fed(STATUS)
     assert framer.next_frame() == STATUS_FRAME
     assert framer.next_frame() is None
-    assert (framer.buffered, framer.pending) == (0, b"")
+    assert (framer.buffered, framer.unfinished_bytes) == (0, b"")
 
 
 def test_framer_trailing_bytes_belong_to_the_next_frame() -> None:
     framer = fed(STATUS + QUERY[:7])
     assert framer.next_frame() == STATUS_FRAME
     assert framer.next_frame() is None
-    assert framer.pending == QUERY[:7]
+    assert framer.unfinished_bytes == QUERY[:7]
     framer.feed(QUERY[7:])
     assert framer.next_frame() == Frame(0x30, b"")
 
@@ -277,7 +277,7 @@ def test_framer_without_magic_looks_at_lengths_only() -> None:
 def test_resync_skips_to_what_may_begin_a_frame(data: bytes, skipped: int, left: bytes) -> None:
     framer = fed(data)
     assert framer.resync() == skipped
-    assert framer.pending == left
+    assert framer.unfinished_bytes == left
     assert framer.buffered == len(left)
 
 
@@ -306,7 +306,7 @@ def followers(framer: Framer, dialect: FramedDialect, size: int) -> tuple[list[b
     found = framer.cut()
     assert found is not None
     like = found[1] - dialect.header.size
-    return framer.following(dialect.header.reader(size), like, size), framer.pending
+    return framer.following(dialect.header.reader(size), like, size), framer.unfinished_bytes
 
 
 def frame_of(dialect: FramedDialect, payload: bytes, message_id: int = 0x20) -> bytes:

@@ -38,12 +38,14 @@ DIALECT = LineDialect(
             lambda text: m.QueryAnswer(application=int(text)),
         ),
         LineRow(m.Trigger, "{ticket}>READ", m.ResultContainer, read),
-        LineRow(None, "results", m.ResultContainer, read, word="0"),
-        LineRow(None, "remarks", m.Notice, lambda text: m.Notice("debug", 0, text), word="00"),
+        LineRow(None, "results", m.ResultContainer, read, answer_word="0"),
+        LineRow(
+            None, "remarks", m.Notice, lambda text: m.Notice("debug", 0, text), answer_word="00"
+        ),
     ),
     split=lambda line: (line.partition(">")[0], line.partition(">")[2]),
     tickets=range(1, 10_000),
-    at_once=True,
+    pipelined=True,
     names_application=False,
 )
 

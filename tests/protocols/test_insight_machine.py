@@ -308,7 +308,7 @@ def test_request_trace_has_every_byte(
     spelled = dict.fromkeys(m.Sender, b"")
     for sender, frame in talk.traced:
         assert isinstance(frame, Frame)
-        spelled[sender] += NATIVE.spell(sender, frame).data
+        spelled[sender] += NATIVE.make_readable(sender, frame).data
     assert spelled == {m.Sender.CLIENT: written, m.Sender.CAMERA: heard}
     counters = talk.machine.counters
     assert counters.bytes_received == len(LOGIN) + len(heard)
@@ -570,7 +570,7 @@ def test_password_is_in_no_trace_and_no_repr() -> None:
     assert "hunter2" not in repr([talk.traced, dialect])
     sent = [frame for sender, frame in talk.traced if sender is m.Sender.CLIENT]
     assert sent == [Frame(Piece.LINE, b"op"), Frame(Piece.PASSWORD, b"")]
-    spelled = dialect.spell(m.Sender.CLIENT, Frame(Piece.PASSWORD, b""))
+    spelled = dialect.make_readable(m.Sender.CLIENT, Frame(Piece.PASSWORD, b""))
     assert spelled == (None, "password", {"text": "***"}, b"")
 
 
@@ -583,7 +583,7 @@ def test_password_is_in_no_trace_and_no_repr() -> None:
     ],
 )
 def test_spell_gives_text_and_bytes(sender: m.Sender, frame: Frame, spelled: object) -> None:
-    assert NATIVE.spell(sender, frame) == spelled
+    assert NATIVE.make_readable(sender, frame) == spelled
 
 
 @pytest.mark.parametrize(

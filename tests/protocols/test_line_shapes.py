@@ -90,7 +90,9 @@ ECHO = LineDialect(
         LineRow(m.Connect, "RM", m.ConnectAnswer, connected),
         LineRow(m.GetStatus, "RS", m.StatusReport, status),
         LineRow(m.Query, "PR", m.QueryAnswer, query),
-        LineRow(m.Trigger, "TA", m.ResultContainer, taken, echo="TA", also=(m.TriggerAnswer,)),
+        LineRow(
+            m.Trigger, "TA", m.ResultContainer, taken, echo="TA", other_answers=(m.TriggerAnswer,)
+        ),
         LineRow(m.EndTrigger, "TE", None, refuse_line),
     ),
     split=first_word,
@@ -104,11 +106,11 @@ AT_ONCE = LineDialect(
         LineRow(m.GetStatus, "||{ticket}>STATE", m.StatusReport, status),
         LineRow(m.Query, "||{ticket}>JOB", m.QueryAnswer, query),
         LineRow(m.Trigger, "||{ticket}>READ", m.ResultContainer, result),
-        LineRow(None, "by itself", m.ResultContainer, result, word="0"),
+        LineRow(None, "by itself", m.ResultContainer, result, answer_word="0"),
     ),
     split=lambda line: (line[2 : line.index(">")], line[line.index(">") + 1 :]),
     tickets=range(1, 4),
-    at_once=True,
+    pipelined=True,
     **COMMON,
 )
 
@@ -305,7 +307,7 @@ def test_frames_have_as_many_digits_as_their_dialect_says(tickets: range, digits
         digits=digits,
         **COMMON,
     )
-    frame = dialect.frame(b"Model 1", str(tickets[0]), length=True)
+    frame = dialect.frame(b"Model 1", str(tickets[0]), with_length=True)
     assert frame == b"%dL%0*d\r\n%dModel 1\r\n" % (
         *(tickets[0], digits, 9 + dialect.width, tickets[0]),
     )
@@ -336,7 +338,7 @@ def test_trigger_by_hand_is_the_clients_own(line: str) -> None:
     dialect = replace(SEVERAL, rows=(*SEVERAL.rows, *OWN), make="Acme")
     with pytest.raises(LocalProtocolError, match=r"Acme: .* call trigger\(\)"):
         dialect.raw_request(line, b"")
-    assert dialect.raw_request("MEASURE?", b"").answered
+    assert dialect.raw_request("MEASURE?", b"").expects_answer
 
 
 def test_line_of_ones_own_is_answered_in_the_shape_of_the_row_that_says_it() -> None:
@@ -351,7 +353,7 @@ def test_line_of_ones_own_is_answered_in_the_shape_of_the_row_that_says_it() -> 
 def test_line_of_ones_own_that_is_never_answered_is_not_waited_for() -> None:
     made = machine(replace(SEVERAL, rows=(*SEVERAL.rows, *OWN)))
     raw = made.dialect.raw_request("RESTART", b" NOW")
-    assert not raw.answered
+    assert not raw.expects_answer
     made.send(raw.message)
     made.send(m.Query())
     assert b"".join(made.data_to_send()) == b"RESTART NOW\nSCENE\n"

@@ -74,7 +74,7 @@ QUERY_ANSWER = bytes.fromhex("50535642 04000000 30000000 15000000")
 TRIGGER = bytes.fromhex("50535642 00000000 40000000")
 
 MALFORMED = m.MalformedMessage(message_id=0x40, payload=b"!")
-KIN = (B16, BID, CODE)
+CANDIDATES = (B16, BID, CODE)
 BID_OR_CODE = (BID, CODE)
 
 each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
@@ -469,7 +469,8 @@ def test_client_one_open_request_per_id(request_: m.Request, answer: m.Message) 
         made.send(request_)
     message_id = HANDBOOK.message_id(request_)
     assert str(caught.value) == (
-        f"an answer to message {message_id:#04x} is still owed; one request of an id can be open"
+        f"an answer to message {message_id:#04x} is still owed; only one request of an id may be "
+        "open at a time"
     )
     assert (made.data_to_send(), made.counters) == ([HANDBOOK.encode(request_)], sent)
     assert feed(made, STATUS, HANDBOOK.encode(answer)) == [STATUS_MESSAGE, answer]
@@ -678,9 +679,9 @@ def test_camera_hears_a_chunk_that_came_before_as_one_that_did_not(
             assert said[0] == said[1]
             if said[0] is not None:
                 assert b"".join(said[0]) == dialect.encode(one)
-        assert (fast.state, fast.pending, fast.counters) == (
+        assert (fast.state, fast.unfinished_bytes, fast.counters) == (
             slow.state,
-            slow.pending,
+            slow.unfinished_bytes,
             slow.counters,
         )
     assert seen[0] == seen[1]
@@ -817,7 +818,7 @@ def test_answer_that_came_before_waits_for_its_last_byte() -> None:
     for cut in range(1, len(QUERY_ANSWER)):
         made.send(m.Query())
         assert feed(made, QUERY_ANSWER[:cut]) == []
-        assert made.pending == QUERY_ANSWER[:cut]
+        assert made.unfinished_bytes == QUERY_ANSWER[:cut]
         assert feed(made, QUERY_ANSWER[cut:]) == [m.QueryAnswer(application=21)]
 
 
@@ -911,7 +912,7 @@ def test_result_as_there_was_one_before_waits_for_its_last_byte() -> None:
     assert feed(made, STATUS, HANDBOOK.encode(result(b"abcd"))) == [STATUS_MESSAGE, result(b"abcd")]
     for cut in range(1, len(other)):
         assert feed(made, other[:cut]) == []
-        assert made.pending == other[:cut]
+        assert made.unfinished_bytes == other[:cut]
         assert feed(made, other[cut:] + STATUS) == [result(b"efgh"), STATUS_MESSAGE]
 
 
@@ -1153,7 +1154,9 @@ def test_camera_that_does_not_tell_drops_a_wrong_length() -> None:
 # ---------------------------------------------------------------------- dialects that begin alike
 
 
-def asking(transport: Transport = TCP, *, candidates: tuple[FramedDialect, ...] = KIN) -> Machine:
+def asking(
+    transport: Transport = TCP, *, candidates: tuple[FramedDialect, ...] = CANDIDATES
+) -> Machine:
     """Return a client that has sent Disconnect and Connect to a camera of unknown dialect."""
     made = Machine(candidates[0], Role.CLIENT, transport, candidates=candidates)
     made.send(m.Disconnect())
@@ -1164,7 +1167,7 @@ def asking(transport: Transport = TCP, *, candidates: tuple[FramedDialect, ...] 
 
 def test_kin_of_a_machine_that_knows_is_its_dialect() -> None:
     assert Machine(BID, Role.CLIENT, TCP).candidates == (BID,)
-    assert asking().candidates == KIN
+    assert asking().candidates == CANDIDATES
     assert asking().dialect is B16
 
 
@@ -1209,7 +1212,7 @@ def test_kin_are_narrowed_by_an_answer_to_disconnect() -> None:
 def test_kin_that_an_answer_of_no_known_length_leaves_are_all(answer: str, taken: bool) -> None:
     made = asking()
     events = feed(made, bytes.fromhex(answer))
-    assert made.candidates == KIN
+    assert made.candidates == CANDIDATES
     if taken:
         assert events == [m.ConnectAnswer(version=1)]
         assert made.counters.long_bodies == 1
@@ -1224,7 +1227,7 @@ def test_kin_are_narrowed_before_the_trace_sees_the_frame() -> None:
     def trace(sender: m.Sender, frame: Frame | RemoteProtocolError) -> None:
         seen.append(made.dialect.name)
 
-    made = Machine(B16, Role.CLIENT, TCP, candidates=KIN, trace=trace)
+    made = Machine(B16, Role.CLIENT, TCP, candidates=CANDIDATES, trace=trace)
     made.send(m.Connect())
     feed(made, bytes.fromhex("01000400 0000 0100"))
     assert seen == ["b16", "bid"]
@@ -1278,10 +1281,10 @@ def test_kin_of_the_other_header_are_not_told_apart_by_it() -> None:
     """A frame with a magic number is waited for, as one of 16,982 bytes."""
     made = asking()
     assert feed(made, HANDBOOK.encode(m.ConnectAnswer(version=1))) == []
-    assert (made.candidates, made.buffered) == (KIN, 16)
+    assert (made.candidates, made.buffered) == (CANDIDATES, 16)
 
 
-@pytest.mark.parametrize("dialect", [*KIN, NO_ID], ids=label)
+@pytest.mark.parametrize("dialect", [*CANDIDATES, NO_ID], ids=label)
 @pytest.mark.parametrize("transport", Transport)
 def test_session_of_a_narrow_dialect_from_connect_to_disconnect(
     dialect: FramedDialect, transport: Transport

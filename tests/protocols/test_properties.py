@@ -255,4 +255,4 @@ def test_resync_is_a_search_for_the_next_magic(dialect: FramedDialect, data: st.
     skipped = framer.resync()
     places = range(1, len(noise) + 1)
     expected = next((at for at in places if magic.startswith(noise[at : at + 4])), 0)
-    assert (skipped, framer.pending) == (expected, noise[expected:])
+    assert (skipped, framer.unfinished_bytes) == (expected, noise[expected:])

@@ -53,7 +53,7 @@ def small_buffers() -> Iterator[None]:
         MIN_OWN_BUFFER_BYTES=LARGE,
         FIRST_READ_BYTES=FIRST_READ,
         MAX_READ_BYTES=MAX_READ,
-        MAX_ALIKE_FRAMES=ALIKE,
+        FRAMES_PER_CUT=ALIKE,
     ):
         yield
 
@@ -101,7 +101,7 @@ def taken(framer: Framer) -> list[Any]:
         try:
             frame = framer.next_frame()
         except FrameError as error:
-            what = (str(error), error.offset, error.data, framer.pending)
+            what = (str(error), error.offset, error.data, framer.unfinished_bytes)
             found += [what, framer.resync()]
         else:
             if frame is None:
@@ -134,7 +134,10 @@ def test_written_bytes_give_the_frames_and_errors_of_fed_ones(
             all_written += taken(written)
             all_fed += taken(fed)
             assert all_written == all_fed
-            assert (written.buffered, written.pending) == (fed.buffered, fed.pending)
+            assert (written.buffered, written.unfinished_bytes) == (
+                fed.buffered,
+                fed.unfinished_bytes,
+            )
             assert written.buffered <= header.size + limit
             assert len(written._store) <= most_kept
             assert len(written.buffer) <= most_kept + LARGE
@@ -221,7 +224,7 @@ def test_unfinished_large_frame_is_dropped_and_the_next_comes(drop: str, write: 
         framer.feed(whole[:5])
     else:
         assert framer.resync() == len(begun)
-    assert framer.pending == whole[:5]
+    assert framer.unfinished_bytes == whole[:5]
     framer.feed(whole[5:])
     assert framer.next_frame() == HANDBOOK.to_frame(m.QueryAnswer(application=21))
 

@@ -166,7 +166,7 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"code": lambda *_: CodeMeaning("no", Verdict.REFUSED)}, "no code says"),
         ({"capabilities": can(result_codes=True)}, "every code says done"),
     ],
-    "test_any_frame_can_be_shown": [({"spell": lambda *_: None}, "expected a Spelled")],
+    "test_any_frame_can_be_shown": [({"make_readable": lambda *_: None}, "expected a ReadableFrame")],
     "test_any_raw_request_is_taken_or_refused": [
         ({"raw_request": lambda *_: None}, "raw_request(0): None"),
         ({"body": lambda *_: "text"}, "expected bytes, got 'text'"),
@@ -203,7 +203,7 @@ def test_frames_that_are_read_otherwise_fail() -> None:
 
 
 def test_table_of_abilities_has_every_capability() -> None:
-    others = {"dialect", "status_by_itself", "unasked_results", "result_codes"}
+    others = {"dialect", "unasked_status", "unasked_results", "result_codes"}
     assert {one.name for one in dataclasses.fields(Capabilities)} == {
         *MESSAGES_BY_CAPABILITY,
         *others,
@@ -282,7 +282,7 @@ class Unbounded(Machine):
 
 class Hoarding(Unbounded):
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         return b""
 
 

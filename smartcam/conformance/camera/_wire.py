@@ -154,12 +154,12 @@ class RawDialect:
         return self._describe(Sender.CLIENT, parts[0], parts[1], data)
 
     def _describe(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
-        spelled = self.dialect.spell(sender, LibraryFrame(message_id, body))
-        fields = ", ".join(f"{name}={value}" for name, value in (spelled.fields or {}).items())
-        label = f"{spelled.message}({fields})" if len(fields) <= 100 else spelled.message
+        readable = self.dialect.make_readable(sender, LibraryFrame(message_id, body))
+        fields = ", ".join(f"{name}={value}" for name, value in (readable.fields or {}).items())
+        label = f"{readable.message}({fields})" if len(fields) <= 100 else readable.message
         if not self.dialect.knows(sender, message_id):
             label = f"id {message_id:#04x}"
-        return f"{label}: {hex_excerpt(raw or spelled.data)}"
+        return f"{label}: {hex_excerpt(raw or readable.data)}"
 
     def find_flaw(self, frame: ReceivedFrame) -> str | None:
         """Return in what a frame's id or length differs from the documents; None if it does not."""

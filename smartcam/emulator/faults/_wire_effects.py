@@ -21,7 +21,7 @@ class WireFramer(Protocol):
     """Cuts received bytes into frames."""
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Bytes of an unfinished frame."""
         ...
 
@@ -265,7 +265,7 @@ def parse(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessa
         try:
             frame = framer.next_frame()
         except FrameError:
-            before = framer.pending
+            before = framer.unfinished_bytes
             skipped = before[: framer.resync()]
             messages.append(WireMessage.of(skipped, skipped))
             continue

@@ -187,21 +187,28 @@ def _make_rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineR
     """
     read_error = _read_error if trigger.answer is m.ResultContainer else _read_error_or_overrun
     unasked_rows = (
-        LineRow(None, "results", m.ResultContainer, _read_result, word=RESULT_TICKET),
-        LineRow(None, "errors", m.Notice, read_error, word=ERROR_TICKET, also=(m.StatusReport,)),
+        LineRow(None, "results", m.ResultContainer, _read_result, answer_word=RESULT_TICKET),
+        LineRow(
+            None,
+            "errors",
+            m.Notice,
+            read_error,
+            answer_word=ERROR_TICKET,
+            other_answers=(m.StatusReport,),
+        ),
         LineRow(
             None,
             "notifications",
             m.Notice,
             partial(_read_notice, "notification"),
-            word=NOTIFICATION_TICKET,
+            answer_word=NOTIFICATION_TICKET,
         ),
         LineRow(
             None,
             "debug",
             m.Notice,
             lambda text: m.Notice("debug", 0, text[:200]),
-            word=DEBUG_TICKET,
+            answer_word=DEBUG_TICKET,
         ),
     )
     return (
@@ -230,7 +237,7 @@ def _make_rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineR
 
 
 SYNCHRONOUS_TRIGGER = LineRow(
-    m.Trigger, "T?", m.ResultContainer, _read_trigger_answer, also=(m.TriggerAnswer,)
+    m.Trigger, "T?", m.ResultContainer, _read_trigger_answer, other_answers=(m.TriggerAnswer,)
 )
 ASYNCHRONOUS_TRIGGER = LineRow(
     m.Trigger, "t", m.TriggerAnswer, lambda text: m.TriggerAnswer(code=_trigger_code(text) or 0)
@@ -347,7 +354,7 @@ def _make_version(name: str, about: str, tickets: range, digits: int) -> PcicDia
         rows=_make_rows(SYNCHRONOUS_TRIGGER, tickets=bool(tickets), lengths=bool(digits)),
         codes=_CODE_MEANINGS,
         tickets=tickets,
-        at_once=bool(tickets),
+        pipelined=bool(tickets),
         digits=digits,
         asks_with_length=name == "v3",
     )

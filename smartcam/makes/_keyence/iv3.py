@@ -111,7 +111,9 @@ LINES = LineDialect(
     about="lines that end with CR",
     source="docs/keyence.md, derived",
     rows=(
-        LineRow(m.Connect, "RT", m.ConnectAnswer, _read_connect_answer, also=(m.StatusReport,)),
+        LineRow(
+            m.Connect, "RT", m.ConnectAnswer, _read_connect_answer, other_answers=(m.StatusReport,)
+        ),
         LineRow(m.Query, "PR", m.QueryAnswer, _read_program),
         LineRow(
             m.SwitchApplication,
@@ -125,10 +127,10 @@ LINES = LineDialect(
             "T2",
             m.ResultContainer,
             _read_trigger_answer,
-            word="RT",
-            also=(m.TriggerAnswer,),
+            answer_word="RT",
+            other_answers=(m.TriggerAnswer,),
         ),
-        LineRow(None, "result", m.Notice, _read_unasked, word="RT"),
+        LineRow(None, "result", m.Notice, _read_unasked, answer_word="RT"),
         LineRow(LineCommand, "{line}", LineReply, _read_reply),
     ),
     ids=range(LAST_PROGRAM + 1),

@@ -121,8 +121,8 @@ def _make_rows(bank: int | None) -> tuple[LineRow, ...]:
             trigger_line,
             m.ResultContainer,
             _read_trigger_answer,
-            word="",
-            also=(m.TriggerAnswer,),
+            answer_word="",
+            other_answers=(m.TriggerAnswer,),
         ),
         LineRow(m.EndTrigger, "LOFF", None, refuse_line),
         LineRow(
@@ -130,7 +130,7 @@ def _make_rows(bank: int | None) -> tuple[LineRow, ...]:
             "LOFF",
             m.Notice,
             lambda line: m.Notice("error", _answer_code(line), line),
-            word="LOFF",
+            answer_word="LOFF",
         ),
         LineRow(None, "code", m.ResultContainer, _read_unasked),
         LineRow(LineCommand, "{line}", LineReply, _read_reply),
@@ -165,7 +165,7 @@ LINES = SrDialect(
     max_line=MAX_LINE_BYTES,
     encoding=ENCODING,
     split=_split,
-    at_once=True,
+    pipelined=True,
     codes=CODES,
     make="Keyence SR",
 )

@@ -59,7 +59,7 @@ def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
     good = [code for code, (_, verdict) in dialect.codes.items() if verdict is Verdict.DONE]
     refusal = c.Struct("code" / c.RawCopy(c.NoneOf(integer[dialect.word], good)), c.Terminated)
     for row in dialect.table:
-        if row.type.sender is sender and dialect.encoder(row.type).may_be_a_code:
+        if row.type.sender is sender and dialect.encoder(row.type).may_be_code_only:
             bodies[row.message_id] = c.Select(bodies[row.message_id], refusal)
     header = dialect.header
     size = c.this.length.value - header.length_includes

@@ -28,7 +28,7 @@ from smartcam.protocols._base import (
     CodeMeaning,
     Dialect,
     RawRequest,
-    Spelled,
+    ReadableFrame,
     Verdict,
 )
 from smartcam.protocols._framed.framing import Buffer, Framer, HeaderLayout, Lengths
@@ -58,7 +58,8 @@ class MessageRow(NamedTuple):
         message_id: id on the wire.
         type: the message.
         title: the message's name in the manual.
-        source: document that describes the message, with the grade of this knowledge.
+        source: document that describes the message, and whether that is published, derived or
+            inferred.
         omits: fields of the message that are not on this dialect's wire; they have defaults.
         byte_order: ``struct`` code of the body's byte order.
     """
@@ -82,6 +83,8 @@ NO_STATUS = Status(0)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusBits:
     """The meaning of the bits in a dialect's status word; by default, the meaning of Status.
+
+    With ``unnamed_shift`` 0 the word is a Status as it is, and nothing else is used.
 
     Attributes:
         named: bit on the wire to the status bit that means the same.
@@ -121,9 +124,9 @@ class StatusBits:
         return word
 
 
-MAX_KNOWN = 256
-"""Largest number of different messages of a type that a codec keeps to return them again. A camera
-sends few, but a peer could send any number."""
+MAX_CACHED_MESSAGES = 256
+"""Largest number of decoded messages that a codec caches. A camera sends few different ones, but a
+peer could send any number."""
 
 
 MAX_SURPLUS_BYTES = 1 << 12
@@ -163,10 +166,10 @@ class Codec:
         )
         self.size: int = self._body.size
         self.has_data: bool = self._data is not None
-        # if each answer begins with a code, a refusal may consist of the code only; but for the
-        # answer to Connect two bytes are the version in another dialect
-        answers = issubclass(row.type, Acknowledgement) and row.type is not ConnectAnswer
-        coded = answers and dialect.coded and "code" in self._fields
+        # if each answer begins with a code, a refusal may consist of the code only; not the answer
+        # to Connect: there two bytes may be the version of another dialect
+        is_answer = issubclass(row.type, Acknowledgement) and row.type is not ConnectAnswer
+        coded = is_answer and dialect.coded and "code" in self._fields
         self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
         self._meaning = dialect.code
         self._messages: dict[bytes, Message] = {}  # received bodies; messages are immutable
@@ -179,7 +182,7 @@ class Codec:
         ]
 
     @property
-    def may_be_a_code(self) -> bool:
+    def may_be_code_only(self) -> bool:
         """True if a refusal may consist of the result code only."""
         return self._code is not None and self._code.size < self.size
 
@@ -235,11 +238,11 @@ class Codec:
             if self._status is not None:
                 values = (self._status.read(values[0]), *values[1:])
             message = self._make(values)
-            if len(self._messages) < MAX_KNOWN:
+            if len(self._messages) < MAX_CACHED_MESSAGES:
                 self._messages[body] = message
         return message
 
-    def spell(self, body: bytes) -> dict[str, Any]:
+    def readable_fields(self, body: bytes) -> dict[str, Any]:
         """Return the fields of a body with data as JSON values; the body must be long enough.
 
         To be fast, no message object is made.
@@ -298,7 +301,8 @@ class WireQuirk(NamedTuple):
 
     Attributes:
         about: one line for people.
-        source: document that describes the deviation, with its grade.
+        source: document that describes the deviation, and whether that is published, derived or
+            inferred.
         rows: rows of the messages that differ.
         codes: meanings of the result codes, if they differ.
     """
@@ -347,7 +351,7 @@ class FramedDialect(Dialect):
         table: rows of the dialect's messages.
         status_bits: meaning of the bits of the status word.
         codes: meaning of the codes in answers.
-        status_by_itself: True if the camera sends its status with the session and at every change.
+        unasked_status: True if the camera sends its status with the session and at every change.
         wire_quirks: deviations by their names.
     """
 
@@ -356,7 +360,7 @@ class FramedDialect(Dialect):
     table: tuple[MessageRow, ...]
     status_bits: StatusBits = StatusBits()
     codes: Mapping[int, CodeMeaning] = field(default_factory=lambda: SWITCH_CODES)
-    status_by_itself: bool = True
+    unasked_status: bool = True
     wire_quirks: Mapping[str, WireQuirk] = field(default_factory=dict[str, WireQuirk])
 
     # made at their first use; most dialects of a protocol are never used
@@ -389,7 +393,7 @@ class FramedDialect(Dialect):
         return answers
 
     @cached_property
-    def constant(self) -> dict[type[Message], tuple[bytes, int, int | None]]:
+    def bodiless_frames(self) -> dict[type[Message], tuple[bytes, int, int | None]]:
         """Messages without a body: the whole frame, its id, the id of the answer."""
         frames: dict[type[Message], tuple[bytes, int, int | None]] = {}
         for row in self.table:
@@ -462,7 +466,7 @@ class FramedDialect(Dialect):
     def _capabilities(self) -> Capabilities:
         return Capabilities(
             dialect=self.name,
-            status_by_itself=self.status_by_itself,
+            unasked_status=self.unasked_status,
             unasked_results=True,
             result_codes=self.has(TriggerAnswer),
             **{name: self.has(message_type) for name, message_type in _ABILITIES.items()},
@@ -496,30 +500,30 @@ class FramedDialect(Dialect):
             return message.message_id
         return self.encoder(message if isinstance(message, type) else type(message)).message_id
 
-    def reinterpret_status(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status, read by the dialect ``reader``, as this dialect reads the same bits."""
-        if not isinstance(reader, FramedDialect):
+    def reinterpret_status(self, report: StatusReport, source_dialect: Dialect) -> StatusReport:
+        """Return a status, decoded by ``source_dialect``, as this dialect decodes the same bits."""
+        if not isinstance(source_dialect, FramedDialect):
             return report
-        word = reader.status_bits.write(report.status)
+        word = source_dialect.status_bits.write(report.status)
         return dataclasses.replace(report, status=self.status_bits.read(word))
 
     def data_begins(self, sender: Sender, message_id: int) -> int | None:
         codec = self.decoders(sender).get(message_id)
         return codec.size if codec is not None and codec.has_data else None
 
-    def spell(self, sender: Sender, frame: Frame) -> Spelled:
+    def make_readable(self, sender: Sender, frame: Frame) -> ReadableFrame:
         """Return a frame in readable form, for a trace; it never raises."""
         fields: dict[str, Any] | None = None
         codec = self.decoders(sender).get(frame.message_id)
         if codec is not None and codec.has_data and len(frame.payload) >= codec.size:
-            fields = codec.spell(frame.payload)
+            fields = codec.readable_fields(frame.payload)
         else:
             with contextlib.suppress(RemoteProtocolError):  # the trace shows the error next
                 message = self.decode(sender, frame)
                 names = self.fields(type(message))
                 fields = {name: jsonable(getattr(message, name)) for name in names}
         name = UnknownMessage.__name__ if codec is None else codec.type.__name__
-        return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
+        return ReadableFrame(frame.message_id, name, fields, self.encode_frame(frame))
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
         """Return a request by its id, for users who know a message that the dialect lacks.
@@ -532,12 +536,12 @@ class FramedDialect(Dialect):
             raise UnsupportedError(f"dialect {self.name}: a message id is a number: {message_id!r}")
         known = self.message_type(Sender.CLIENT, message_id)
         if known in {m.Connect, m.Disconnect}:
-            raise LocalProtocolError("the session is the client's own")
+            raise LocalProtocolError("only the client itself sends Connect and Disconnect")
         answer = self.message_type(Sender.CAMERA, message_id)
         return RawRequest(
             self._named_message(Frame(message_id, payload)),
             message_id if answer is UnknownMessage else answer,
-            answered=self.answer_id(message_id) is not None,
+            expects_answer=self.answer_id(message_id) is not None,
             known=known is not UnknownMessage,
         )
 
@@ -623,8 +627,8 @@ class FramedDialect(Dialect):
 
     def encode(self, message: Message) -> bytes:
         """Return a message's bytes on the wire; raises as :meth:`to_frame`."""
-        constant = self.constant.get(type(message))
-        return self.encode_frame(self.to_frame(message)) if constant is None else constant[0]
+        encoded = self.bodiless_frames.get(type(message))
+        return self.encode_frame(self.to_frame(message)) if encoded is None else encoded[0]
 
     def surplus(self, sender: Sender, frame: Frame) -> int:
         """Return by how many bytes a known message's body is longer than documented."""

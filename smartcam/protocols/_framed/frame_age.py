@@ -11,9 +11,9 @@ FRAME_TIME = 5.0
 """Seconds that a frame on TCP may take, in addition to the transfer time of its bytes. A camera
 writes a frame at once; TCP replaces lost segments within one or two seconds."""
 
-FRAME_RATE = 1 << 16
-"""Rate of the slowest line, bytes per second: half a megabit. The 64 kB that a camera sends at most
-may take 6 s; the 1 MiB that is accepted by default, 21 s."""
+MIN_BYTES_PER_SECOND = 1 << 16
+"""Rate of the slowest line that is allowed for: half a megabit. Then the 64 kB that a camera sends
+at most may take 6 s; the 1 MiB that is accepted by default, 21 s."""
 
 HINT_TIME = 1.0
 """Seconds after which another header inside an unfinished frame shows that the frame's length is

@@ -5,8 +5,8 @@ form of the header is data: :class:`HeaderLayout`. A length above the general li
 the limit of its message, is refused as soon as the header is received, so no more than one header
 and one payload of the permitted size is ever kept.
 
-A received chunk is not copied: frames are found in the chunk by offset. A large unfinished frame
-has its own buffer, into which the transport may write.
+Frames are found in a received chunk by offset; a large chunk is not copied. A large unfinished
+frame has its own buffer, into which the transport may write.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ MIN_READ_BYTES = 1 << 10
 """Least number of bytes to which the size of reads is reduced while frames are many and small."""
 
 
-MAX_ALIKE_FRAMES = 16
-"""Number of frames that are cut at once if they begin with the same bytes, including the length."""
+FRAMES_PER_CUT = 16
+"""Number of frames that are cut together if they begin with the same bytes, length included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,12 +114,12 @@ class Lengths:
         by_id: lengths of a message's payload, by its id.
 
     Attributes:
-        shortest: the smallest of the largest lengths; no message up to this length is too long.
+        always_allowed: the smallest of the messages' upper bounds: up to it, none is too long.
     """
 
     def __init__(self, by_id: Mapping[int, range]) -> None:
         self.by_id = by_id
-        self.shortest: int = min(
+        self.always_allowed: int = min(
             (length.stop - 1 for length in by_id.values()), default=sys.maxsize
         )
 
@@ -163,7 +163,7 @@ class Framer:
         Messages that are not in ``lengths`` may have any length up to ``max_length``.
         """
         self._lengths = lengths.by_id
-        self._always_allowed = min(self._max_length, lengths.shortest)
+        self._always_allowed = min(self._max_length, lengths.always_allowed)
 
     @property
     def buffered(self) -> int:
@@ -171,7 +171,7 @@ class Framer:
         return self._filled if self._large is not None else len(self.buffer) - self.start
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Copy of the bytes kept, for traces and error texts."""
         if self._large is not None:
             return bytes(self._large[: self._filled])
@@ -285,24 +285,24 @@ class Framer:
         """
         header, buffer, start = self._header, self.buffer, self.start
         payloads: list[bytes] = []
-        available, id_first, before = len(buffer), header.id_first, header.size
-        least, last = before + size, available - before - size
+        available, id_first, header_size = len(buffer), header.id_first, header.size
+        least, last = header_size + size, available - header_size - size
         if start > last or isinstance(buffer, memoryview):
             return payloads
         magic, wanted_id, wanted_length, first = read(buffer, model_start)
         if not id_first:
             wanted_id, wanted_length = wanted_length, wanted_id
-        before -= header.length_includes
+        length_to_size = header_size - header.length_includes
         longest = self._max_length + header.length_includes
-        length = before + wanted_length
+        length = length_to_size + wanted_length
         if (
-            start + MAX_ALIKE_FRAMES * length <= available
+            start + FRAMES_PER_CUT * length <= available
             and length >= least
             and wanted_length <= longest
         ):
             head, end = (
                 buffer[model_start : model_start + least],
-                start + (MAX_ALIKE_FRAMES - 1) * length,
+                start + (FRAMES_PER_CUT - 1) * length,
             )
             if buffer[start : start + least] == head == buffer[end : end + least]:
                 start = _cut_alike(buffer, start, head, length, payloads)
@@ -310,7 +310,7 @@ class Framer:
             next_magic, message_id, length, next_first = read(buffer, start)
             if not id_first:
                 message_id, length = length, message_id
-            end = start + before + length
+            end = start + length_to_size + length
             if (
                 message_id != wanted_id
                 or next_first != first
@@ -370,7 +370,7 @@ class Framer:
         """
         magic = self._header.magic
         if self._large is not None:
-            self.buffer, self.start, self._large = self.pending, 0, None
+            self.buffer, self.start, self._large = self.unfinished_bytes, 0, None
         self._copy_view(self.start)  # otherwise each search would copy the view
         begin = self.start
         begin_of_next = bytes(self.buffer).find(magic, begin + 1) if magic else -1
@@ -451,14 +451,14 @@ def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, pieces: list
     Returns:
         The offset of the next frame.
     """
-    cut = _cutter(MAX_ALIKE_FRAMES, len(head), length - len(head))
-    last = len(buffer) - MAX_ALIKE_FRAMES * length
+    cut = _cutter(FRAMES_PER_CUT, len(head), length - len(head))
+    last = len(buffer) - FRAMES_PER_CUT * length
     while start <= last:
         parts = cut(buffer, start)
-        if parts[::2].count(head) < MAX_ALIKE_FRAMES:
+        if parts[::2].count(head) < FRAMES_PER_CUT:
             break
         pieces += parts[1::2]
-        start += MAX_ALIKE_FRAMES * length
+        start += FRAMES_PER_CUT * length
     return start
 
 

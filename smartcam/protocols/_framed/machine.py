@@ -40,11 +40,11 @@ if TYPE_CHECKING:
     from smartcam.protocols.messages import Message
 
 MAX_EVENTS_PER_READ = 64
-"""Number of events of one read above which the next read takes fewer bytes, so that the work on one
+"""If one read gives more events than this, the next read takes fewer bytes, so that the work on one
 read does not delay other cameras."""
 
 MAX_FRAMES_PER_READ = 512
-"""Number of frames of one read above which the next read takes fewer bytes, even if all are one
+"""If one read gives more frames than this, the next read takes fewer bytes, even if all are one
 burst of results. The receive task handles fewer in a turn, so reading would pause after each read.
 """
 
@@ -153,8 +153,8 @@ _NEXT_STATES: dict[m.Sender, dict[State, dict[type[Message], State]]] = {
 """:data:`TRANSITIONS` by sender and state, which is faster to look up for each message."""
 
 
-_MadeFrame: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
-"""Bytes of a frame, its id and the id of its answer; the frame."""
+_EncodedFrame: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
+"""The encoded frame, its message id and the id of its answer; and the frame before encoding."""
 
 
 class _Delivery(NamedTuple):
@@ -162,26 +162,26 @@ class _Delivery(NamedTuple):
 
     Attributes:
         head: bytes before the result's data; all bytes if there is no result.
-        begin: offset where the data begins.
+        data_begin: offset where the data begins.
         tail: bytes after the data.
-        end: offset where the data ends.
+        data_end: offset where the data ends.
         pending: ids of the answers that were pending before the delivery.
         pending_after: ids of the answers that were pending after the delivery.
-        before: messages before the result; all messages if there is no result.
+        messages_before: messages before the result; all messages if there is no result.
         make: function that makes the result from its data; None if there is no result.
-        after: messages after the result.
+        messages_after: messages after the result.
         frames: number of frames.
     """
 
     head: bytes
-    begin: int
+    data_begin: int
     tail: bytes
-    end: int
+    data_end: int
     pending: tuple[int, ...]
     pending_after: tuple[int, ...]
-    before: list[Message]
+    messages_before: list[Message]
     make: Callable[[bytes], Message] | None
-    after: list[Message]
+    messages_after: list[Message]
     frames: int
 
 
@@ -226,13 +226,14 @@ class Machine:
     Attributes:
         get_buffer: function that returns the buffer for a stream's next bytes; call
             :meth:`buffer_updated` next.
+        may_reply: False: received bytes never give bytes to send.
         transitions: the next state by state, sender and type of message; all other messages are
             illegal.
     """
 
     # an object with more than thirty attributes and no slots is slower at each of them
     __slots__ = (
-        *("_bounded", "_burst_reader", "_burst_size", "_constant_frames", "_decoders"),
+        *("_bounded", "_burst_reader", "_burst_size", "_bodiless_frames", "_decoders"),
         *("_deliveries_left", "_events", "_framer", "_header_size", "_ignores_bytes"),
         *("_is_client", "_is_connecting", "_known_chunks", "_known_deliveries"),
         *("_known_messages", "_known_results", "_known_statuses", "_makes_bursts", "_outbox"),
@@ -246,7 +247,7 @@ class Machine:
             "dialect",
             "error",
             "candidates",
-            "replies",
+            "may_reply",
             "role",
             "get_buffer",
             "transport",
@@ -270,7 +271,7 @@ class Machine:
         self.candidates: Sequence[FramedDialect] = candidates or (dialect,)
         self.role = role
         self.transport = transport
-        self.replies: bool = False
+        self.may_reply: bool = False
         self.error: RemoteProtocolError | None = None
         self.counters: Counters = Counters()
         self._policy = policy or POLICIES[role, transport]
@@ -305,7 +306,7 @@ class Machine:
         # of a camera: messages and frames of chunks received in this state
         self._known_chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
         # of a camera, by the id of a message object sent before: the message and its frame
-        self._sent_frames: dict[int, tuple[Message, _MadeFrame]] = {}
+        self._sent_frames: dict[int, tuple[Message, _EncodedFrame]] = {}
         self._sent_data_key = 0  # the key of the last message with data
         self._status_id = self._status_size = 0
         self.state = State.IDLE
@@ -328,7 +329,7 @@ class Machine:
     def _use_dialect(self, dialect: FramedDialect) -> None:
         self.dialect = dialect
         self._decoders = dialect.decoders(self._peer_sender)
-        self._constant_frames = dialect.constant
+        self._bodiless_frames = dialect.bodiless_frames
         if self._bounded:
             self._framer.limit_lengths(dialect.lengths(self._peer_sender))
         result = dialect.encoder(m.ResultContainer)
@@ -366,9 +367,9 @@ class Machine:
         return self._framer.buffered
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Copy of the bytes of an unfinished frame."""
-        return self._framer.pending
+        return self._framer.unfinished_bytes
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> None:
         """Add bytes of a stream, or one whole datagram; call :meth:`events` next.
@@ -453,7 +454,7 @@ class Machine:
         return has_frames
 
     def receive_eof(self) -> None:
-        """Note that the peer will send no more; call :meth:`events` next."""
+        """Record that the peer will send no more; call :meth:`events` next."""
         if self._ignores_bytes:
             return
         self._events.append(LinkEnded(pending=self._framer.buffered))
@@ -489,20 +490,21 @@ class Machine:
                 f"{kind.__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        constant, frame = self._constant_frames.get(kind), None
-        if constant is None:
+        encoded, frame = self._bodiless_frames.get(kind), None
+        if encoded is None:
             known = self._sent_frames.get(id(message))
-            constant, frame = self._make_frame(message) if known is None else known[1]
-        data, message_id, pending = constant
+            encoded, frame = self._make_frame(message) if known is None else known[1]
+        data, message_id, answer_id = encoded
         if answered is not None:
-            pending = message_id if answered else None
-        if pending is not None and self._is_client:
-            if self._pending_ids.count(pending) > again:
+            answer_id = message_id if answered else None
+        if answer_id is not None and self._is_client:
+            max_pending = 2 if again else 1
+            if self._pending_ids.count(answer_id) >= max_pending:
                 raise LocalProtocolError(
-                    f"an answer to message {message_id:#04x} is still owed; one request of an id "
-                    "can be open"
+                    f"an answer to message {message_id:#04x} is still owed; only one request of an "
+                    "id may be open at a time"
                 )
-            self._pending_ids += (pending,)
+            self._pending_ids += (answer_id,)
         if next_state is not self._state:
             self.state = next_state
         self._outbox.append(data)
@@ -521,7 +523,7 @@ class Machine:
         sent.
 
         Raises:
-            LocalProtocolError: the state forbids a message; the messages before it are sent.
+            LocalProtocolError: the state forbids a message; :meth:`data_to_send` has those before.
         """
         sent_before = self._sent_together
         if sent_before is not None:
@@ -550,7 +552,7 @@ class Machine:
 
     # ------------------------------------------------------------------ inside
 
-    def _make_frame(self, message: Message) -> _MadeFrame:
+    def _make_frame(self, message: Message) -> _EncodedFrame:
         """Return a message's frame; a camera's machine keeps it for the next use of that object.
 
         Of messages with data, such as results, only the last frame is kept.
@@ -601,13 +603,13 @@ class Machine:
         buffer, start = framer.buffer, framer.start
         if not self._recognizes or isinstance(buffer, memoryview):
             return
-        known, size, status_id = self._known_statuses.get, self._status_size, self._status_id
+        find_status, size, status_id = self._known_statuses.get, self._status_size, self._status_id
         before, available = len(events), len(buffer)
         may_store = self._deliveries_left and available <= MAX_KNOWN_DELIVERY_BYTES
         pending_before = self._pending_ids if may_store and not start and not before else None
         while start < available:
             end = start + size
-            message = known(buffer[start:end])
+            message = find_status(buffer[start:end])
             if message is None:
                 match = self._find_result(buffer, start)
                 if match is None and self._pending_ids:
@@ -737,12 +739,14 @@ class Machine:
         other = framer.header_within(unfinished.searched)
         if other is not None:
             text = f"{which} holds another header at byte {other}; {progress}"
-        elif age > frame_age.FRAME_TIME + size / frame_age.FRAME_RATE:
+        elif age > frame_age.FRAME_TIME + size / frame_age.MIN_BYTES_PER_SECOND:
             text = f"{which} does not become whole: {progress}"
         else:
             unfinished.searched = max(framer.buffered - header.size + 1, 0)
             return False
-        self._reject(FrameError(text, offset=other or 0, data=framer.pending[: header.size]))
+        self._reject(
+            FrameError(text, offset=other or 0, data=framer.unfinished_bytes[: header.size])
+        )
         return True
 
     def _receive_datagram(self) -> None:
@@ -758,8 +762,8 @@ class Machine:
             frame = framer.cut()
             if frame is None or framer.buffered:
                 raise MessageError(
-                    f"a datagram is not one whole frame: {hex_excerpt(framer.pending)}",
-                    data=framer.pending,
+                    f"a datagram is not one whole frame: {hex_excerpt(framer.unfinished_bytes)}",
+                    data=framer.unfinished_bytes,
                 )
         except RemoteProtocolError as error:
             self._reject(error)
@@ -775,7 +779,7 @@ class Machine:
         counters, framer, size = self.counters, self._framer, end - begin
         counters.frames_received += 1
         if self._is_connecting and len(self.candidates) > 1:
-            self._narrow_kin(message_id, size)
+            self._narrow_candidates(message_id, size)
         if self._trace is not None:
             self._trace(self._peer_sender, Frame(message_id, framer.take(begin, end)))
         codec = self._decoders.get(message_id)
@@ -860,7 +864,7 @@ class Machine:
             self._deliveries_left, self._sent_together = MAX_KNOWN_DELIVERIES, None
             self._known_messages = {self._status_id: self._known_statuses}
 
-    def _narrow_kin(self, message_id: int, size: int) -> None:
+    def _narrow_candidates(self, message_id: int, size: int) -> None:
         """Remove the candidates that have no such message, or another length for it."""
         decoders = [
             dialect.decoders(self._peer_sender).get(message_id) for dialect in self.candidates
@@ -894,7 +898,7 @@ class Machine:
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
 
     def _accept_answer(self, message_id: int, *, known: bool) -> bool:
-        """Note that a pending answer has come; return False for an answer to no request.
+        """Record that a pending answer has come; return False for an answer to no request.
 
         A message with an unknown id is accepted in any case.
         """
@@ -906,7 +910,7 @@ class Machine:
         return not known
 
     def _remove_pending(self, message_id: int) -> None:
-        """Note that a pending answer has come."""
+        """Record that a pending answer has come."""
         at = self._pending_ids.index(message_id)
         self._pending_ids = self._pending_ids[:at] + self._pending_ids[at + 1 :]
 

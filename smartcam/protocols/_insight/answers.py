@@ -48,7 +48,7 @@ class CommandAnswer(NamedTuple):
 class AnswerReader(LineReader):
     """Cuts answers from a stream; the form of each depends on its command.
 
-    The machine that feeds the reader reads until nothing is left, so at most one line is kept.
+    The machine calls :meth:`next_answer` until it gets None, so at most one line is kept.
 
     Args:
         max_length: longest text accepted in an answer that states the text's length, bytes.

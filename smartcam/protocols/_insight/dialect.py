@@ -23,7 +23,7 @@ from smartcam.protocols._base import (
     Dialect,
     Protocol,
     RawRequest,
-    Spelled,
+    ReadableFrame,
     Transport,
     Verdict,
 )
@@ -63,7 +63,7 @@ _VERDICTS: Mapping[int, Verdict] = {
 }
 """Verdicts by status code; any other code is a refusal."""
 
-_LOGIN = CodeMeaning("the user or the password is wrong", Verdict.REFUSED)
+_WRONG_LOGIN = CodeMeaning("the user or the password is wrong", Verdict.REFUSED)
 
 _MNEMONICS: Mapping[type[m.Message], str] = {
     m.GetStatus: "GO",
@@ -95,7 +95,7 @@ class InSightDialect(Dialect):
         user: name of the user to log in.
         password: password of that user.
         cells: cells that are read after each trigger, in order, as commands name them.
-        counter: a cell that counts runs, read before and after them; "" for none.
+        counter: a cell that counts runs; it is read before and after ``cells``. "" for none.
     """
 
     user: str = "admin"
@@ -155,7 +155,7 @@ class InSightDialect(Dialect):
     def code(self, code: int, request: type[m.Message] | None = None) -> CodeMeaning:
         """Return the meaning of a status code in the answer to a request."""
         if request is m.Connect and code != StatusCode.DONE:
-            return _LOGIN
+            return _WRONG_LOGIN
         mnemonic = _MNEMONICS.get(request, "") if request is not None else ""
         return CodeMeaning(code_text(mnemonic, code), _VERDICTS.get(code, Verdict.REFUSED))
 
@@ -176,15 +176,15 @@ class InSightDialect(Dialect):
         command = message.line if isinstance(message, Command) else _MNEMONICS.get(kind, "")
         return f"{kind.__name__} ({command[:32]})"
 
-    def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
+    def make_readable(self, sender: m.Sender, frame: Frame) -> ReadableFrame:
         """Return a line in readable form; the password is not shown."""
         text = frame.payload.decode(ENCODING)
         if frame.message_id == Piece.PASSWORD:
-            return Spelled(None, "password", {"text": "***"}, b"")
+            return ReadableFrame(None, "password", {"text": "***"}, b"")
         if frame.message_id == Piece.TEXT:
-            return Spelled(None, "text", {"text": text}, frame.payload)
+            return ReadableFrame(None, "text", {"text": text}, frame.payload)
         kind = "command" if sender is m.Sender.CLIENT else "line"
-        return Spelled(None, kind, {"text": text}, frame.payload + LINE_END)
+        return ReadableFrame(None, kind, {"text": text}, frame.payload + LINE_END)
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
         """Return a command that the user writes, such as ``GVA001``; the payload is added to it.
@@ -199,7 +199,7 @@ class InSightDialect(Dialect):
             raise UnsupportedError(
                 f"dialect {self.name}: {line[:32]!r} begins with no command that is known: {known}"
             )
-        return RawRequest(Command(line=line), Reply, answered=True, known=True)
+        return RawRequest(Command(line=line), Reply, expects_answer=True, known=True)
 
     def body(self, answer: m.Message) -> bytes:
         """Return the data after the code.

@@ -142,7 +142,7 @@ class InSightMachine:
         self.dialect: InSightDialect = dialect
         self.candidates: Sequence[Dialect] = (dialect,)
         self.transport: Transport = transport
-        self.replies: bool = True
+        self.may_reply: bool = True
         self.counters: Counters = Counters()
         self.state: State = State.IDLE
         self._trace = trace
@@ -178,9 +178,9 @@ class InSightMachine:
         return len(self._reader)
 
     @property
-    def pending(self) -> bytes:
+    def unfinished_bytes(self) -> bytes:
         """Copy of the bytes of an unfinished line or text."""
-        return self._reader.pending
+        return self._reader.unfinished_bytes
 
     def get_buffer(self) -> memoryview:
         """Return the buffer for the next bytes; call :meth:`buffer_updated` next."""
@@ -204,7 +204,7 @@ class InSightMachine:
             self._read()
 
     def receive_eof(self) -> None:
-        """Note that the camera will send no more; call :meth:`events` next."""
+        """Record that the camera will send no more; call :meth:`events` next."""
         if self.state in {State.FAILED, State.CLOSED}:
             return
         self._events.append(LinkEnded(pending=self.buffered))
@@ -359,7 +359,8 @@ class InSightMachine:
         self._write(line)
 
     def _report(self, message: m.Message) -> None:
-        self._events.append(message)  # the attribute: after a yield, it may be another list
+        # not a local name for the list: events() replaces it while a script waits
+        self._events.append(message)
 
     def _get_status(self, _message: m.Message | None = None) -> Script:
         answer_text = (yield "GO").text.strip()
@@ -424,9 +425,9 @@ class InSightMachine:
             m.CellValue(cell, None if values[cell] == ERROR_VALUE else values[cell])
             for cell in self.dialect.cells
         ]
-        fault, now = None, (yield from self._read_job_id()) if cells else job
-        if now != job:
-            fault = f"job {now} was loaded while the cells of job {job} were read"
+        fault, last_job = None, (yield from self._read_job_id()) if cells else job
+        if last_job != job:
+            fault = f"job {last_job} was loaded while the cells of job {job} were read"
         elif before != after:
             fault = (
                 f"cell {counter}, which counts runs, went from {before} to {after} while the cells "

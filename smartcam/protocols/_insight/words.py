@@ -123,7 +123,8 @@ class CommandRow(NamedTuple):
         form: form of the answer.
         mode: mode in which the command is possible; in the other mode the answer is -2.
         codes: meaning of the status codes other than 1 and 0.
-        source: document that the row is from, with the grade of this knowledge.
+        source: document that the row is from, and whether that is published by the maker, or
+            derived from traffic.
     """
 
     mnemonic: str
@@ -146,7 +147,7 @@ _EVENT = {
 }
 _LOAD = "the camera is online, there is no such job, or it failed to load"
 _NO_MEMORY = {-4: "out of memory", **_NO_ACCESS}
-_NOT_SET = {
+_SET_FAILURES = {
     -3: "the cell is read-only (newer firmware)",
     -4: "wrong type (newer firmware)",
     **_NO_ACCESS,
@@ -227,7 +228,7 @@ _ROWS = (
         {
             -1: "no such cell or name, or no integer",
             -2: "out of the control's range, or the cell has no control for integers",
-            **_NOT_SET,
+            **_SET_FAILURES,
         },
         _MANUAL,
     ),
@@ -240,7 +241,7 @@ _ROWS = (
         {
             -1: "no such cell or name, or no number",
             -2: "the cell has no control for numbers",
-            **_NOT_SET,
+            **_SET_FAILURES,
         },
         _CLIENTS,
     ),
@@ -253,7 +254,7 @@ _ROWS = (
         {
             -1: "no such cell or name",
             -2: "too long, or the cell has no control for texts",
-            **_NOT_SET,
+            **_SET_FAILURES,
         },
         _MANUAL,
     ),

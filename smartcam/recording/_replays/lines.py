@@ -247,7 +247,7 @@ class ReplayedLines(LineCamera):
             )
         self._speed, self._repeats = speed, loop
         dialect = next(iter(self.protocol.dialects.values()))
-        self._accepts_lines_at_once = isinstance(dialect, LineDialect) and dialect.at_once
+        self._accepts_lines_at_once = isinstance(dialect, LineDialect) and dialect.pipelined
         self._on_over = None if loop else on_over
         self._line_counts: dict[LineClient, int] = {}
         self._trigger_count = 0  # number of triggers so far

@@ -47,7 +47,9 @@ class LooksAtSizes(ShortMachine):
     def _store_delivery(self, buffer: bytes, owed: tuple[int, ...]) -> None:
         super()._store_delivery(buffer, owed)
         for size, known in self._known_deliveries.items():
-            self._known_deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
+            self._known_deliveries[size] = known._replace(
+                head=b"", data_begin=0, tail=b"", data_end=size
+            )
 
 
 class IsOwedAnything(ShortMachine):

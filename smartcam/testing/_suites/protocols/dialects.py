@@ -21,7 +21,7 @@ from smartcam.exceptions import (
 from smartcam.models import jsonable
 from smartcam.protocols import CodeMeaning, Frame, FramedDialect, RawRequest, Transport, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import Framer, Spelled
+from smartcam.protocols._inside import Framer, ReadableFrame
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, parse_address
 from smartcam.testing._suites.protocols.parameters import SuiteBase
@@ -142,7 +142,7 @@ class DialectChecks(SuiteBase):
         assert dialect.answers(m.Connect), "Connect must be answered"
         assert dialect.answers(m.Query), "Query must be answered: it is the sign of life"
         abilities = dialect.capabilities
-        assert abilities.status_by_itself or abilities.get_status, (
+        assert abilities.unasked_status or abilities.get_status, (
             "capabilities: the status neither comes by itself nor can be asked for"
         )
 
@@ -318,18 +318,22 @@ def _error_text(
     return None
 
 
-def check_described(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
+def check_described(dialect: Dialect, sender: m.Sender, frame: Frame) -> ReadableFrame:
     """Check that a frame can be shown, in JSON as well.
 
     Raises:
         AssertionError: the frame cannot be shown.
     """
-    spelled = dialect.spell(sender, frame)
-    assert isinstance(spelled, Spelled), f"spell({frame}): expected a Spelled, got {spelled!r}"
-    assert _is_printable_line(spelled.message), f"spell({frame}): message {spelled.message!r}"
-    assert isinstance(spelled.data, bytes), f"spell({frame}): data {spelled.data!r}"
-    json.dumps(jsonable(spelled.fields), allow_nan=False)
-    return spelled
+    readable = dialect.make_readable(sender, frame)
+    assert isinstance(readable, ReadableFrame), (
+        f"make_readable({frame}): expected a ReadableFrame, got {readable!r}"
+    )
+    assert _is_printable_line(readable.message), (
+        f"make_readable({frame}): message {readable.message!r}"
+    )
+    assert isinstance(readable.data, bytes), f"make_readable({frame}): data {readable.data!r}"
+    json.dumps(jsonable(readable.fields), allow_nan=False)
+    return readable
 
 
 def check_address(address: Address) -> None:

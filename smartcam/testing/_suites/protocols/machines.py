@@ -176,7 +176,7 @@ class MachineChecks(SuiteBase):
             events = machine.events()
             failed = any(isinstance(event, LinkFailed) for event in events)
             messages += len(events)
-            waiting = len(machine.pending)
+            waiting = len(machine.unfinished_bytes)
             assert waiting <= self.max_pending_bytes, f"{where}: {waiting} bytes are kept"
             if failed:
                 assert waiting == 0, f"{where}: {waiting} bytes are kept of a link that failed"
@@ -277,9 +277,13 @@ class MachineChecks(SuiteBase):
         assert machine.dialect in group, f"dialect: {machine.dialect} was not asked for"
         assert machine.candidates[0] in group, f"candidates: {machine.candidates} was not asked for"
         assert machine.transport is conversation.transport, f"transport: {machine.transport}"
-        assert isinstance(machine.replies, bool), f"replies: expected a bool, {machine.replies!r}"
+        assert isinstance(machine.may_reply, bool), (
+            f"may_reply: expected a bool, {machine.may_reply!r}"
+        )
         assert isinstance(machine.counters, Counters), f"counters: {machine.counters!r}"
-        assert bytes(machine.pending) == b"", f"pending: {machine.pending!r} before anything came"
+        assert bytes(machine.unfinished_bytes) == b"", (
+            f"unfinished_bytes: {machine.unfinished_bytes!r} before anything came"
+        )
         for take in (machine.events, machine.data_to_send):
             name = getattr(take, "__name__", "it")
             items: list[Any] = take()
@@ -329,8 +333,8 @@ class MachineChecks(SuiteBase):
             if isinstance(frame, RemoteProtocolError):
                 continue
             assert isinstance(frame, Frame), f"traced: expected a Frame, got {frame!r}"
-            spelled = check_described(dialect, sender, frame)
-            trace_text = f"{frame!r} {spelled!r}"
+            readable = check_described(dialect, sender, frame)
+            trace_text = f"{frame!r} {readable!r}"
             assert not secret or secret not in trace_text, (
                 f"the trace has the password: {trace_text}"
             )

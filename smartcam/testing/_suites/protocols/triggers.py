@@ -175,7 +175,7 @@ class TriggerChecks(SuiteBase):
         skip_without_applications(camera_kind, OTHER)
         async with open_session(camera_kind, application=COUNTER) as (live, camera):
             live.switch(OTHER)
-            if camera.capabilities.status_by_itself:
+            if camera.capabilities.unasked_status:
                 await wait_until(lambda: camera.active_application == OTHER)
             with pytest.raises(WrongApplicationError):
                 await camera.trigger()
