@@ -47,8 +47,8 @@ class IfmApplication:
 
     Attributes:
         id: number, 1 to 99.
-        parts: values of each evaluation's result, by ids of layout elements; records are lists of
-            mappings.
+        parts: the workpieces that are evaluated in turn: the values of each one's result, by ids of
+            layout elements; records are lists of mappings.
         processing_time: seconds of an evaluation.
         trigger: trigger of evaluations: ``"process"``, ``"continuous"`` or ``"hardware"``.
         images: number of pictures of an evaluation.

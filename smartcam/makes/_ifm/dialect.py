@@ -173,7 +173,7 @@ def _input_script(dialect: PcicDialect, message: m.SetInput) -> Script:
     data = message.data
     if len(data) > MAX_INPUT_BYTES:
         raise ConfigurationError(
-            f"ifm: an input container has {MAX_INPUT_BYTES} bytes, got {len(data)}"
+            f"ifm: an input container holds at most {MAX_INPUT_BYTES} bytes, got {len(data)}"
         )
     answer = yield f"j{dialect.container:02}{len(data):09}{data.decode('latin-1')}"
     return m.SetInputAnswer(code=CODES[answer])
@@ -319,8 +319,8 @@ class PcicDialect(TicketedDialect):
             )
         if not _COMMAND_FORM.fullmatch(line):
             raise ConfigurationError(
-                f"ifm: {line[:32]!r} is no command; smartcam.makes has them in docs/ifm.md; "
-                "the version is the dialect's"
+                f"ifm: {line[:32]!r} is no command that can be sent; docs/ifm.md lists them; the "
+                "dialect fixes the protocol's version"
             )
         return line
 

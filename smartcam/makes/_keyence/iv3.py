@@ -13,7 +13,7 @@ from smartcam.makes._keyence.words import (
     MAX_LINE_BYTES,
     READY,
     answer_key,
-    check_done,
+    result_code,
     error_code,
 )
 from smartcam.protocols import (
@@ -97,13 +97,13 @@ def _read_program(line: str) -> m.QueryAnswer:
 
 
 def _switch_script(dialect: LineDialect, message: m.SwitchApplication) -> Script:
-    code = check_done((yield f"PW,{message.application}"))
+    code = result_code((yield f"PW,{message.application}"))
     program = _read_program((yield "PR")).application
     return m.SwitchAnswer(code=code, application=program)
 
 
 def _read_reply(line: str) -> LineReply:
-    return LineReply(code=check_done(line), data=line.encode(ENCODING))
+    return LineReply(code=result_code(line), data=line.encode(ENCODING))
 
 
 LINES = LineDialect(

@@ -15,7 +15,7 @@ from smartcam.makes._keyence.words import (
     MAX_LINE_BYTES,
     READY,
     answer_key,
-    check_done,
+    result_code,
     error_code,
 )
 from smartcam.models import Status
@@ -75,7 +75,8 @@ def _read_trigger_answer(line: str) -> tuple[m.Message, ...]:
 
 
 def _read_unasked(line: str) -> m.ResultContainer:
-    if line.startswith(("ER,", "OK,LON")):  # an answer, not a code; and LON has no answer
+    # ER is an answer and no barcode; the reader never confirms LON by OK
+    if line.startswith(("ER,", "OK,LON")):
         raise ValueError(line)
     return read_code(line)
 
@@ -103,7 +104,7 @@ def _make_rows(bank: int | None) -> tuple[LineRow, ...]:
     trigger_line = "LON" if bank is None else f"LON,{bank:02}"
 
     def read_query_answer(line: str) -> m.QueryAnswer:
-        if check_done(line) or not line.startswith("OK,NUM"):
+        if result_code(line) or not line.startswith("OK,NUM"):
             raise ValueError(line)
         return m.QueryAnswer(application=active)
 

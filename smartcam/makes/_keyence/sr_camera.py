@@ -22,7 +22,7 @@ class SrDevice:
         self._camera = camera
 
     def trigger(self) -> None:
-        """Trigger by the input; the reading is sent to all clients."""
+        """Trigger by the reader's trigger input; the reading is sent to all clients."""
         self._camera.tell_all()
 
 
@@ -55,11 +55,11 @@ class EmulatedSr(LineCamera):
         self.reading_time: float = check_seconds(reading_time, "reading_time")
         self.answer_time: float = check_seconds(answer_time, "answer_time")
         self.waits_for_end: bool = check_flag(waits_for_end, "waits_for_end")
-        self.read: int = 0
-        self.unread: int = 0
+        self.read_count: int = 0
+        self.unread_count: int = 0
         self._reading: LineClient | None = None
         self._code: str | None = None  # code that was read in the current reading
-        self._run = 0
+        self._reading_number = 0
         self.device: Any = SrDevice(self)
         super().__init__(**options)
 
@@ -81,7 +81,7 @@ class EmulatedSr(LineCamera):
         answers = {
             "BUSYSTAT": f"OK,BUSYSTAT,{'NONE' if self._reading is None else 'TRG'}",
             "ERRSTAT": "OK,ERRSTAT,NONE",
-            "NUM": f"OK,NUM,{self.read},{self.unread}",
+            "NUM": f"OK,NUM,{self.read_count},{self.unread_count}",
             "BCLR": "OK,BCLR",
             "RESET": "OK,RESET",
         }
@@ -90,19 +90,19 @@ class EmulatedSr(LineCamera):
     def _before_stop(self) -> None:
         """Forget the current reading, like a reader that loses power."""
         super()._before_stop()
-        self._reading, self._code, self._run = None, None, self._run + 1
+        self._reading, self._code, self._reading_number = None, None, self._reading_number + 1
 
     def _begin(self, call: LineClient) -> None:
         if self._reading is not None:
             call.answer("ER,LON,20")
             return
-        self._reading, self._code, self._run = call, None, self._run + 1
-        run = self._run
-        self.after(self.reading_time, lambda: self._read_code(run))
+        self._reading, self._code, self._reading_number = call, None, self._reading_number + 1
+        number = self._reading_number
+        self.after(self.reading_time, lambda: self._read_code(number))
 
-    def _read_code(self, run: int) -> None:
+    def _read_code(self, number: int) -> None:
         """Read the next code if the reading with this number still runs."""
-        if run != self._run or self._reading is None:
+        if number != self._reading_number or self._reading is None:
             return
         self._code = next(self.codes)
         if self._code is not None and not self.waits_for_end:
@@ -115,7 +115,7 @@ class EmulatedSr(LineCamera):
     def _send_reading(self) -> None:
         call, code = self._reading, self._code
         self._reading = self._code = None
-        self.read, self.unread = self.read + (code is not None), self.unread + (code is None)
+        self.read_count, self.unread_count = self.read_count + (code is not None), self.unread_count + (code is None)
         if call is not None:
             text = NOTHING_READ if code is None else code
             self.after(self.answer_time, lambda: call.answer(text))
@@ -123,6 +123,7 @@ class EmulatedSr(LineCamera):
     def tell_all(self) -> None:
         """Read a code and send it to all clients."""
         code = next(self.codes)
+        # messages are numbered by the protocol's rows
         row_number = next(number for number, row in enumerate(LINES.rows, 1) if row.line == "code")
         for client in list(self._clients.values()):
             client.say_bytes(

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 LINE_END = b"\r"
 ENCODING = "latin-1"
-"""Encoding of lines: one byte for each character, since a code is not always text."""
+"""Encoding of lines: one byte for each character, since a barcode's content is not always text."""
 
 MAX_LINE_BYTES = 8192
 """Largest number of bytes of a line: the longest two-dimensional codes have some 7,000
@@ -30,8 +30,8 @@ def error_code(line: str) -> int | None:
     return int(code_text.rpartition(",")[2]) if word == "ER" else None
 
 
-def check_done(line: str) -> int:
-    """Return the code of an answer: 0 unless it is an error."""
+def result_code(line: str) -> int:
+    """Return the result code of an answer: 0 unless it is an error."""
     return error_code(line) or 0
 
 
