@@ -148,7 +148,7 @@ LIMITS = (
     "_accepting.BACKLOG",
     "_accepting.HANDSHAKE_TIMEOUT",
     "_accepting.RESERVED_DESCRIPTORS",
-    "_accepting.RESERVED_BY_CAMERAS",
+    "_accepting.DESCRIPTORS_LEFT_BY_EMULATORS",
     "emulator._client_link.MAX_INPUT_BYTES",
     "emulator._wire_camera.MAX_LINKS",
     "emulator._wire_camera.WRITE_LIMIT",

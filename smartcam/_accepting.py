@@ -54,9 +54,9 @@ RESOLVE_TIMEOUT: Final = 10.0
 """Seconds that the look-up of a host's address may take."""
 
 RESERVED_DESCRIPTORS: Final = 32
-"""File descriptors that a server's connections leave to the rest of the process, and to cameras."""
+"""File descriptors that a server's connections leave to the rest of the process, and to clients."""
 
-RESERVED_BY_CAMERAS: Final = 8
+DESCRIPTORS_LEFT_BY_EMULATORS: Final = 8
 """File descriptors that the connections of an emulated camera leave to the rest of the process."""
 
 
@@ -72,9 +72,9 @@ def is_loopback(host: str) -> bool:
     return bool((mapped or address).is_loopback)
 
 
-def share_of(most: int) -> int:
-    """Return the number of ``most`` places that one address may take; loopback may take all."""
-    return max(1, most - most // 4)
+def share_of(max_places: int) -> int:
+    """Return the number of all places that one address may take; loopback may take all."""
+    return max(1, max_places - max_places // 4)
 
 
 class Occupant(Protocol):
@@ -85,7 +85,7 @@ class Occupant(Protocol):
         """True if it has a session or is being served, so that it is never closed for another."""
         ...
 
-    def close_for(self, why: str) -> None:
+    def close_for(self, reason: str) -> None:
         """Close the connection at once, since it has lost its place. Harmless when called twice."""
         ...
 
@@ -108,29 +108,29 @@ class Places(Generic[G]):
     Moments are seconds of any clock that does not go back.
 
     Args:
-        most: largest number of connections at a time.
-        within: seconds that a new connection may stay without a session.
-        timeout_reason: what such a connection lacks, for the log: "no session".
+        max_places: largest number of connections at a time.
+        timeout: seconds that a new connection may stay without a session.
+        missing: what such a connection lacks, for the log: "no session".
         session_name: name of a session, for the log: "a session".
 
     Attributes:
-        most: largest number of connections at a time; may be changed.
+        max_places: largest number of connections at a time; may be changed.
         crowded_out: number of connections that were closed, or refused, because too many were open.
     """
 
     def __init__(
         self,
-        most: int,
+        max_places: int,
         *,
-        within: float = HANDSHAKE_TIMEOUT,
-        timeout_reason: str = "no session",
+        timeout: float = HANDSHAKE_TIMEOUT,
+        missing: str = "no session",
         session_name: str = "a session",
     ) -> None:
-        self.most = most
+        self.max_places = max_places
         self.crowded_out = 0
-        self._timeout, self._timeout_reason, self._session_name = (
-            within,
-            timeout_reason,
+        self._timeout, self._missing, self._session_name = (
+            timeout,
+            missing,
             session_name,
         )
         self._places: dict[G, _TakenPlace] = {}  # the first has been idle for longest
@@ -144,18 +144,18 @@ class Places(Generic[G]):
     def __contains__(self, occupant: object) -> bool:
         return occupant in self._places
 
-    def refusal_on_entry(self, occupant: G, peer: str, now: float) -> str:
+    def enter(self, occupant: G, peer: str, now: float) -> str:
         """Give a new connection a place; another connection may be closed for it.
 
         Returns:
             The reason why the connection is refused; "" if it has a place now.
         """
-        rivals, reason = list(self._places), f"{self.most} others are open"
-        if len(rivals) < self.most:
+        rivals, reason = list(self._places), f"{self.max_places} others are open"
+        if len(rivals) < self.max_places:
             rivals = []
             if not is_loopback(peer):
                 of_peer = [other for other, place in self._places.items() if place.peer == peer]
-                if len(of_peer) >= share_of(self.most):
+                if len(of_peer) >= share_of(self.max_places):
                     rivals, reason = of_peer, f"{len(of_peer)} others of {peer} are open"
         if rivals:
             self.crowded_out += 1
@@ -164,7 +164,7 @@ class Places(Generic[G]):
                 return f"{reason}, and each has {self._session_name}"
             self._evict(evicted, f"{reason}, it was without {self._session_name} for longest")
         self._places[occupant] = _TakenPlace(
-            peer, now, self._timeout, self._timeout_reason, now + self._timeout
+            peer, now, self._timeout, self._missing, now + self._timeout
         )
         return ""
 
@@ -182,18 +182,18 @@ class Places(Generic[G]):
             place.idle_since = now
             self._places[occupant] = place
 
-    def set_time_limit(self, occupant: G, within: float | None, missing: str, now: float) -> None:
+    def set_time_limit(self, occupant: G, timeout: float | None, missing: str, now: float) -> None:
         """Set a new time limit within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
-            within: seconds from ``now`` on.
+            timeout: seconds from ``now`` on.
             missing: what a connection that is too late lacks, for the log: "no request".
             now: the present time.
         """
         place = self._places.get(occupant)
         if place is not None:
-            place.timeout, place.missing = math.inf if within is None else within, missing
+            place.timeout, place.missing = math.inf if timeout is None else timeout, missing
             place.deadline = now + place.timeout
 
     def find_longest_idle(self) -> tuple[float, G] | None:
@@ -207,12 +207,12 @@ class Places(Generic[G]):
                 return place.idle_since, occupant
         return None
 
-    def make_room(self, why: str) -> None:
+    def make_room(self, reason: str) -> None:
         """Close the connection that has been without a session for longest, if there is one."""
         longest_idle = self.find_longest_idle()
         if longest_idle is not None:
             self.crowded_out += 1
-            self._evict(longest_idle[1], why)
+            self._evict(longest_idle[1], reason)
 
     def end_overdue(self, now: float) -> None:
         """Close connections without a session at their deadline; others get a new deadline."""
@@ -228,9 +228,9 @@ class Places(Generic[G]):
         """Return the time at which :meth:`end_overdue` has work next; infinity if it has none."""
         return min((place.deadline for place in self._places.values()), default=math.inf)
 
-    def _evict(self, occupant: G, why: str) -> None:
+    def _evict(self, occupant: G, reason: str) -> None:
         self._places.pop(occupant, None)
-        occupant.close_for(why)
+        occupant.close_for(reason)
 
 
 class _ThreadState(threading.local):
@@ -246,7 +246,7 @@ _thread_state = _ThreadState()
 class Acceptor(Generic[G]):
     """Accepts connections on a listening socket; gives each a protocol, which takes a place.
 
-    The protocol calls :meth:`refusal_on_entry` when its connection is made, and :meth:`leave` when
+    The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when
     it is lost.
 
     Args:
@@ -310,7 +310,7 @@ class Acceptor(Generic[G]):
 
     # ------------------------------------------------------------------ its connections
 
-    def refusal_on_entry(self, occupant: G, address: Any) -> str:
+    def enter(self, occupant: G, address: Any) -> str:
         """Give a new connection a place; return the reason if it is refused, "" if it has a place.
 
         Args:
@@ -318,9 +318,9 @@ class Acceptor(Generic[G]):
             address: address of its peer, in a socket's form.
         """
         now = asyncio.get_running_loop().time()
-        why = self.places.refusal_on_entry(occupant, str(address[0]) if address else "", now)
+        reason = self.places.enter(occupant, str(address[0]) if address else "", now)
         self._set_timer()
-        return why
+        return reason
 
     def leave(self, occupant: G) -> None:
         """Forget a connection that has ended; harmless when called twice."""
@@ -333,15 +333,15 @@ class Acceptor(Generic[G]):
         """Note that a connection is idle only since now; see :meth:`Places.restart_idle_time`."""
         self.places.restart_idle_time(occupant, asyncio.get_running_loop().time())
 
-    def set_time_limit(self, occupant: G, within: float | None, missing: str) -> None:
+    def set_time_limit(self, occupant: G, timeout: float | None, missing: str) -> None:
         """Set a new time limit within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
-            within: seconds from now on.
+            timeout: seconds from now on.
             missing: what a connection that is too late lacks, for the log: "no request".
         """
-        self.places.set_time_limit(occupant, within, missing, asyncio.get_running_loop().time())
+        self.places.set_time_limit(occupant, timeout, missing, asyncio.get_running_loop().time())
         self._set_timer()
 
     def _set_timer(self) -> None:
@@ -412,8 +412,8 @@ class Acceptor(Generic[G]):
 
     def _admit(self, connection: socket.socket) -> None:
         """Adopt a connection; close it if too few descriptors of the process are left."""
-        if not _is_reserved(connection, self._reserve):
-            self._adopt_ready(connection)
+        if not _uses_reserved_descriptor(connection, self._reserve):
+            self._prepare_and_adopt(connection)
         elif _make_room():
             self._moving_count += 1
             asyncio.get_running_loop().call_soon(self._move, connection)
@@ -434,9 +434,9 @@ class Acceptor(Generic[G]):
             moved = connection
         else:
             connection.close()
-        self._adopt_ready(moved)
+        self._prepare_and_adopt(moved)
 
-    def _adopt_ready(self, connection: socket.socket) -> None:
+    def _prepare_and_adopt(self, connection: socket.socket) -> None:
         """Set a connection's options, and adopt it."""
         self._has_warned = False
         connection.setblocking(False)
@@ -452,15 +452,16 @@ class Acceptor(Generic[G]):
             connection.close()
 
 
-def _is_reserved(connection: socket.socket, reserve: int) -> bool:
+def _uses_reserved_descriptor(connection: socket.socket, reserve: int) -> bool:
     """Return True if a new connection has one of the last ``reserve`` descriptors of the process.
 
     The system gives the lowest free descriptor, so all below are in use.
     """
     if sys.platform == "win32":
         return False
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return most != resource.RLIM_INFINITY and connection.fileno() >= most - min(reserve, most // 4)
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    reserved = min(reserve, limit // 4)
+    return limit != resource.RLIM_INFINITY and connection.fileno() >= limit - reserved
 
 
 def _make_room() -> bool:
@@ -495,7 +496,7 @@ async def listening_socket(host: str, port: int, *, local: bool = False) -> sock
         addresses = await loop.getaddrinfo(host or "0.0.0.0", port, type=socket.SOCK_STREAM)  # noqa: S104
     family, _, _, _, address = addresses[0]
     if local and not is_loopback(str(address[0])):
-        raise ValueError(f"{host} is {address[0]} here, which needs a token")
+        raise ValueError(f"expected an address of this machine only, got {host}: {address[0]}")
     listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)
     listener.setblocking(False)
     return listener

@@ -92,7 +92,7 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
         make_camera = stack.enter_context(options.cameras(url, reconnect=Backoff()))
         first = make_camera()
         server = await stack.enter_async_context(Gateway(first, settings))
-        stack.callback(_print_account, server, options)
+        stack.callback(_print_counts, server, options)
 
         def show() -> None:
             value = {"gateway": server.address, "camera": url}
@@ -177,15 +177,15 @@ async def _emulated_camera(options: Options) -> AsyncIterator[str]:
         yield emulator.url
 
 
-def _print_account(server: Gateway, options: Options) -> None:
-    """Print the account of all requests and parts."""
-    account = server.account
+def _print_counts(server: Gateway, options: Options) -> None:
+    """Print the counts of all requests and parts."""
+    counts = server.counts
     if options.as_json:
-        options.show({"account": dataclasses.asdict(account)}, "")
+        options.show({"counts": dataclasses.asdict(counts)}, "")
         return
     click.echo(
-        f"requests {account.requests} = answered {account.answered} + errors {account.errors} + "
-        f"abandoned {account.abandoned} + open {account.open}; parts {account.parts} = delivered "
-        f"{account.delivered} + forgotten {account.forgotten} + waiting {account.waiting}",
+        f"requests {counts.requests} = answered {counts.answered} + errors {counts.errors} + "
+        f"abandoned {counts.abandoned} + open {counts.open}; parts {counts.parts} = delivered "
+        f"{counts.delivered} + forgotten {counts.forgotten} + waiting {counts.waiting}",
         err=True,
     )

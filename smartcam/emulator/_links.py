@@ -14,7 +14,7 @@ import struct
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from smartcam._accepting import HANDSHAKE_TIMEOUT, RESERVED_BY_CAMERAS, Acceptor, Places
+from smartcam._accepting import DESCRIPTORS_LEFT_BY_EMULATORS, HANDSHAKE_TIMEOUT, Acceptor, Places
 from smartcam._datagrams import limit_read_size
 from smartcam.emulator._client_link import ClientLink
 from smartcam.protocols import State, Transport
@@ -68,7 +68,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         if self._listener.is_down:
             self.close("the camera is down")
             return
-        refusal = self._listener.refusal_on_entry(self)
+        refusal = self._listener.enter(self)
         if refusal:
             self.close(refusal)
             return
@@ -218,7 +218,7 @@ class TcpListener(Listener):
             self.places,
             _log,
             name="smartcam.emulator",
-            reserve=RESERVED_BY_CAMERAS,
+            reserve=DESCRIPTORS_LEFT_BY_EMULATORS,
         )
 
     async def serve(self, sock: socket.socket) -> None:
@@ -242,10 +242,10 @@ class TcpListener(Listener):
         await self._acceptor.wait_closed()
         await super().wait_closed()
 
-    def refusal_on_entry(self, link: _TcpLink) -> str:
+    def enter(self, link: _TcpLink) -> str:
         """Accept a new connection; return "", or the reason why it is refused."""
-        self.places.most = self._owner.max_links
-        return self._acceptor.refusal_on_entry(link, link.address)
+        self.places.max_places = self._owner.max_links
+        return self._acceptor.enter(link, link.address)
 
     def leave(self, link: _TcpLink) -> None:
         """Forget a connection that has ended; harmless when called twice."""
@@ -358,8 +358,8 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         link = self.links.get(addr)
         if link is None:
             link = _UdpLink(self, self._owner, addr)
-            self.places.most = self._owner.max_links
-            if self.places.refusal_on_entry(link, str(addr[0]), now):
+            self.places.max_places = self._owner.max_links
+            if self.places.enter(link, str(addr[0]), now):
                 return  # every link has a session
             self.links[addr] = link
         else:

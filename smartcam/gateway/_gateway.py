@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from smartcam._accepting import Acceptor, Places, listening_socket
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.gateway._account import GatewayAccount
+from smartcam.gateway._counts import GatewayCounts
 from smartcam.gateway._lines import AnswerWriter
 from smartcam.gateway._link import RobotLink
-from smartcam.gateway._parts import Parts
+from smartcam.gateway._parts import PartConverter
 from smartcam.gateway._requests import GatewayCamera
 from smartcam.gateway._settings import GatewaySettings
 
@@ -25,7 +25,7 @@ _log = logging.getLogger("smartcam.gateway")
 
 
 class Gateway(Server):
-    """Answers controllers that ask for a camera's parts.
+    """Answers controllers that ask where the parts in a camera's picture are.
 
     ::
 
@@ -46,21 +46,21 @@ class Gateway(Server):
 
     def __init__(self, camera: Camera, settings: GatewaySettings | None = None) -> None:
         self.settings: GatewaySettings = settings or GatewaySettings()
-        parts = Parts(self.settings, camera.settings.interpret_as)
-        self._account = GatewayAccount()
-        self._shared = GatewayCamera(camera, self.settings, parts, self._account)
+        parts = PartConverter(self.settings, camera.settings.interpret_as)
+        self._counts = GatewayCounts()
+        self._shared = GatewayCamera(camera, self.settings, parts, self._counts)
         self._writer = AnswerWriter(self.settings.style, parts.names)
         places: Places[RobotLink] = Places(
             self.settings.clients,
-            within=self.settings.idle,
-            timeout_reason="no request",
+            timeout=self.settings.idle,
+            missing="no request",
             session_name="a robot",
         )
         self._acceptor: Acceptor[RobotLink] = Acceptor(
             self._make_link, places, _log, name="smartcam.gateway"
         )
         self._socket: socket.socket | None = None
-        self._port = self.settings.place[1]
+        self._port = self.settings.host_and_port[1]
 
     def _make_link(self) -> RobotLink:
         return RobotLink(self._shared, self._writer, self._acceptor)
@@ -68,13 +68,13 @@ class Gateway(Server):
     @property
     def address(self) -> str:
         """Address to which robots connect, tcp/HOST:PORT."""
-        host = self.settings.place[0]
+        host = self.settings.host_and_port[0]
         return f"tcp/{f'[{host}]' if ':' in host else host}:{self._port}"
 
     @property
-    def account(self) -> GatewayAccount:
+    def counts(self) -> GatewayCounts:
         """Counts of the requests and answers so far."""
-        return dataclasses.replace(self._account)
+        return dataclasses.replace(self._counts)
 
     @property
     def camera(self) -> Camera:
@@ -95,7 +95,7 @@ class Gateway(Server):
         """
         if self._socket is not None:
             return
-        host, port = self.settings.place
+        host, port = self.settings.host_and_port
         try:
             self._socket = await listening_socket(host, port)
         except (OSError, ValueError, OverflowError) as exc:

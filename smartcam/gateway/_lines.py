@@ -38,8 +38,8 @@ _BLANKS = b" \t\r\n\0"
 class AnswerCode(enum.IntEnum):
     """The number with which each answer begins; 0 and 1 report success, the others errors."""
 
-    PART = 0
-    NONE = 1
+    OK = 0
+    NO_PART = 1
     BAD_REQUEST = 10
     TOO_LONG = 11
     BUSY = 20
@@ -55,7 +55,7 @@ class AnswerCode(enum.IntEnum):
     @property
     def is_error(self) -> bool:
         """True if the request failed."""
-        return self > AnswerCode.NONE
+        return self > AnswerCode.NO_PART
 
 
 class RobotRequest(NamedTuple):
@@ -81,16 +81,20 @@ class RobotAnswer(NamedTuple):
         code: outcome of the request.
         left: number of parts of the result that the robot can still request.
         values: values of the part, or of the camera's state.
-        words: the reason of an error, as a text for people.
+        text: the reason of an error, for people.
     """
 
     code: AnswerCode
     left: int = 0
     values: Sequence[float | str] = ()
-    words: str = ""
+    text: str = ""
 
 
-class NotWritableError(ValueError):
+class RequestTooLongError(ValueError):
+    """A request is longer than :data:`MAX_LINE_BYTES`."""
+
+
+class AnswerError(ValueError):
     """An answer is too long, or has a number that a controller cannot read."""
 
 
@@ -103,7 +107,7 @@ def _skip_blanks(data: bytes, start: int) -> int:
 class RequestReader:
     """Cuts the bytes of a connection into requests.
 
-    A line ends with CR, LF or both. Blanks and zeros around a line are ignored, since some
+    A line ends with CR, LF or both. Blanks and zero bytes around it are ignored, since some
     controllers send arrays of a fixed length. XML ends with the closing tag of its first element.
 
     Args:
@@ -118,7 +122,7 @@ class RequestReader:
         """Add received bytes; return the requests that are complete now.
 
         Raises:
-            NotWritableError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
+            RequestTooLongError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
         """
         data, requests = self._unread + data, []
         start = _skip_blanks(data, 0)
@@ -129,7 +133,7 @@ class RequestReader:
             start = _skip_blanks(data, end)
         self._unread = data[start:].lstrip(_BLANKS)
         if len(self._unread) > MAX_LINE_BYTES:
-            raise NotWritableError(f"a request has more than {MAX_LINE_BYTES} bytes")
+            raise RequestTooLongError(f"a request has more than {MAX_LINE_BYTES} bytes")
         return requests
 
     def _find_end(self, data: bytes, start: int) -> int:
@@ -177,7 +181,7 @@ class AnswerWriter:
         """Return the bytes of an answer.
 
         Raises:
-            NotWritableError: the answer is too long, or a number cannot be written.
+            AnswerError: the answer is too long, or a number cannot be written.
         """
         style = self._style
         values = [self._value(value) for value in answer.values]
@@ -194,7 +198,7 @@ class AnswerWriter:
                 " " if char == self._style.separator else char for char in to_one_line(value)
             )
         if not abs(value) < MAX_NUMBER:
-            raise NotWritableError(f"{value} is no number that a controller reads")
+            raise AnswerError(f"{value} is no number that a controller reads")
         if isinstance(value, int):
             return str(int(value))
         return f"{round(value, self._style.decimals) + 0.0:.{self._style.decimals}f}"
@@ -203,21 +207,21 @@ class AnswerWriter:
         style = self._style
         head = [str(item) for item in (tag, int(answer.code), answer.left) if item is not None]
         line = style.separator.join([*head, *values])
-        room = style.longest - len(style.line_end)
+        room = style.max_bytes - len(style.line_end)
         if len(line) > room:
-            raise NotWritableError(f"a part has {len(line)} characters, {room} are allowed")
-        if answer.words:
+            raise AnswerError(f"an answer has {len(line)} characters, {room} are allowed")
+        if answer.text:
             line = f"{line}{style.separator}{self._words(answer)}"[:room]
         return line
 
     def _brackets(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
-        if answer.words and not answer.code.is_error:
-            return to_one_line(answer.words)[: self._style.longest]  # the answer to WHY
+        if answer.text and not answer.code.is_error:
+            return to_one_line(answer.text)[: self._style.max_bytes]  # the answer to WHY
         padded = values + ["0"] * (len(self.names) - len(values))
         head = [str(item) for item in (tag, int(answer.code), answer.left) if item is not None]
         if len(head) + len(padded) > MAX_BRACKETED_NUMBERS:
-            raise NotWritableError(
-                f"a part has {len(head) + len(padded)} numbers, {MAX_BRACKETED_NUMBERS} are read"
+            raise AnswerError(
+                f"an answer has {len(head) + len(padded)} numbers, {MAX_BRACKETED_NUMBERS} are read"
             )
         return f"({','.join([*head, *padded])})"
 
@@ -228,7 +232,7 @@ class AnswerWriter:
             f"{name.upper()}={quoteattr(value)}"
             for name, value in zip(self.names, padded, strict=False)
         )
-        words = escape(self._words(answer)[:80]) if answer.words else ""
+        words = escape(self._words(answer)[:80]) if answer.text else ""
         return (
             f"<Gateway><Id>{tag or 0}</Id><Code>{int(answer.code)}</Code>"
             f"<Left>{answer.left}</Left><Part {part}/><Words>{words}</Words></Gateway>"
@@ -237,7 +241,7 @@ class AnswerWriter:
     @staticmethod
     def _words(answer: RobotAnswer) -> str:
         name = f"{answer.code.name} " if answer.code.is_error else ""
-        return name + to_one_line(answer.words)
+        return name + to_one_line(answer.text)
 
 
 def to_one_line(words: str) -> str:

@@ -9,7 +9,13 @@ import socket
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
-from smartcam.gateway._lines import AnswerCode, NotWritableError, RequestReader, RobotAnswer
+from smartcam.gateway._lines import (
+    AnswerCode,
+    AnswerError,
+    RequestReader,
+    RequestTooLongError,
+    RobotAnswer,
+)
 from smartcam.gateway._requests import PART_WORDS, RobotRequests
 
 if TYPE_CHECKING:
@@ -41,8 +47,7 @@ class RobotLink(asyncio.Protocol):
 
     Attributes:
         keeps_place: True once the robot has requested a part. Until then the connection may be
-        closed
-            to make room for a new one.
+            closed to make room for a new one.
     """
 
     _transport: asyncio.Transport
@@ -52,7 +57,7 @@ class RobotLink(asyncio.Protocol):
     ) -> None:
         self.keeps_place: bool = False
         self._shared, self._writer, self._acceptor = shared, writer, acceptor
-        self._account = shared.account
+        self._counts = shared.counts
         self._robot_requests = RobotRequests(shared)
         self._reader = RequestReader(shared.settings.style.form)
         self._queue: deque[tuple[RobotRequest, float]] = deque()
@@ -68,15 +73,15 @@ class RobotLink(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         address = transport.get_extra_info("peername")
         self._peer = f"{address[0]}:{address[1]}" if address else "?"
-        refusal = self._acceptor.refusal_on_entry(self, address)
+        refusal = self._acceptor.enter(self, address)
         if refusal:
-            self._account.refused += 1
+            self._counts.refused += 1
             _log.warning("%s: refused: %s", self._peer, refusal)
-            self._write(RobotAnswer(AnswerCode.FULL, words=refusal), None)
+            self._write(RobotAnswer(AnswerCode.FULL, text=refusal), None)
             self._transport.close()
             return
         self._closed = False
-        self._account.robots += 1
+        self._counts.robots += 1
         _keep_alive(transport.get_extra_info("socket"))
         self._acceptor.set_time_limit(self, self._shared.settings.idle, "no request")
         self._restart_idle_timer()
@@ -88,8 +93,8 @@ class RobotLink(asyncio.Protocol):
         self._restart_idle_timer()
         try:
             requests = self._reader.feed(data)
-        except NotWritableError as exc:
-            self._report_error(RobotAnswer(AnswerCode.TOO_LONG, words=str(exc)), None)
+        except RequestTooLongError as exc:
+            self._report_error(RobotAnswer(AnswerCode.TOO_LONG, text=str(exc)), None)
             self._close("a request is too long")
             return
         for request in requests:
@@ -97,44 +102,44 @@ class RobotLink(asyncio.Protocol):
                 self._accept_request(request)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End the unfinished requests, and forget parts that the robot has not requested."""
+        """End the unfinished requests, and forget the parts that the robot has not fetched yet."""
         self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
 
-    def close_for(self, why: str) -> None:
+    def close_for(self, reason: str) -> None:
         """Close the connection at once, to make room for another one."""
-        self._close(why, abort=True)
+        self._close(reason, abort=True)
 
     # ------------------------------------------------------------------ requests
 
     def _accept_request(self, request: RobotRequest) -> None:
         self.keeps_place = self.keeps_place or request.word in PART_WORDS
-        self._account.requests += 1
+        self._counts.requests += 1
         loop = asyncio.get_running_loop()
         deadline = loop.time() + self._shared.settings.timeout
         if self._task is None:
-            self._account.open += 1
+            self._counts.open += 1
             self._task = loop.create_task(self._serve(request, deadline), name="smartcam.gateway")
         elif request.tag is None:
             # without numbers, the robot would read the previous answer as the answer to this one
-            self._account.abandoned += 1
+            self._counts.abandoned += 1
             self._close("a request without a number came before the answer to the one before")
         elif len(self._queue) >= MAX_WAITING_REQUESTS:
-            self._account.errors += 1
+            self._counts.errors += 1
             words = f"{MAX_WAITING_REQUESTS} requests are waiting already"
-            self._write(RobotAnswer(AnswerCode.BUSY, words=words), request.tag)
+            self._write(RobotAnswer(AnswerCode.BUSY, text=words), request.tag)
         else:
-            self._account.open += 1
+            self._counts.open += 1
             self._queue.append((request, deadline))
 
     async def _serve(self, request: RobotRequest, deadline: float) -> None:
         """Answer a request, and then the requests that have arrived meanwhile."""
         while True:
             answer = await self._robot_requests.answer(request, deadline)
-            self._account.open -= 1
+            self._counts.open -= 1
             if self._write(answer, request.tag):
-                self._account.errors += 1
+                self._counts.errors += 1
             else:
-                self._account.answered += 1
+                self._counts.answered += 1
             if self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
                 self._close("the robot reads nothing", abort=True)
                 return
@@ -147,22 +152,22 @@ class RobotLink(asyncio.Protocol):
         """Write an answer, or an error if it cannot be written; return True for an error."""
         try:
             data = self._writer.write(answer, tag)
-        except NotWritableError as exc:
+        except AnswerError as exc:
             answer = self._robot_requests.replace_answer(str(exc))
             data = self._writer.write(answer, tag)
         self._transport.write(data)
         self._robot_requests.on_sent()
         if answer.code.is_error:
-            _log.warning("%s: %s: %s", self._peer, answer.code.name, answer.words)
+            _log.warning("%s: %s: %s", self._peer, answer.code.name, answer.text)
         return answer.code.is_error
 
     def _report_error(self, answer: RobotAnswer, tag: int | None) -> None:
-        self._account.requests += 1
+        self._counts.requests += 1
         if self._task is not None:
             # without numbers, the robot would read a late error as the answer to its next request
-            self._account.abandoned += 1
+            self._counts.abandoned += 1
             return
-        self._account.errors += 1
+        self._counts.errors += 1
         self._write(answer, tag)
 
     # ------------------------------------------------------------------ the end
@@ -171,14 +176,14 @@ class RobotLink(asyncio.Protocol):
         if self._idle_timer is not None:
             self._idle_timer.cancel()
         idle = self._shared.settings.idle
-        why = f"no request within {idle:g} s"
-        self._idle_timer = asyncio.get_running_loop().call_later(idle, self._close, why)
+        reason = f"no request within {idle:g} s"
+        self._idle_timer = asyncio.get_running_loop().call_later(idle, self._close, reason)
 
-    def _close(self, why: str, abort: bool = False) -> None:
+    def _close(self, reason: str, abort: bool = False) -> None:
         if self._closed:
             return
         self._closed = True
-        _log.info("%s: closed: %s", self._peer, why)
+        _log.info("%s: closed: %s", self._peer, reason)
         if self._idle_timer is not None:
             self._idle_timer.cancel()
         self._acceptor.leave(self)
@@ -188,8 +193,8 @@ class RobotLink(asyncio.Protocol):
         if task is not None and task is not asyncio.current_task():
             task.cancel()
             abandoned += 1
-        self._account.open -= abandoned
-        self._account.abandoned += abandoned
+        self._counts.open -= abandoned
+        self._counts.abandoned += abandoned
         self._robot_requests.forget_result()
         if abort:
             self._transport.abort()

@@ -1,4 +1,4 @@
-"""Convert a result into rows of values for a robot, one row for each part."""
+"""Convert a result into values for a robot, one list for each part."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from smartcam.layout import Layout
     from smartcam.layout._inside import Field
 
-Row = list[float | str]
+PartValues = list[float | str]
 
 
-class Parts:
+class PartConverter:
     """Converts results: poses to the robot's convention, other values to the robot's units.
 
     Args:
@@ -48,8 +48,8 @@ class Parts:
             return (*self._convention.numbers, *self._settings.also)
         return tuple(field.name for field in layout.fields)
 
-    def rows(self, value: object, application: int) -> list[Row]:
-        """Return a row for each part of a result.
+    def convert(self, value: object, application: int) -> list[PartValues]:
+        """Return the values of each part of a result.
 
         Raises:
             InterpretationError: the value holds neither localizations nor records.
@@ -65,11 +65,11 @@ class Parts:
             )
         layout = self._layouts.get(application) or self._layouts.get(None)
         fields = {field.name: field for field in layout.fields} if layout else {}
-        return [self._row(item, fields) for item in cast("Sequence[object]", items)]
+        return [self._values(item, fields) for item in cast("Sequence[object]", items)]
 
-    def _row(self, item: object, fields: Mapping[str, Field]) -> Row:
+    def _values(self, item: object, fields: Mapping[str, Field]) -> PartValues:
         if isinstance(item, Localization):
-            return self._pose_row(item)
+            return self._pose_values(item)
         if hasattr(item, "_asdict"):
             item = cast("Any", item)._asdict()
         if not isinstance(item, Mapping):
@@ -79,7 +79,7 @@ class Parts:
         record = cast("Mapping[str, object]", item)
         return [self._convert_unit(value, fields.get(name)) for name, value in record.items()]
 
-    def _pose_row(self, part: Localization) -> Row:
+    def _pose_values(self, part: Localization) -> PartValues:
         x, y, z, w = part.pose.orientation
         if self._settings.tool_flip:
             x, y, z, w = w, z, -y, -x  # the quaternion times (1, 0, 0, 0): half a turn about x

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from smartcam.camera import Camera
-    from smartcam.gateway._account import GatewayAccount
+    from smartcam.gateway._counts import GatewayCounts
     from smartcam.gateway._lines import RobotRequest
-    from smartcam.gateway._parts import Parts, Row
+    from smartcam.gateway._parts import PartConverter, PartValues
     from smartcam.gateway._settings import GatewaySettings
     from smartcam.models import Result
 
@@ -67,7 +67,7 @@ class GatewayCamera:
     Args:
         camera: the camera.
         settings: timeouts of requests, and the age up to which parts are given to robots.
-        account: counts of requests and parts.
+        counts: counts of requests and parts.
 
     Attributes:
         camera: the camera; the gateway may set another object.
@@ -75,12 +75,16 @@ class GatewayCamera:
     """
 
     def __init__(
-        self, camera: Camera, settings: GatewaySettings, parts: Parts, account: GatewayAccount
+        self,
+        camera: Camera,
+        settings: GatewaySettings,
+        converter: PartConverter,
+        counts: GatewayCounts,
     ) -> None:
         self.camera: Camera = camera
         self.settings: GatewaySettings = settings
-        self.parts: Parts = parts
-        self.account: GatewayAccount = account
+        self.converter: PartConverter = converter
+        self.counts: GatewayCounts = counts
         self.trigger_lock = asyncio.Lock()
 
 
@@ -93,10 +97,10 @@ class RobotRequests:
 
     def __init__(self, shared: GatewayCamera) -> None:
         self._shared = shared
-        self._rows: list[Row] | None = None  # rows of the last result; None without one
-        self._rows_expire_at = 0.0  # loop time after which the robot gets no more of the rows
-        self._last_error = RobotAnswer(AnswerCode.NONE, words="no request has failed")
-        self._answer_has_row = False  # True while an answer with the first row is being written
+        self._parts: list[PartValues] | None = None  # values of the parts of the last result
+        self._parts_expire_at = 0.0  # loop time after which the robot gets no more of the parts
+        self._last_error = RobotAnswer(AnswerCode.NO_PART, text="no request has failed")
+        self._answer_has_part = False  # True while an answer with the first part is being written
 
     # ------------------------------------------------------------------ a request
 
@@ -107,10 +111,10 @@ class RobotRequests:
                 answer = await self._answer(request, deadline)
         except (SmartCamError, TimeoutError) as exc:
             code = next((code for kind, code in CODES if isinstance(exc, kind)), AnswerCode.FAULT)
-            answer = RobotAnswer(code, words=str(exc) or "no answer of the camera in time")
+            answer = RobotAnswer(code, text=str(exc) or "no answer of the camera in time")
         except Exception as exc:  # noqa: BLE001 - a robot waits for an answer in any case
             _log.exception("a request failed")
-            answer = RobotAnswer(AnswerCode.FAULT, words=f"unexpected {exc!r:.100}")
+            answer = RobotAnswer(AnswerCode.FAULT, text=f"unexpected {exc!r:.100}")
         if answer.code.is_error:
             self._last_error = answer
         return answer
@@ -120,12 +124,12 @@ class RobotRequests:
             request.word == "TRIGGER"
         ):
             words = f"expected {', '.join(WORDS)} (TRIGGER n: with application n)"
-            return RobotAnswer(AnswerCode.BAD_REQUEST, words=f"{words}, got {request.text!r}")
+            return RobotAnswer(AnswerCode.BAD_REQUEST, text=f"{words}, got {request.text!r}")
         if request.word == "STATUS":
             return self._status()
         if request.word == "WHY":
             return RobotAnswer(
-                AnswerCode.PART, words=f"{self._last_error.code.name} {self._last_error.words}"
+                AnswerCode.OK, text=f"{self._last_error.code.name} {self._last_error.text}"
             )
         if request.word != "NEXT":
             self.forget_result()
@@ -146,50 +150,50 @@ class RobotRequests:
         camera = self._shared.camera
         running = camera.connected and Status.RUNNING in camera.status
         values = [int(camera.connected), int(running), camera.active_application or 0]
-        return RobotAnswer(AnswerCode.PART, values=values)
+        return RobotAnswer(AnswerCode.OK, values=values)
 
     # ------------------------------------------------------------------ parts
 
     def _keep_parts(self, result: Result) -> None:
-        rows = self._shared.parts.rows(result.value, result.application)
-        self._rows = rows
-        self._rows_expire_at = asyncio.get_running_loop().time() + self._shared.settings.max_age
-        self._shared.account.parts += len(rows)
-        self._shared.account.waiting += len(rows)
+        parts = self._shared.converter.convert(result.value, result.application)
+        self._parts = parts
+        self._parts_expire_at = asyncio.get_running_loop().time() + self._shared.settings.max_age
+        self._shared.counts.parts += len(parts)
+        self._shared.counts.waiting += len(parts)
 
     def _next_part(self) -> RobotAnswer:
-        if self._rows is None:
+        if self._parts is None:
             return RobotAnswer(
-                AnswerCode.NO_RESULT, words="there is no result: TRIGGER or WAIT comes first"
+                AnswerCode.NO_RESULT, text="there is no result: TRIGGER or WAIT comes first"
             )
-        if self._rows and asyncio.get_running_loop().time() > self._rows_expire_at:
+        if self._parts and asyncio.get_running_loop().time() > self._parts_expire_at:
             self.forget_result()
             age = self._shared.settings.max_age
-            return RobotAnswer(AnswerCode.NO_RESULT, words=f"the result is older than {age:g} s")
-        if not self._rows:
-            return RobotAnswer(AnswerCode.NONE)
-        self._answer_has_row = True
-        return RobotAnswer(AnswerCode.PART, len(self._rows) - 1, self._rows[0])
+            return RobotAnswer(AnswerCode.NO_RESULT, text=f"the result is older than {age:g} s")
+        if not self._parts:
+            return RobotAnswer(AnswerCode.NO_PART)
+        self._answer_has_part = True
+        return RobotAnswer(AnswerCode.OK, len(self._parts) - 1, self._parts[0])
 
     def on_sent(self) -> None:
         """Count the part in the last answer as delivered; called after the answer was written."""
-        if self._answer_has_row and self._rows:
-            del self._rows[0]
-            self._shared.account.waiting -= 1
-            self._shared.account.delivered += 1
-        self._answer_has_row = False
+        if self._answer_has_part and self._parts:
+            del self._parts[0]
+            self._shared.counts.waiting -= 1
+            self._shared.counts.delivered += 1
+        self._answer_has_part = False
 
     def replace_answer(self, words: str) -> RobotAnswer:
         """Forget the result, and return an error instead of an answer that cannot be written."""
         self.forget_result()
-        self._last_error = RobotAnswer(AnswerCode.UNREADABLE, words=words)
+        self._last_error = RobotAnswer(AnswerCode.UNREADABLE, text=words)
         return self._last_error
 
     def forget_result(self) -> None:
         """Forget the last result: the robot requests a newer one, or has disconnected."""
-        rows, self._rows, self._answer_has_row = self._rows or [], None, False
-        self._shared.account.waiting -= len(rows)
-        self._shared.account.forgotten += len(rows)
+        parts, self._parts, self._answer_has_part = self._parts or [], None, False
+        self._shared.counts.waiting -= len(parts)
+        self._shared.counts.forgotten += len(parts)
 
 
 def _time_left(deadline: float) -> float:

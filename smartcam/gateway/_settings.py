@@ -46,7 +46,7 @@ class Style(NamedTuple):
         separator: text between two values.
         line_end: text after an answer.
         width: number of bytes of each answer, filled with blanks; 0: as many as the answer needs.
-        longest: largest number of bytes of an answer. A longer text for people is cut; too many
+        max_bytes: largest number of bytes of an answer. A longer text for people is cut; too many
             numbers are an error.
     """
 
@@ -58,15 +58,15 @@ class Style(NamedTuple):
     separator: str = ","
     line_end: str = "\r\n"
     width: int = 0
-    longest: int = 250
+    max_bytes: int = 250
 
 
 STYLES: Mapping[str, Style] = {
     "plain": Style(),
-    "ur": Style("brackets", "ur", "m", "rad", 6, line_end="\n", longest=1000),
-    "kuka": Style("xml", "kuka", decimals=4, line_end="", longest=1000),
-    "fanuc": Style(pose="fanuc", line_end="\r", longest=120),
-    "siemens": Style(width=96, longest=96),
+    "ur": Style("brackets", "ur", "m", "rad", 6, line_end="\n", max_bytes=1000),
+    "kuka": Style("xml", "kuka", decimals=4, line_end="", max_bytes=1000),
+    "fanuc": Style(pose="fanuc", line_end="\r", max_bytes=120),
+    "siemens": Style(width=96, max_bytes=96),
 }
 """The style of answers that each make of controller can read; docs/robots.md names the sources."""
 
@@ -133,7 +133,7 @@ class GatewaySettings(BaseModel):
         default=DEFAULT_TIMEOUT, description="seconds until an answer, at most"
     )
     max_age: Seconds = Field(
-        default=60.0, description="seconds that NEXT may ask for a result's parts"
+        default=60.0, description="seconds after a result in which NEXT still returns its parts"
     )
     idle: Seconds = Field(
         default=3600.0, description="seconds after which a silent robot is hung up on"
@@ -141,7 +141,7 @@ class GatewaySettings(BaseModel):
     clients: int = Field(default=8, ge=1, le=MAX_CLIENTS, description="robots at a time")
 
     @property
-    def place(self) -> tuple[str, int]:
+    def host_and_port(self) -> tuple[str, int]:
         """Host and port to listen on."""
         host, _, port = self.listen.removeprefix("tcp/").rpartition(":")
         return host.strip("[]"), int(port)
@@ -152,14 +152,14 @@ class GatewaySettings(BaseModel):
         names = ("form", "pose", "length", "angle", "decimals", "separator", "width")
         options = {name: value for name in names if (value := getattr(self, name)) is not None}
         if self.pose is not None:
-            metre = ROBOTS[self.pose].units_per_metre
-            defaults = {"length": "m" if metre == 1.0 else "mm", "angle": "rad"}
+            units_per_metre = ROBOTS[self.pose].units_per_metre
+            defaults = {"length": "m" if units_per_metre == 1.0 else "mm", "angle": "rad"}
             defaults["angle"] = "rad" if self.pose == "ur" else "deg"
             options = {**defaults, **options}
         if self.line_end is not None:
             options["line_end"] = LINE_ENDS[self.line_end]
         if self.width:
-            options["longest"] = self.width
+            options["max_bytes"] = self.width
         return STYLES[self.robot]._replace(**options)
 
     @model_validator(mode="after")
@@ -168,14 +168,16 @@ class GatewaySettings(BaseModel):
         if style.form == "brackets" and "feature_id" in self.also:
             raise ValueError("also: feature_id is a text, which brackets have no room for")
         if style.form == "text" and not (style.line_end or style.width):
-            raise ValueError("line_end: a text that nothing ends needs a width")
+            raise ValueError("line_end: answers without a line end need a width")
         return self
 
 
 class GatewayFile(GatewaySettings):
     """A gateway and its camera in one file."""
 
-    url: str | None = Field(default=None, description="the camera; a fleet's, too")
+    url: str | None = Field(
+        default=None, description="URL of the camera, or of a camera that a fleet shares"
+    )
     emulated: bool = Field(default=False, description="an emulated camera instead")
     application: int | None = Field(
         default=None,
@@ -184,11 +186,12 @@ class GatewayFile(GatewaySettings):
         description="the application that is to run",
     )
     interpret_as: str | None = Field(
-        default=None, description="how results are read; localizations"
+        default=None, description="how results are interpreted; default: localizations"
     )
     y_down: bool = Field(default=False, description="the camera's y axis points down")
     calibration: str | None = Field(
-        default=None, description="a file beside this one: poses are a robot's"
+        default=None,
+        description="calibration file in the same folder; with it, poses are in the robot's frame",
     )
     name: str | None = Field(default=None, description="the camera's name, in results and poses")
 

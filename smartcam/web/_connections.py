@@ -55,8 +55,8 @@ class SiteConnections:
         self.closed: bool = False
         self.places: Places[SiteConnection] = Places(
             MAX_CONNECTIONS,
-            within=HEAD_TIMEOUT,
-            timeout_reason="no request",
+            timeout=HEAD_TIMEOUT,
+            missing="no request",
             session_name="a request",
         )
         self.acceptor: Acceptor[SiteConnection] = Acceptor(
@@ -92,7 +92,7 @@ class SiteConnection(asyncio.Protocol):
         if self._connections.closed:
             self._transport.abort()
             return
-        refusal = self._acceptor.refusal_on_entry(self, address)
+        refusal = self._acceptor.enter(self, address)
         if refusal:
             _log.info("= %s: connection closed: %s", self._peer, refusal)
             self._transport.write(_BUSY)

@@ -26,17 +26,17 @@ class Guest:
 
 def full(count: int, peer: str = "127.0.0.1", most: int = 0) -> tuple[Places[Guest], list[Guest]]:
     """Return places that are all taken, or as many of ``most``."""
-    places: Places[Guest] = Places(most or count, within=10)
+    places: Places[Guest] = Places(most or count, timeout=10)
     guests = [Guest() for _ in range(count)]
     for moment, one in enumerate(guests):
-        assert places.refusal_on_entry(one, peer, moment) == ""
+        assert places.enter(one, peer, moment) == ""
     return places, guests
 
 
 def test_the_one_without_a_session_for_longest_makes_room() -> None:
     places, guests = full(3)
     guests[0].keeps_place = True
-    assert places.refusal_on_entry(newcomer := Guest(), "127.0.0.1", 3) == ""
+    assert places.enter(newcomer := Guest(), "127.0.0.1", 3) == ""
     assert guests[1].why == "3 others are open, it was without a session for longest"
     assert list(places) == [guests[0], guests[2], newcomer]
     assert places.crowded_out == 1
@@ -45,8 +45,8 @@ def test_the_one_without_a_session_for_longest_makes_room() -> None:
 def test_who_had_a_session_makes_room_last() -> None:
     places, guests = full(3)
     places.restart_idle_time(guests[0], 5)
-    places.refusal_on_entry(Guest(), "127.0.0.1", 6)
-    places.refusal_on_entry(Guest(), "127.0.0.1", 7)
+    places.enter(Guest(), "127.0.0.1", 6)
+    places.enter(Guest(), "127.0.0.1", 7)
     assert [bool(one.why) for one in guests] == [False, True, True]
 
 
@@ -55,10 +55,7 @@ def test_where_each_has_a_session_the_newcomer_has_no_place() -> None:
     for one in guests:
         one.keeps_place = True
     newcomer = Guest()
-    assert (
-        places.refusal_on_entry(newcomer, "127.0.0.1", 3)
-        == "2 others are open, and each has a session"
-    )
+    assert places.enter(newcomer, "127.0.0.1", 3) == "2 others are open, and each has a session"
     assert newcomer not in places
     assert places.crowded_out == 1
 
@@ -66,15 +63,15 @@ def test_where_each_has_a_session_the_newcomer_has_no_place() -> None:
 def test_one_address_has_three_quarters_and_its_own_make_room() -> None:
     places, guests = full(6, "10.0.0.1", 8)
     assert share_of(8) == 6
-    assert places.refusal_on_entry(Guest(), "10.0.0.2", 7) == ""
-    assert places.refusal_on_entry(Guest(), "10.0.0.1", 8) == ""
+    assert places.enter(Guest(), "10.0.0.2", 7) == ""
+    assert places.enter(Guest(), "10.0.0.1", 8) == ""
     assert guests[0].why == "6 others of 10.0.0.1 are open, it was without a session for longest"
     for one in guests:
         one.keeps_place = not one.why
-    places.refusal_on_entry(Guest(keeps_place=True), "10.0.0.3", 9)
+    places.enter(Guest(keeps_place=True), "10.0.0.3", 9)
     for one in list(places):
         one.keeps_place = True
-    assert places.refusal_on_entry(Guest(), "10.0.0.1", 10).startswith("8 others")
+    assert places.enter(Guest(), "10.0.0.1", 10).startswith("8 others")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1", "::ffff:127.0.0.1", "127.1.2.3"])
@@ -122,7 +119,7 @@ def test_what_is_expected_can_be_set_and_be_nothing() -> None:
     )
 )
 def test_bounds_hold_whatever_happens(steps: list[tuple[str, int, str]]) -> None:
-    places: Places[Guest] = Places(8, within=10)
+    places: Places[Guest] = Places(8, timeout=10)
     there: list[tuple[Guest, str]] = []
     now = 0.0
     for what, number, peer in steps:
@@ -130,7 +127,7 @@ def test_bounds_hold_whatever_happens(steps: list[tuple[str, int, str]]) -> None
         if what == "enter":
             newcomer = Guest()
             unsettled = [one for one, _ in there if not one.keeps_place]
-            refusal = places.refusal_on_entry(newcomer, peer, now)
+            refusal = places.enter(newcomer, peer, now)
             if not refusal:
                 there.append((newcomer, peer))
             elif unsettled:

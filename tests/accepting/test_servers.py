@@ -103,14 +103,14 @@ async def strangers(
     """Connect strangers to a server; refused ones give their sockets back."""
     there: list[Stranger] = []
     try:
-        for _ in range(count or (MANY if kind == "thousand" else 2 * stage.places.most)):
+        for _ in range(count or (MANY if kind == "thousand" else 2 * stage.places.max_places)):
             there.append(Stranger(kind, row, host))
             await there[-1].connect(stage.port)
             if len(there) % 32 == 0:
                 await turns()
                 for one in there:
                     one.look()
-                assert len(stage.places) <= stage.places.most
+                assert len(stage.places) <= stage.places.max_places
         await turns()
         yield there
     finally:
@@ -149,7 +149,7 @@ async def test_strangers_lock_nobody_out_and_are_sent_away(name: str, kind: str)
             await alive()
             async with strangers(kind, row, stage) as there:
                 await alive()
-                assert len(stage.places) <= stage.places.most
+                assert len(stage.places) <= stage.places.max_places
                 if not row.one_session:
                     await stage.served()
                     await alive()
@@ -184,7 +184,7 @@ async def test_what_strangers_say_takes_little_memory(name: str) -> None:
                         one.speak()
                     await turns(5)
                 now, _ = tracemalloc.get_traced_memory()
-            assert now - before < stage.places.most * MAX_BYTES
+            assert now - before < stage.places.max_places * MAX_BYTES
         finally:
             tracemalloc.stop()
 
@@ -206,7 +206,7 @@ async def test_one_address_takes_no_place_of_another(name: str) -> None:
         slow = Stranger("nothing", row, "127.0.0.1")  # a newcomer that has said nothing yet
         await slow.connect(stage.port)
         async with strangers("nothing", row, stage, host="127.0.0.2"):
-            share = share_of(stage.places.most)
+            share = share_of(stage.places.max_places)
             assert len(stage.places) <= share + 1
             slow.look()
             assert not slow.ended or row.target_decides
@@ -225,7 +225,9 @@ async def test_the_last_descriptors_are_for_who_has_a_session(
         async with strangers("nothing", row, stage, count=8) as there:
             before = len(stage.places)
             with monkeypatch.context() as patch:
-                patch.setattr(_accepting, "_is_reserved", lambda _connection, _reserve: True)
+                patch.setattr(
+                    _accepting, "_uses_reserved_descriptor", lambda _connection, _reserve: True
+                )
                 async with strangers("nothing", row, stage, count=8):
                     assert len(stage.places) <= before
                     await alive()

@@ -26,7 +26,7 @@ def ask(address: str, *requests: bytes) -> list[bytes]:
         return answers
 
 
-def test_demo_answers_and_tells_the_account() -> None:
+def test_demo_answers_and_tells_the_counts() -> None:
     with Process("smartcam", "gateway", "--demo", "--json", "--listen", "tcp/127.0.0.1:0") as it:
         address = json.loads(it.read_until(b"\n"))["gateway"]
         status, part = ask(address, b"STATUS\n", b"TRIGGER\r\n")
@@ -34,10 +34,10 @@ def test_demo_answers_and_tells_the_account() -> None:
         assert part.startswith(b"0,6,")
         it.send_signal(signal.SIGINT)
         ended = it.wait()
-    account = json.loads(ended.out.splitlines()[-1])["account"]
+    counts = json.loads(ended.out.splitlines()[-1])["counts"]
     assert (ended.code, ended.err) == (0, "")
-    assert (account["requests"], account["parts"], account["delivered"]) == (2, 7, 1)
-    assert (account["forgotten"], account["waiting"]) == (6, 0)
+    assert (counts["requests"], counts["parts"], counts["delivered"]) == (2, 7, 1)
+    assert (counts["forgotten"], counts["waiting"]) == (6, 0)
 
 
 def test_file_says_what_options_say_and_options_win(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_what_cannot_work_is_reported() -> None:
         ((), "expected a camera's URL, a YAML file, or --demo"),
         (("--demo", "bvs://127.0.0.1"), "expected a camera's URL, a YAML file, or --demo"),
         (("--demo", "--listen", "7001"), "--listen: expected tcp/HOST:PORT"),
-        (("--demo", "--line-end", "none"), "line_end: a text that nothing ends needs a width"),
+        (("--demo", "--line-end", "none"), "line_end: answers without a line end need a width"),
         (("nowhere.yaml",), "nowhere.yaml"),
     ):
         outcome = run("gateway", *given)

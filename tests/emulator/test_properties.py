@@ -252,7 +252,7 @@ class Owner:
 class OpenHouse(TcpListener):
     """Has room for every client, and no event loop."""
 
-    def refusal_on_entry(self, link: _TcpLink) -> str:
+    def enter(self, link: _TcpLink) -> str:
         return ""
 
     def leave(self, link: _TcpLink) -> None:

@@ -51,16 +51,16 @@ async def test_example_picks_every_part_once_and_then_asks_for_new_ones(robot: s
         picks = len(truth) + 2  # into a second picture
         controller = CONTROLLERS[robot](int(gateway.address.rpartition(":")[2]), picks)
         await asyncio.to_thread(controller.run)
-    account = gateway.account
+    counts = gateway.counts
     assert len(controller.poses) == picks
     for numbers, (x, y, theta) in zip(controller.poses, [*truth, *truth[:2]], strict=True):
         found = pose_of(robot, numbers)
         assert math.dist(found[:2], (x, y)) < 0.001
         assert abs(math.remainder(found[2] - theta, math.tau)) < 0.02
-    assert account.errors == 0
-    assert account.delivered == picks
-    assert account.parts == account.delivered + account.forgotten + account.waiting
-    assert account.requests == account.answered + account.errors + account.abandoned
+    assert counts.errors == 0
+    assert counts.delivered == picks
+    assert counts.parts == counts.delivered + counts.forgotten + counts.waiting
+    assert counts.requests == counts.answered + counts.errors + counts.abandoned
 
 
 @pytest.mark.real_time
@@ -81,5 +81,5 @@ async def test_example_takes_no_part_of_an_answer_that_comes_too_late(robot: str
         await asyncio.to_thread(controller.run)
     assert controller.poses == []
     assert controller.errors == [99, 99, 99]
-    assert gateway.account.delivered == 0
-    assert gateway.account.abandoned >= 2  # the last one may not have come any more
+    assert gateway.counts.delivered == 0
+    assert gateway.counts.abandoned >= 2  # the last one may not have come any more

@@ -1,4 +1,4 @@
-"""The rules of a gateway: one answer to each request, in time, never a stale part; the account."""
+"""The rules of a gateway: one answer to each request, in time, never a stale part; the counts."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class Cell:
         self._robots.append(robot)
         return robot
 
-    async def account(self) -> Any:
-        """Return the account once nothing is under way; it balances."""
+    async def counts(self) -> Any:
+        """Return the counts once nothing is under way; it balances."""
         for _ in range(100):
             await asyncio.sleep(0.001)
-        found = self.gateway.account
+        found = self.gateway.counts
         assert found.requests == found.answered + found.errors + found.abandoned + found.open
         assert found.parts == found.delivered + found.forgotten + found.waiting
         return found
@@ -94,9 +94,9 @@ async def test_parts_come_one_by_one_and_then_none() -> None:
         assert await robot.ask(b"TRIGGER\r\n") == FIRST
         assert await robot.ask(b"next\r") == SECOND
         assert await robot.ask(b" NEXT \n") == b"1,0\r\n"
-        account = await it.account()
-    assert (account.requests, account.answered, account.errors) == (3, 3, 0)
-    assert (account.parts, account.delivered) == (2, 2)
+        counts = await it.counts()
+    assert (counts.requests, counts.answered, counts.errors) == (3, 3, 0)
+    assert (counts.parts, counts.delivered) == (2, 2)
 
 
 async def test_without_a_result_there_is_no_next_part() -> None:
@@ -114,7 +114,7 @@ async def test_a_part_that_is_too_old_is_not_given() -> None:
         assert await robot.ask(b"TRIGGER\n") == FIRST
         await asyncio.sleep(11)
         assert await robot.ask(b"NEXT\n") == b"26,0,NO_RESULT the result is older than 10 s\r\n"
-        assert (await it.account()).forgotten == 1
+        assert (await it.counts()).forgotten == 1
 
 
 async def test_a_failed_trigger_leaves_no_part_of_the_result_before() -> None:
@@ -149,7 +149,7 @@ async def test_a_line_without_end_is_answered_and_ends_the_connection() -> None:
         robot = await it.robot()
         assert (await robot.ask(b"T" * 300)).startswith(b"11,0,TOO_LONG ")
         assert await robot.reader.read() == b""
-        assert (await it.account()).errors == 1
+        assert (await it.counts()).errors == 1
 
 
 async def test_another_robot_waits_and_is_told_that_the_camera_is_busy() -> None:
@@ -167,8 +167,8 @@ async def test_a_robot_that_leaves_in_the_middle_leaves_nothing_behind() -> None
         robot.writer.write(b"TRIGGER\n")
         await asyncio.sleep(0.02)
         robot.reset()
-        account = await it.account()
-        assert (account.abandoned, account.open, account.delivered) == (1, 0, 0)
+        counts = await it.counts()
+        assert (counts.abandoned, counts.open, counts.delivered) == (1, 0, 0)
         other = await it.robot()
         assert await other.ask(b"TRIGGER\n") == FIRST  # its own: the turn is free again
 
@@ -180,7 +180,7 @@ async def test_a_second_request_before_the_answer_ends_the_connection() -> None:
         await asyncio.sleep(0.02)
         robot.writer.write(b"NEXT\n")
         assert await robot.reader.read() == b""
-        assert (await it.account()).abandoned == 2
+        assert (await it.counts()).abandoned == 2
 
 
 async def test_numbered_requests_may_wait_for_each_other() -> None:
@@ -193,7 +193,7 @@ async def test_numbered_requests_may_wait_for_each_other() -> None:
         answers = [(await robot.reader.readuntil(b"\n")).split(b",") for _ in range(20)]
         assert sorted(int(one[0]) for one in answers) == list(range(20))
         assert sum(one[1] == b"20" for one in answers) == 11  # BUSY: one is served, eight wait
-        await it.account()
+        await it.counts()
 
 
 async def test_one_robot_too_many_is_told_and_the_others_stay() -> None:
@@ -205,7 +205,7 @@ async def test_one_robot_too_many_is_told_and_the_others_stay() -> None:
         assert (await late.reader.readuntil(b"\n")).startswith(b"30,0,FULL ")
         assert await late.reader.read() == b""
         assert await robots[0].ask(b"STATUS\n") == b"0,0,1,1,7\r\n"
-        assert (await it.account()).refused == 1
+        assert (await it.counts()).refused == 1
 
 
 async def test_a_silent_robot_is_hung_up_on_without_a_line() -> None:
@@ -302,7 +302,7 @@ async def test_what_also_stands_after_a_pose() -> None:
     [
         ({"listen": "127.0.0.1:7001"}, "tcp/HOST:PORT"),
         ({"robot": "ur", "also": ["feature_id"]}, "brackets have no room"),
-        ({"line_end": "none"}, "needs a width"),
+        ({"line_end": "none"}, "need a width"),
         ({"separator": "."}, "stands in no number"),
         ({"timeout": 0}, "greater than 0"),
         ({"clients": 0}, "greater than or equal to 1"),

@@ -61,7 +61,7 @@ class Sr(EmulatedSr):
 
     @property
     def runs(self) -> int:
-        return self._run
+        return self._reading_number
 
 
 CAMERAS: dict[str, tuple[Any, str, str]] = {

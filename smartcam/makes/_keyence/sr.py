@@ -15,8 +15,8 @@ from smartcam.makes._keyence.words import (
     MAX_LINE_BYTES,
     READY,
     answer_key,
-    result_code,
     error_code,
+    result_code,
 )
 from smartcam.models import Status
 from smartcam.protocols import (

@@ -240,7 +240,7 @@ class StreamRelay(Relay[ProxiedConnection]):
             client.close()
             return
         self.clients[self._last_number] = connection
-        refusal = self._acceptor.refusal_on_entry(connection, address)
+        refusal = self._acceptor.enter(connection, address)
         if refusal:
             connection.close_for(refusal)
         else:

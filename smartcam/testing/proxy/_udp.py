@@ -239,9 +239,7 @@ class DatagramRelay(Relay[_Peer]):
             self.log.note("not accepted", self._last_number)
             return None
         self.clients[address] = peer
-        refusal = self.places.refusal_on_entry(
-            peer, str(address[0]), asyncio.get_running_loop().time()
-        )
+        refusal = self.places.enter(peer, str(address[0]), asyncio.get_running_loop().time())
         if refusal:
             peer.close_for(refusal)
             return None

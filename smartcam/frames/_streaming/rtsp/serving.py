@@ -49,7 +49,7 @@ class RtspServing:
         self._max_viewers = max_viewers
         self._viewer_addresses: list[str] = []  # address of each viewer
         self._listener: socket.socket | None = None
-        self.places: Places[RtspConnection] = Places(max_connections, within=IDLE_TIMEOUT)
+        self.places: Places[RtspConnection] = Places(max_connections, timeout=IDLE_TIMEOUT)
         self._acceptor = Acceptor(
             lambda: RtspConnection(self), self.places, _log, name="smartcam.rtsp"
         )
@@ -84,7 +84,7 @@ class RtspServing:
         """Register a new connection; return the reason if there are too many, else ""."""
         if self._listener is None:
             return "the server is stopped"
-        return self._acceptor.refusal_on_entry(connection, peer)
+        return self._acceptor.enter(connection, peer)
 
     def unregister(self, connection: RtspConnection) -> None:
         """Remove a closed connection."""

@@ -1,4 +1,4 @@
-"""Count the outcomes of a gateway's requests and parts."""
+"""Count the outcomes of a gateway's requests and parts, the workpieces in the camera's results."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(slots=True)
-class GatewayAccount:
+class GatewayCounts:
     """The counts of a gateway's requests and answers.
 
     ``requests == answered + errors + abandoned + open``, and
