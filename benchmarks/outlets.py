@@ -81,7 +81,7 @@ async def _triggers(plan: Plan, port: int, folder: Path) -> list[Comparison]:
             for name, each in took.items() if number else ():
                 slowest[name].append(each[len(each) - max(1, len(each) // 100)])
                 middle[name].append(each[len(each) // 2])
-        account = stalled.outlet_states()["stalled"].account
+        account = stalled.outlet_states()["stalled"].counts
         count = blocks * BLOCK * (plan.rounds + 1)
         assert account.spooled == account.results == count, account
     case = "await trigger(), 100 a second"

@@ -57,7 +57,7 @@ HELPERS = (
         "_natural",
         "_ros_names",
         "_server",
-        "_short_turns",
+        "_switch_interval",
         "_suggestions",
         "_user_code",
         "_whole_files",

@@ -352,12 +352,12 @@ class EntryRefusedError(OutletError):
     """The far end of an outlet will never take one of the entries.
 
     Attributes:
-        place: index of the entry among the entries to deliver; the entries before it were taken.
+        index: index of the entry among the entries to deliver; the entries before it were taken.
     """
 
-    def __init__(self, message: str = "", *, place: int = 0) -> None:
+    def __init__(self, message: str = "", *, index: int = 0) -> None:
         super().__init__(message)
-        self.place = place
+        self.index = index
 
 
 class RecordingError(SmartCamError, OSError):

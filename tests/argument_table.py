@@ -235,8 +235,8 @@ Fleet.stored_results  pattern: pattern, since: function or None, failed: flag, m
     timeout: seconds
 Fleet.trigger  pattern: url, timeout: seconds
 Outlets.__init__  section: mapping, folder: text, columns: function, command: function or None,
-    cameras: function, names: function, on_trouble: function
-Outlets.stored  question: object
+    cameras: function, application_names: function, on_trouble: function
+Outlets.stored  query: object
 Fleet.url_of  name: text
 fleet.open  place: url, connect_timeout: seconds
 FrameSource.__init__  driver: not judged, camera_info: not judged, timeout: seconds or None,

@@ -217,11 +217,11 @@ async def outlets(url_or_file: str, options: Options) -> None:
     from smartcam.fleet import load_fleet
 
     with from_part("mqtt", '"fleet outlets" needs'):
-        from smartcam.outlets._inside import stored_accounts
+        from smartcam.outlets._inside import stored_counts
 
     section = load_fleet(url_or_file).outlets or {}
     rows: list[tuple[str, ...]] = []
-    for name, account in stored_accounts(section, Path(url_or_file).parent).items():
+    for name, account in stored_counts(section, Path(url_or_file).parent).items():
         fields = {} if account is None else account.fields()
         if options.as_json:
             options.show({"outlet": name, "account": fields or None}, "")

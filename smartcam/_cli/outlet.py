@@ -51,7 +51,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
         command=source.command,
         on_trouble=source.report_trouble,
         cameras=source.cameras,
-        names=source.application_names,
+        application_names=source.application_names,
     )
     url = await options.locate_url(url)
     with options.cameras(url, reconnect=Backoff()) as make_camera:
@@ -66,7 +66,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
             finally:
                 await source.stop()
         for name, state in outlets.states.items():
-            options.show({"outlet": name, **state.account.fields()}, f"{name}: {state.account}")
+            options.show({"outlet": name, **state.counts.fields()}, f"{name}: {state.counts}")
 
 
 class _OutletSource:

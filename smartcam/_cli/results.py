@@ -56,9 +56,9 @@ async def results(
     if "://" in store:
         await _show_fleet_stores(store, since, failed, camera or "**", max_count, options)
         return
-    from smartcam.outlets._inside import StoreQuestion, read_store
+    from smartcam.outlets._inside import StoreQuery, read_store
 
-    stored = read_store(Path(store), StoreQuestion(since, failed, camera or "**", max_count))
+    stored = read_store(Path(store), StoreQuery(since, failed, camera or "**", max_count))
     _show_rows(stored.rows, stored.summary, "", options)
 
 

@@ -53,11 +53,11 @@ class FleetOutlets(Server):
     ) -> None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):
             from smartcam.outlets import Outlets
-            from smartcam.outlets._inside import StoreQuestion, columns_of, do_command
+            from smartcam.outlets._inside import StoreQuery, columns_of, do_command
         if server.file.outlets is None:
             raise ConfigurationError(f"fleet {server.file.fleet}: outlets: is not in its file")
         self._server, self._do_command, self._columns_of = server, do_command, columns_of
-        self._question_class = StoreQuestion
+        self._question_class = StoreQuery
         self.outlets: Outlets = Outlets(
             server.file.outlets,
             server.folder,
@@ -65,7 +65,7 @@ class FleetOutlets(Server):
             command=self._command,
             on_trouble=report,
             cameras=self._cameras,
-            names=self._names,
+            application_names=self._names,
         )
         self._observer = _OutletObserver(self)
         self._interpretations: dict[str, tuple[object, Interpretation]] = {}

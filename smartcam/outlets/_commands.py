@@ -1,4 +1,4 @@
-"""Carry out commands to a camera that clients of an outlet send, such as a trigger over MQTT."""
+"""Carry out commands to a camera that come in through an outlet, such as a trigger over MQTT."""
 
 from __future__ import annotations
 

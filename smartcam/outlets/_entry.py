@@ -37,7 +37,7 @@ class OutletEntry(NamedTuple):
         return f"{self.camera}/{self.epoch}/{self.number}{gap}"
 
 
-class OutletAccount(NamedTuple):
+class OutletCounts(NamedTuple):
     """An outlet's counts, for which ``results == delivered + spooled + dropped`` always holds.
 
     Errors count as results; gaps do not count.
@@ -62,5 +62,5 @@ class OutletAccount(NamedTuple):
         return self.results == self.delivered + self.spooled + sum(self.dropped.values())
 
     def fields(self) -> dict[str, Any]:
-        """Return the account as values for JSON."""
+        """Return the counts as values for JSON."""
         return self._asdict()

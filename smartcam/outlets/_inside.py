@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from smartcam.outlets._commands import do_command
-from smartcam.outlets._outlets import OutletState, columns_of, stored_accounts
+from smartcam.outlets._outlets import OutletState, columns_of, stored_counts
 from smartcam.outlets._settings import OutletsFile, mistakes_of
-from smartcam.outlets._stored import StoreQuestion, read_store
+from smartcam.outlets._stored import StoreQuery, read_store
 
 __all__ = [
     "OutletState",
     "OutletsFile",
-    "StoreQuestion",
+    "StoreQuery",
     "columns_of",
     "do_command",
     "mistakes_of",
     "read_store",
-    "stored_accounts",
+    "stored_counts",
 ]

@@ -67,7 +67,7 @@ def _check_broker(text: str) -> str:
     if not fits or parts is None:
         raise ValueError("expected mqtt://HOST[:PORT] or mqtts://HOST[:PORT]")
     if parts.username is not None or parts.password is not None:
-        raise ValueError("expected no user in the address: user: and password: have them")
+        raise ValueError('expected no user in the address: set "user" and "password" instead')
     return text
 
 
@@ -169,7 +169,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             Exception: the broker cannot be reached, or refuses the connection.
         """
         aiomqtt = load("aiomqtt")
-        settings, online = self.settings, f"{self.settings.topic}/outlet/{self.name}"
+        settings, online_topic = self.settings, f"{self.settings.topic}/outlet/{self.name}"
         parts = urlsplit(settings.broker)
         password = None if settings.password is None else settings.password.read(self.folder)
         self._client = client = aiomqtt.Client(
@@ -179,7 +179,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             password=password,
             identifier=settings.client_id or f"smartcam-{self.name}",
             protocol=aiomqtt.ProtocolVersion.V5,
-            will=aiomqtt.Will(online, '{"online":false}', qos=1, retain=True),
+            will=aiomqtt.Will(online_topic, '{"online":false}', qos=1, retain=True),
             timeout=settings.timeout,
             keepalive=10,
             clean_start=True,  # earlier commands would be carried out too late
@@ -196,7 +196,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         if settings.commands and self.context.command is not None:
             for verb in _VERBS:
                 await client.subscribe(f"{settings.topic}/command/{verb}/#", qos=1)
-        await client.publish(online, '{"online":true}', qos=1, retain=True)
+        await client.publish(online_topic, '{"online":true}', qos=1, retain=True)
         self._unsent_states.update(self._states)
         self._changed.set()
         self._connection_task = asyncio.get_running_loop().create_task(
@@ -271,7 +271,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         )
         if too_large is not None:
             text = f"{sizes[too_large]} bytes, {limit} are allowed"
-            raise EntryRefusedError(text, place=too_large)
+            raise EntryRefusedError(text, index=too_large)
 
     async def _publish_while_connected(self, calls: list[Any]) -> None:
         """Await calls that publish; raise if the connection to the broker is lost before.
@@ -322,9 +322,9 @@ class MqttOutlet(Outlet[MqttSettings]):
             await asyncio.wait(tasks)
         client = self._client
         if client is not None and tasks:
-            online = f"{self.settings.topic}/outlet/{self.name}"
+            topic = f"{self.settings.topic}/outlet/{self.name}"
             with contextlib.suppress(Exception):
-                await client.publish(online, '{"online":false}', qos=1, retain=True, timeout=1)
+                await client.publish(topic, '{"online":false}', qos=1, retain=True, timeout=1)
         self._client = None
         await self._stack.aclose()
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._settings import OutletSettings
-    from smartcam.outlets._stored import StoredResults, StoreQuestion
+    from smartcam.outlets._stored import StoredResults, StoreQuery
 
 SettingsT = TypeVar("SettingsT", bound="OutletSettings")
 
@@ -27,7 +27,8 @@ class OutletContext:
             not allowed.
         cameras: function that returns the names of the cameras, and whether each is emulated; None
             if that is not known.
-        names: function that returns the names of a camera's applications, with their numbers.
+        application_names: function that returns the names of a camera's applications, with their
+            numbers.
     """
 
     def __init__(
@@ -35,12 +36,12 @@ class OutletContext:
         columns: Callable[[str, int], Sequence[Column]],
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
         cameras: Callable[[], Mapping[str, bool | None]] = dict,
-        names: Callable[[str], Mapping[str, int]] = lambda _camera: {},
+        application_names: Callable[[str], Mapping[str, int]] = lambda _camera: {},
     ) -> None:
         self.columns = columns
         self.command = command
         self.cameras = cameras
-        self.names = names
+        self.application_names = application_names
 
 
 Column = tuple[str, str, str]
@@ -59,7 +60,7 @@ class Outlet(ABC, Generic[SettingsT]):
         name: name of the outlet.
         settings: settings of the outlet.
         folder: folder to which relative paths refer.
-        context: functions of the process that has the cameras.
+        context: callbacks into the process that has the cameras.
 
     Attributes:
         settings_class: model of the settings, a class of ``OutletSettings``.
@@ -95,7 +96,7 @@ class Outlet(ABC, Generic[SettingsT]):
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
         """Handle a camera's state: ``connected``, ``application``, ``reason``; return at once."""
 
-    def stored(self, question: StoreQuestion) -> StoredResults | None:
+    def stored(self, query: StoreQuery) -> StoredResults | None:
         """Return results that the far end has stored; None if it cannot be queried.
 
         Called in a thread.

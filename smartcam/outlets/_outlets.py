@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from smartcam._arguments import check_callable, check_kind, check_path
 from smartcam._json import object_text
 from smartcam._server import Server
-from smartcam._short_turns import leave_turns, shorten_turns
+from smartcam._switch_interval import restore_switch_interval, shorten_switch_interval
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.outlets._outlet import Column, OutletContext
 from smartcam.outlets._pump import Pump
 from smartcam.outlets._settings import mistakes_of, outlet_class
-from smartcam.outlets._spool import Spool, read_account
-from smartcam.outlets._stored import StoreQuestion
+from smartcam.outlets._spool import Spool, read_outlet_counts
+from smartcam.outlets._stored import StoreQuery
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from smartcam.interpreters import Interpreter
     from smartcam.models import Result
-    from smartcam.outlets._entry import OutletAccount
+    from smartcam.outlets._entry import OutletCounts
     from smartcam.outlets._settings import OutletSettings, Section
     from smartcam.outlets._stored import StoredResults
 
@@ -42,11 +42,11 @@ class OutletState(NamedTuple):
     """The state of one outlet.
 
     Attributes:
-        account: account of the outlet.
+        counts: counts of the outlet.
         trouble: reason why entries are not delivered, or not spooled, now; "" without one.
     """
 
-    account: OutletAccount
+    counts: OutletCounts
     trouble: str
 
 
@@ -63,7 +63,8 @@ class Outlets(Server):
             cannot deliver or spool, and with "" when it can again.
         cameras: function that returns the cameras' names, and whether each is emulated; None if
             that is not known.
-        names: function that returns the names of a camera's applications, with their numbers.
+        application_names: function that returns the names of a camera's applications, with their
+            numbers.
 
     Raises:
         ConfigurationError: the section is wrong.
@@ -78,7 +79,7 @@ class Outlets(Server):
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
         on_trouble: Callable[[str, str], None] = lambda _name, _why: None,
         cameras: Callable[[], Mapping[str, bool | None]] = dict,
-        names: Callable[[str], Mapping[str, int]] = lambda _camera: {},
+        application_names: Callable[[str], Mapping[str, int]] = lambda _camera: {},
     ) -> None:
         check_kind(
             section, dict, "section", "a mapping of settings by the outlet's name", "Outlets"
@@ -87,12 +88,12 @@ class Outlets(Server):
         check_callable(columns, "columns", "Outlets")
         check_callable(on_trouble, "on_trouble", "Outlets")
         check_callable(cameras, "cameras", "Outlets")
-        check_callable(names, "names", "Outlets")
+        check_callable(application_names, "application_names", "Outlets")
         if command is not None:
             check_callable(command, "command", "Outlets")
         for keys, text in mistakes_of(section):
             raise ConfigurationError(f"{'.'.join(map(str, keys))}: {text}")
-        context = OutletContext(columns, command, cameras, names)
+        context = OutletContext(columns, command, cameras, application_names)
         self._pumps: dict[str, Pump] = {}
         for name, fields in section.items():
             class_ = outlet_class(name, fields)
@@ -117,7 +118,7 @@ class Outlets(Server):
         """
         if self._started:
             return
-        shorten_turns(self, SWITCH_INTERVAL)
+        shorten_switch_interval(self, SWITCH_INTERVAL)
         try:
             for pump in self._pumps.values():
                 try:
@@ -136,24 +137,24 @@ class Outlets(Server):
         while self._started:
             await self._started[-1].stop()
             self._started.pop()
-        leave_turns(self)
+        restore_switch_interval(self)
 
     @property
     def states(self) -> dict[str, OutletState]:
         """State of each outlet, by name."""
         return {
-            name: OutletState(pump.account, pump.disk_trouble or pump.trouble)
+            name: OutletState(pump.counts, pump.disk_trouble or pump.trouble)
             for name, pump in self._pumps.items()
         }
 
-    def stored(self, question: StoreQuestion) -> dict[str, StoredResults]:
+    def stored(self, query: StoreQuery) -> dict[str, StoredResults]:
         """Return the results in the outlets' stores, by the outlet's name; blocks.
 
         Raises:
             ConfigurationError: one of the stores cannot be read now.
         """
-        check_kind(question, StoreQuestion, "question", "a StoreQuestion", "stored")
-        answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}
+        check_kind(query, StoreQuery, "query", "a StoreQuery", "stored")
+        answers = {name: pump.outlet.stored(query) for name, pump in self._pumps.items()}
         return {name: answer for name, answer in answers.items() if answer is not None}
 
     # ------------------------------------------------------------------ from cameras
@@ -227,15 +228,15 @@ def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:
     return folder / settings.spool / f"{name}.spool"
 
 
-def stored_accounts(section: Section, folder: Path) -> dict[str, OutletAccount | None]:
-    """Return the accounts of a section's spools, by the outlet's name; None without a spool."""
-    accounts: dict[str, OutletAccount | None] = {}
+def stored_counts(section: Section, folder: Path) -> dict[str, OutletCounts | None]:
+    """Return the counts of a section's spools, by the outlet's name; None without a spool."""
+    counts: dict[str, OutletCounts | None] = {}
     for name, fields in section.items():
         settings = outlet_class(name, fields).settings_class.model_validate(fields)
-        accounts[name] = None
+        counts[name] = None
         with contextlib.suppress(FileNotFoundError):
-            accounts[name] = read_account(spool_path(folder, settings, name))
-    return accounts
+            counts[name] = read_outlet_counts(spool_path(folder, settings, name))
+    return counts
 
 
 LOCALIZATION_COLUMNS: Sequence[Column] = (

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.backoff import Backoff
 from smartcam.exceptions import EntryRefusedError
-from smartcam.outlets._entry import OutletAccount, OutletEntry
+from smartcam.outlets._entry import OutletCounts, OutletEntry
 from smartcam.outlets._spool import is_damage
 
 if TYPE_CHECKING:
@@ -96,11 +96,11 @@ class Pump:
         self.trouble = self.disk_trouble = ""
         self._waiting: collections.deque[Arrival] = collections.deque()
         self._waiting_bytes = 0
-        # the last dropped entry of each camera, and their number, until a gap is written for them
+        # the last dropped entry of each camera, and their number, until a gap entry reports them
         self._dropped: dict[str, tuple[Arrival, int]] = {}
         self._last_numbers: dict[str, int] = {}
         self._arrived, self._spooled = asyncio.Event(), asyncio.Event()
-        self._account = OutletAccount()
+        self._counts = OutletCounts()
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
         self._open = False
@@ -121,7 +121,7 @@ class Pump:
         except BaseException:
             await self._stop_thread()
             raise
-        self._account = self.spool.account
+        self._counts = self.spool.counts
         self._open = True
         loop = asyncio.get_running_loop()
         for work in (self._write(), self._deliver()):
@@ -138,14 +138,16 @@ class Pump:
         try:
             await self._cancel_tasks(self._tasks[:1])
             if self._open:
-                with contextlib.suppress(Exception):  # the next start adds a gap for unwritten ones
+                with contextlib.suppress(
+                    Exception
+                ):  # the next start adds a gap entry for unwritten ones
                     async with asyncio.timeout(STOP_TIMEOUT):
                         while self._waiting or self._dropped:
                             await self._store_waiting()
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(FINAL_DELIVERY_TIMEOUT):
                         while (  # noqa: ASYNC110 - for a second at most
-                            self._account.spooled and not (self.trouble or self.disk_trouble)
+                            self._counts.spooled and not (self.trouble or self.disk_trouble)
                         ):
                             await asyncio.sleep(0.01)
         finally:
@@ -198,14 +200,14 @@ class Pump:
         self._arrived.set()
 
     @property
-    def account(self) -> OutletAccount:
-        """The account of all entries, also of those in memory."""
-        counts, waiting = self._account, len(self._waiting)
+    def counts(self) -> OutletCounts:
+        """The counts of all entries, also of those in memory."""
+        counts, waiting = self._counts, len(self._waiting)
         memory_count = sum(count for _, count in self._dropped.values())
         dropped = dict(counts.dropped)
         if memory_count:
             dropped["memory"] = dropped.get("memory", 0) + memory_count
-        return OutletAccount(
+        return OutletCounts(
             counts.results + waiting + memory_count,
             counts.delivered,
             counts.spooled + waiting,
@@ -223,7 +225,7 @@ class Pump:
                     await self._store_waiting()
                 except Exception as exc:  # noqa: BLE001 - after any error entries are kept
                     self._report_disk(f"the spool {self.spool.path}: {text_of(exc)}")
-                    self._account = self.spool.account
+                    self._counts = self.spool.counts
                     await asyncio.sleep(DISK_RETRY_SECONDS)
                 else:
                     self._report_disk("")
@@ -239,7 +241,7 @@ class Pump:
     ) -> None:
         epoch = self.spool.epoch
 
-        def work() -> OutletAccount:
+        def work() -> OutletCounts:
             entries = list[OutletEntry]()
             for arrival in batch:
                 kind, application, body = arrival.make_content()
@@ -256,15 +258,13 @@ class Pump:
                 for arrival, count in dropped.values()
             ]
             self.spool.add(entries, gaps)
-            return self.spool.account
+            return self.spool.counts
 
-        await self._run_in_thread(
-            work, lambda account: self._remove_stored(batch, dropped, account)
-        )
+        await self._run_in_thread(work, lambda counts: self._remove_stored(batch, dropped, counts))
         self._spooled.set()
 
     def _remove_stored(
-        self, batch: list[Arrival], dropped: dict[str, tuple[Arrival, int]], account: OutletAccount
+        self, batch: list[Arrival], dropped: dict[str, tuple[Arrival, int]], counts: OutletCounts
     ) -> None:
         for arrival in batch:
             self._waiting.popleft()
@@ -273,7 +273,7 @@ class Pump:
             last, new_count = self._dropped.pop(camera)
             if new_count > count:
                 self._dropped[camera] = last, new_count - count
-        self._account = account
+        self._counts = counts
 
     async def _run_in_thread(
         self, work: Callable[[], T], on_done: Callable[[T], None] = lambda _: None
@@ -301,12 +301,12 @@ class Pump:
         on_done(outcome)
         return outcome
 
-    def _report_disk(self, why: str) -> None:
-        if why != self.disk_trouble:
-            self.disk_trouble = why
-            log = logger.error if why else logger.info
-            log("outlet %s: %s", self.outlet.name, why or "the spool is written again")
-            self._report(self.outlet.name, why)
+    def _report_disk(self, reason: str) -> None:
+        if reason != self.disk_trouble:
+            self.disk_trouble = reason
+            log = logger.error if reason else logger.info
+            log("outlet %s: %s", self.outlet.name, reason or "the spool can be written to again")
+            self._report(self.outlet.name, reason)
 
     # ------------------------------------------------------------------ to the server
 
@@ -352,7 +352,7 @@ class Pump:
         self._spooled.clear()
         batch_size, self._batch_size = self._batch_size, 1
         head = await self._run_in_thread(lambda: self.spool.head(batch_size))
-        if not head.places:
+        if not head.row_ids:
             self._batch_size = batch_size
             if self.trouble:
                 self._report_delivery("")
@@ -362,7 +362,7 @@ class Pump:
             async with asyncio.timeout(self.outlet.settings.timeout):
                 await self.outlet.deliver(head.entries)
         except EntryRefusedError as exc:
-            index = min(max(exc.place, 0), len(head.places) - 1)
+            index = min(max(exc.index, 0), len(head.row_ids) - 1)
             logger.error(  # noqa: TRY400 - the text says it
                 "outlet %s: %s is refused for good: %s",
                 self.outlet.name,
@@ -371,29 +371,34 @@ class Pump:
             )
             await self._remove_delivered(head, index, str(exc) or "refused")
         else:
-            await self._remove_delivered(head, None, "")
+            await self._remove_delivered(head)
         self._batch_size = min(2 * batch_size, self.outlet.max_batch)
         self._report_delivery("")
         return True
 
-    async def _remove_delivered(self, head: SpoolHead, count: int | None, refused: str) -> None:
-        """Remove delivered entries, so that none is sent twice; retry while the disk is full."""
+    async def _remove_delivered(
+        self, head: SpoolHead, refused_index: int | None = None, refusal: str = ""
+    ) -> None:
+        """Remove the delivered entries, and the refused one after them, so that none is sent twice.
 
-        def work() -> OutletAccount:
-            self.spool.remove_delivered(head, count, refused)
-            return self.spool.account
+        Retry while the disk is full.
+        """
+
+        def work() -> OutletCounts:
+            self.spool.remove_delivered(head, refused_index, refusal)
+            return self.spool.counts
 
         while True:
             try:
-                await self._run_in_thread(work, self._set_account)
+                await self._run_in_thread(work, self._set_counts)
             except sqlite3.Error as exc:
                 self._report_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                 await asyncio.sleep(DISK_RETRY_SECONDS)
             else:
                 return
 
-    def _set_account(self, account: OutletAccount) -> None:
-        self._account = account
+    def _set_counts(self, counts: OutletCounts) -> None:
+        self._counts = counts
 
     async def _wait_for_entries(self) -> None:
         """Wait until an entry is written to the spool.
@@ -413,12 +418,12 @@ class Pump:
                 task.cancel()
             await asyncio.wait({spooled_task, lost_task})
 
-    def _report_delivery(self, why: str) -> None:
-        if why != self.trouble:
-            self.trouble = why
-            log = logger.warning if why else logger.info
-            log("outlet %s: %s", self.outlet.name, why or "delivers again")
-            self._report(self.outlet.name, why)
+    def _report_delivery(self, reason: str) -> None:
+        if reason != self.trouble:
+            self.trouble = reason
+            log = logger.warning if reason else logger.info
+            log("outlet %s: %s", self.outlet.name, reason or "delivers again")
+            self._report(self.outlet.name, reason)
 
 
 _MEMORY_REASON = "the spool's disk was full, away or too slow"

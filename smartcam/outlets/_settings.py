@@ -1,4 +1,7 @@
-"""Define the settings of outlets, from a section of a fleet file or from an own file."""
+"""Define the settings of outlets, which deliver results to brokers, databases and PLCs.
+
+They come from a section of a fleet file, or from a file of their own.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +94,7 @@ class OutletSettings(_OutletFields):
     full: Policy = Field(
         "drop_oldest",
         description="what a full spool does; drop_oldest: drop the oldest; drop_newest: refuse the "
-        "newest. Both are counted, and the gap is delivered",
+        "newest. Dropped entries are counted, and an entry about the gap is delivered instead",
     )
     durable: bool = Field(
         False,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 from smartcam._locks import try_lock
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets._database import open_database, open_for_reading
-from smartcam.outlets._entry import OutletAccount, OutletEntry
+from smartcam.outlets._entry import OutletCounts, OutletEntry
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,11 +24,11 @@ Policy: TypeAlias = Literal["drop_oldest", "drop_newest"]
 ROW_BYTES = 200
 """Approximate number of bytes of an entry in the file, without its text."""
 
-MAX_PLACE = (1 << 63) - 1
-"""Largest place (row number) of an entry."""
+MAX_ROW_ID = (1 << 63) - 1
+"""Largest row id of an entry; the table's column is named ``place``."""
 
-MIN_FREE_PLACES = 1 << 32
-"""Least number of free places after the last one. If there are fewer, the file is damaged."""
+MIN_FREE_ROW_IDS = 1 << 32
+"""Least number of free row ids after the last one. If there are fewer, the file is damaged."""
 
 MAX_REASON_CHARACTERS = 500
 """Largest number of characters of a gap's reason; joined gaps have several reasons."""
@@ -70,9 +70,9 @@ def is_damage(error: sqlite3.Error) -> bool:
 
 
 class SpoolHead(NamedTuple):
-    """The oldest entries of the spool, their places (row numbers), and the spool's epoch."""
+    """The oldest entries of the spool, their row ids, and the spool's epoch."""
 
-    places: list[int]
+    row_ids: list[int]
     entries: list[OutletEntry]
     epoch: int
 
@@ -107,7 +107,7 @@ class Spool:
         self.epoch: int = 0
         self._counts: dict[str, int] = {}
         self._bytes = self._spooled = 0
-        self._in_flight = 0  # last place that is being delivered; it is not dropped
+        self._in_flight = 0  # last row id that is being delivered; it is not dropped
         self._lock: int | None = None
 
     def open(self) -> None:
@@ -127,12 +127,12 @@ class Spool:
             self._replace_file(str(exc))
         self._write_epoch(self.epoch)
 
-    def replace_damaged(self, why: str) -> None:
+    def replace_damaged(self, reason: str) -> None:
         """Rename the damaged file, and copy its readable entries to a new file."""
         database, self._database = self._database, None
         if database is not None:
             database.close()
-        self._replace_file(why)
+        self._replace_file(reason)
 
     @property
     def closed(self) -> bool:
@@ -160,25 +160,29 @@ class Spool:
     def _load(self, database: sqlite3.Connection) -> None:
         counts = _read_counts(database)
         self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
-        if not _account(counts, self._spooled).balanced:
-            raise sqlite3.DatabaseError("its account does not balance")
-        ((last_place,),) = database.execute(
+        if not _outlet_counts(counts, self._spooled).balanced:
+            raise sqlite3.DatabaseError("its counts do not balance")
+        ((last_row_id,),) = database.execute(
             "SELECT COALESCE(MAX(place), 0) FROM entries"
         ).fetchall()
-        if not last_place < _next_place(database):
-            raise sqlite3.DatabaseError(f"place {last_place} is behind the last one")
+        if not last_row_id < _next_row_id(database):
+            raise sqlite3.DatabaseError(
+                f"an entry has row id {last_row_id}, but the file's last one is smaller"
+            )
         file_epoch, lock_epoch = counts.get("epoch", 0), self._read_epoch()
         self.epoch = max(file_epoch + 1, lock_epoch + 1, time.time_ns() // 1000)
         with _transaction(database):
             if counts.get("running"):  # the process crashed: results that were in memory are lost
-                why = "the process ended at once; what came behind the last entry may be missing"
+                reason = "the process crashed; results after the last entry may be missing"
                 for camera, epoch, number in _last_numbers(database):
-                    _add_gap(database, _make_gap(camera, epoch, number + 1), 0, why, 0)
+                    _add_gap(database, _make_gap(camera, epoch, number + 1), 0, reason, 0)
             database.execute("DELETE FROM cameras")
             database.execute("INSERT INTO cameras VALUES ('', ?, 0)", (self.epoch,))
             if lock_epoch > file_epoch:
-                why = "the spool is gone, or older than its last start; what it had is missing"
-                self._add_common_gap(database, 0, why)
+                reason = (
+                    "the spool's file was deleted or replaced by an older copy; entries are lost"
+                )
+                self._add_common_gap(database, 0, reason)
             _write_counts(database, {"epoch": self.epoch, "running": 1})
         self._counts = {**counts, "epoch": self.epoch, "running": 1}
 
@@ -195,14 +199,14 @@ class Spool:
             os.lseek(self._lock, 0, os.SEEK_SET)
             os.write(self._lock, b"%20d" % epoch)
 
-    def _add_common_gap(self, database: sqlite3.Connection, lost: int, why: str) -> None:
+    def _add_common_gap(self, database: sqlite3.Connection, lost: int, reason: str) -> None:
         """Add a gap that concerns all cameras."""
         ((_, epoch, number),) = _last_numbers(database, "WHERE camera = ''")
         gap = _make_gap("", epoch, number + 1)
-        _add_gap(database, gap, lost, why, self._in_flight, at_least=True)
+        _add_gap(database, gap, lost, reason, self._in_flight, may_be_more=True)
         database.execute("UPDATE cameras SET number = number + 1 WHERE camera = ''")
 
-    def _replace_file(self, why: str) -> None:
+    def _replace_file(self, reason: str) -> None:
         """Rename the damaged file, and write its readable entries to a new one."""
         saved, counts = _salvage(self.path)
         stamp = time.time_ns()
@@ -221,8 +225,8 @@ class Spool:
                 epoch = max([counts.get("epoch", 0), *(entry.epoch for entry in saved)])
                 epoch = 1 + max(epoch, self._read_epoch(), time.time_ns() // 1000)
                 _write_counts(database, {**counts, "epoch": epoch, "running": 0})
-                text = f"the spool was damaged ({why}); the file is kept beside it"
-                _add_gap(database, _make_gap("", epoch, 0), lost, text, 0, at_least=True)
+                text = f"the spool was damaged ({reason}); the file is kept beside it"
+                _add_gap(database, _make_gap("", epoch, 0), lost, text, 0, may_be_more=True)
         self._write_epoch(epoch)
         self._in_flight = 0
         self._connect()
@@ -258,8 +262,8 @@ class Spool:
         database = self._open_database
         counts = dict(self._counts)
         with _transaction(database):
-            for last, count, why in lost:
-                _add_gap(database, last, count, why, self._in_flight)
+            for last, count, reason in lost:
+                _add_gap(database, last, count, reason, self._in_flight)
                 counts["results"] = counts.get("results", 0) + count
                 counts["dropped.memory"] = counts.get("dropped.memory", 0) + count
             results = sum(entry.kind != "gap" for entry in entries)
@@ -283,7 +287,7 @@ class Spool:
 
     def _write(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> int:
         rows = [
-            _make_row(entry, place) for place, entry in enumerate(entries, _next_place(database))
+            _make_row(entry, row_id) for row_id, entry in enumerate(entries, _next_row_id(database))
         ]
         database.executemany(_INSERT, rows)
         return sum(row[-2] for row in rows)
@@ -303,22 +307,26 @@ class Spool:
         """Drop the oldest entries beyond the bound; return their number and their bytes."""
         if size <= self._max_bytes or self._policy != "drop_oldest":
             return 0, 0
-        freed, places, dropped = 0, list[int](), list[OutletEntry]()
-        for place, size_of, *fields in database.execute(
+        freed, row_ids, dropped = 0, list[int](), list[OutletEntry]()
+        for row_id, size_of, *fields in database.execute(
             f"SELECT place, bytes, {_FIELDS} FROM entries WHERE place > ? AND kind != 'gap' "  # noqa: S608
             "ORDER BY place",
             (self._in_flight,),
         ):
             if size - freed <= self._max_bytes:
                 break
-            places.append(place)
+            row_ids.append(row_id)
             dropped.append(OutletEntry(*fields))
             freed += size_of
-        database.executemany("DELETE FROM entries WHERE place = ?", [(place,) for place in places])
-        last_places = {entry.camera: place for entry, place in zip(dropped, places, strict=True)}
+        database.executemany(
+            "DELETE FROM entries WHERE place = ?", [(row_id,) for row_id in row_ids]
+        )
+        last_row_ids = {
+            entry.camera: row_id for entry, row_id in zip(dropped, row_ids, strict=True)
+        }
         for last, count in _last_by_camera(dropped):
-            place = last_places[last.camera]
-            _add_gap(database, last, count, "the spool was full", self._in_flight, place)
+            row_id = last_row_ids[last.camera]
+            _add_gap(database, last, count, "the spool was full", self._in_flight, row_id)
         counts["dropped.full"] = counts.get("dropped.full", 0) + len(dropped)
         return len(dropped), freed
 
@@ -327,28 +335,28 @@ class Spool:
     def head(self, max_count: int) -> SpoolHead:
         """Return the oldest entries, up to ``max_count``; none is dropped before the next call."""
         while True:
-            places, entries, damaged = list[int](), list[OutletEntry](), list[int]()
-            for place, checksum, *fields in self._open_database.execute(
+            row_ids, entries, damaged = list[int](), list[OutletEntry](), list[int]()
+            for row_id, checksum, *fields in self._open_database.execute(
                 f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY place LIMIT ?",  # noqa: S608
                 (max_count,),
             ):
                 entry = OutletEntry(*fields)
-                if _checksum(entry, place) != checksum:
-                    damaged.append(place)
+                if _checksum(entry, row_id) != checksum:
+                    damaged.append(row_id)
                 else:
-                    places.append(place)
+                    row_ids.append(row_id)
                     entries.append(entry)
             if not damaged:
-                self._in_flight = places[-1] if places else 0
-                return SpoolHead(places, entries, self.epoch)
+                self._in_flight = row_ids[-1] if row_ids else 0
+                return SpoolHead(row_ids, entries, self.epoch)
             self._drop_damaged(damaged)
 
-    def _drop_damaged(self, places: Sequence[int]) -> None:
-        """Drop damaged entries, and add a gap in their place."""
+    def _drop_damaged(self, row_ids: Sequence[int]) -> None:
+        """Drop damaged entries, and add a gap after the other entries."""
         database, counts = self._open_database, dict(self._counts)
         with _transaction(database):
             database.executemany(
-                "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
+                "DELETE FROM entries WHERE place = ?", [(row_id,) for row_id in row_ids]
             )
             lost = _balance(database, counts)
             self._add_common_gap(database, lost, "entries of the spool were damaged")
@@ -369,20 +377,20 @@ class Spool:
         database = self._open_database
         if head.epoch != self.epoch:
             return  # the file was replaced meanwhile: the entries are delivered again
-        accepted = len(head.places) if count is None else count
-        places, entries = head.places[:accepted], head.entries[:accepted]
+        accepted = len(head.row_ids) if count is None else count
+        row_ids, entries = head.row_ids[:accepted], head.entries[:accepted]
         delivered = sum(entry.kind != "gap" for entry in entries)
         counts = {"delivered": self._counts.get("delivered", 0) + delivered}
         removed = delivered
         with _transaction(database):
             if refused:
-                place, entry = head.places[accepted], head.entries[accepted]
-                places, entries = [*places, place], [*entries, entry]
+                row_id, entry = head.row_ids[accepted], head.entries[accepted]
+                row_ids, entries = [*row_ids, row_id], [*entries, entry]
                 if entry.kind != "gap":
                     counts["dropped.refused"] = self._counts.get("dropped.refused", 0) + 1
                     removed += 1
             database.executemany(
-                "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
+                "DELETE FROM entries WHERE place = ?", [(row_id,) for row_id in row_ids]
             )
             _write_counts(database, counts)
         self._counts |= counts
@@ -391,12 +399,12 @@ class Spool:
         self._spooled -= removed
         self._in_flight = 0
 
-    # ------------------------------------------------------------------ the account
+    # ------------------------------------------------------------------ the counts
 
     @property
-    def account(self) -> OutletAccount:
-        """The account of the entries in the file."""
-        return _account(self._counts, self._spooled)
+    def counts(self) -> OutletCounts:
+        """The counts of the entries in the file."""
+        return _outlet_counts(self._counts, self._spooled)
 
     @property
     def bytes(self) -> int:
@@ -421,8 +429,8 @@ class Spool:
             os.close(lock)
 
 
-def read_account(path: Path) -> OutletAccount | None:
-    """Return the account in a spool's file; None without a file. A process may be using the file.
+def read_outlet_counts(path: Path) -> OutletCounts | None:
+    """Return the counts in a spool's file; None without a file. A process may be using the file.
 
     Raises:
         sqlite3.Error: the file cannot be read now.
@@ -433,7 +441,7 @@ def read_account(path: Path) -> OutletAccount | None:
         database.execute("BEGIN")
         counts = _read_counts(database)
         spooled, _ = database.execute(_TOTALS).fetchone()
-    return _account(counts, spooled)
+    return _outlet_counts(counts, spooled)
 
 
 def _open_connection(path: Path) -> sqlite3.Connection:
@@ -446,7 +454,7 @@ def _check_versions(path: Path) -> None:
     """Check the file's format versions: with a damaged one, SQLite would open the file read-only.
 
     Raises:
-        sqlite3.DatabaseError: the entries are damaged.
+        sqlite3.DatabaseError: the file's header is damaged.
     """
     with path.open("rb") as file:
         versions = file.read(20)[18:]
@@ -462,30 +470,30 @@ def _read_counts(database: sqlite3.Connection) -> dict[str, int]:
     """Return the counts in the file.
 
     Raises:
-        sqlite3.DatabaseError: the entries are damaged.
+        sqlite3.DatabaseError: the counts are damaged.
     """
     counts = dict(database.execute("SELECT name, value FROM counts"))
     if not all(isinstance(count, int) and count >= 0 for count in counts.values()):
-        raise sqlite3.DatabaseError("a count is none")
+        raise sqlite3.DatabaseError("expected counts of 0 or more")
     return counts
 
 
-def _account(counts: Mapping[str, int], spooled: int) -> OutletAccount:
+def _outlet_counts(counts: Mapping[str, int], spooled: int) -> OutletCounts:
     dropped = {
         name.removeprefix("dropped."): value
         for name, value in counts.items()
         if name.startswith("dropped.") and value
     }
-    return OutletAccount(counts.get("results", 0), counts.get("delivered", 0), spooled, dropped)
+    return OutletCounts(counts.get("results", 0), counts.get("delivered", 0), spooled, dropped)
 
 
 def _balance(database: sqlite3.Connection, counts: dict[str, int]) -> int:
     """Correct the counts to fit the entries in the file; return the number of lost entries."""
     spooled, _ = database.execute(_TOTALS).fetchone()
-    account = _account(counts, int(spooled))
-    accounted = account.delivered + account.spooled + sum(account.dropped.values())
-    lost = max(0, account.results - accounted)  # the counts may be older than the entries
-    counts["results"] = max(account.results, accounted)
+    totals = _outlet_counts(counts, int(spooled))
+    counted = totals.delivered + totals.spooled + sum(totals.dropped.values())
+    lost = max(0, totals.results - counted)  # the counts may be older than the entries
+    counts["results"] = max(totals.results, counted)
     counts["dropped.damaged"] = counts.get("dropped.damaged", 0) + lost
     return lost
 
@@ -516,29 +524,29 @@ def _last_numbers(database: sqlite3.Connection, which: str = "") -> list[tuple[s
     return database.execute(f"SELECT camera, epoch, number FROM cameras {which}").fetchall()  # noqa: S608
 
 
-def _checksum(entry: OutletEntry, place: int) -> int:
-    """Return the checksum of an entry and of its place, which decides its order."""
-    return zlib.crc32(repr((place, *entry)).encode(errors="backslashreplace"))
+def _checksum(entry: OutletEntry, row_id: int) -> int:
+    """Return the checksum of an entry and of its row id, which decides its order."""
+    return zlib.crc32(repr((row_id, *entry)).encode(errors="backslashreplace"))
 
 
-def _next_place(database: sqlite3.Connection) -> int:
-    """Return the place for the next entry, after the places of all earlier entries.
+def _next_row_id(database: sqlite3.Connection) -> int:
+    """Return the row id for the next entry, after those of all earlier entries.
 
     Raises:
-        sqlite3.DatabaseError: the file's record of the last place is damaged.
+        sqlite3.DatabaseError: the file's record of the last row id is damaged.
     """
     row = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
     last = 0 if row is None else row[0]
-    if not isinstance(last, int) or not 0 <= last < MAX_PLACE - MIN_FREE_PLACES:
+    if not isinstance(last, int) or not 0 <= last < MAX_ROW_ID - MIN_FREE_ROW_IDS:
         raise sqlite3.DatabaseError(f"expected the last place of an entry, got {last!r:.40}")
     return last + 1
 
 
-def _make_row(entry: OutletEntry, place: int) -> tuple[Any, ...]:
+def _make_row(entry: OutletEntry, row_id: int) -> tuple[Any, ...]:
     """Return the row of an entry for the table."""
     entry = entry._replace(at=float(entry.at))
     size = 0 if entry.kind == "gap" else len(entry.body) + ROW_BYTES
-    return place, *entry, size, _checksum(entry, place)
+    return row_id, *entry, size, _checksum(entry, row_id)
 
 
 def _make_gap(camera: str, epoch: int, number: int) -> OutletEntry:
@@ -557,45 +565,45 @@ def _add_gap(
     database: sqlite3.Connection,
     last: OutletEntry,
     count: int,
-    why: str,
+    reason: str,
     in_flight: int,
-    place: int | None = None,
+    row_id: int | None = None,
     *,
-    at_least: bool = False,
+    may_be_more: bool = False,
 ) -> None:
-    """Add a gap, at a free place or at the end; join it with the gaps before it.
+    """Add a gap, with a free row id or at the end; join it with the gaps before it.
 
     Args:
         database: the spool.
         last: the last entry that the gap replaces.
         count: number of replaced entries; 0 if it is unknown.
-        why: reason.
-        in_flight: place up to which entries are being delivered, and must not change.
-        place: place of the gap; None: the end.
-        at_least: whether more entries than ``count`` may be missing.
+        reason: why entries are missing.
+        in_flight: row id up to which entries are being delivered, and must not change.
+        row_id: row id of the gap; None: the end.
+        may_be_more: whether more entries than ``count`` may be missing.
     """
-    at_least, joined_places, reasons = at_least or count == 0, list[tuple[int]](), [why]
-    for older_place, checksum, *fields in database.execute(
+    may_be_more, joined_row_ids, reasons = may_be_more or count == 0, list[tuple[int]](), [reason]
+    for older_row_id, checksum, *fields in database.execute(
         f"SELECT place, checksum, {_FIELDS} FROM entries "  # noqa: S608
         "WHERE camera = ? AND place > ? AND place <= ? ORDER BY place DESC",
-        (last.camera, in_flight, MAX_PLACE if place is None else place),
+        (last.camera, in_flight, MAX_ROW_ID if row_id is None else row_id),
     ):
         entry = OutletEntry(*fields)
-        if entry.kind != "gap" or _checksum(entry, older_place) != checksum:
+        if entry.kind != "gap" or _checksum(entry, older_row_id) != checksum:
             break
         older = json.loads(entry.body)
         count += older["lost"]
-        at_least = at_least or older["at_least"]
+        may_be_more = may_be_more or older["at_least"]
         reasons.append(older["error"])
-        joined_places.append((older_place,))
-    database.executemany("DELETE FROM entries WHERE place = ?", joined_places)
+        joined_row_ids.append((older_row_id,))
+    database.executemany("DELETE FROM entries WHERE place = ?", joined_row_ids)
     unique_reasons = dict.fromkeys(
         reason for text in reversed(reasons) for reason in text.split("; ")
     )
     error = "; ".join(unique_reasons)[:MAX_REASON_CHARACTERS]
-    body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": at_least})
+    body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": may_be_more})
     gap = OutletEntry(last.camera, last.epoch, last.number, "gap", None, last.at, body)
-    database.execute(_INSERT, _make_row(gap, _next_place(database) if place is None else place))
+    database.execute(_INSERT, _make_row(gap, _next_row_id(database) if row_id is None else row_id))
 
 
 def _salvage(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
@@ -606,12 +614,12 @@ def _salvage(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
             counts = _read_counts(database)
         for order in ("place", "place DESC"):  # a page in between may be unreadable
             with contextlib.suppress(sqlite3.Error):
-                for place, checksum, *fields in database.execute(
+                for row_id, checksum, *fields in database.execute(
                     f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY {order}"  # noqa: S608
                 ):
-                    if place in entries:
+                    if row_id in entries:
                         break
                     entry = OutletEntry(*fields)
-                    if _checksum(entry, place) == checksum:
-                        entries[place] = entry
-    return [entries[place] for place in sorted(entries)], counts
+                    if _checksum(entry, row_id) == checksum:
+                        entries[row_id] = entry
+    return [entries[row_id] for row_id in sorted(entries)], counts

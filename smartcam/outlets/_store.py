@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import Field
 
-from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
+from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic needs them at run time
 from smartcam._user_code import text_of
 from smartcam.exceptions import ConfigurationError, EntryRefusedError, OutletError
 from smartcam.outlets._database import open_database
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._outlet import Column, OutletContext
-    from smartcam.outlets._stored import StoredResults, StoreQuestion
+    from smartcam.outlets._stored import StoredResults, StoreQuery
 
 VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
@@ -118,13 +118,13 @@ class ResultStore(Outlet[StoreSettings]):
             raise sqlite3.OperationalError("the store is closed")
         await _wait_for_thread(file.submit(lambda: file.write(entries)))
 
-    def stored(self, question: StoreQuestion) -> StoredResults | None:
+    def stored(self, query: StoreQuery) -> StoredResults | None:
         """Return the results in the file.
 
         Raises:
             ConfigurationError: the file cannot be read.
         """
-        return read_store(self.path, question)
+        return read_store(self.path, query)
 
     async def close(self) -> None:
         """Close the file."""
@@ -149,7 +149,7 @@ class _StoreFile:
         name: name of the outlet.
         path: path of the file.
         settings: settings of the store.
-        context: functions of the process that has the cameras.
+        context: callbacks into the process that has the cameras.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class _StoreFile:
         try:
             self._write_all(database, entries)
         except EntryRefusedError as exc:
-            self._write_all(database, entries[: exc.place])
+            self._write_all(database, entries[: exc.index])
             raise
         if time.monotonic() - self._expired_at > EXPIRE_INTERVAL or not self._expired_at:
             self._expire(database)
@@ -245,7 +245,7 @@ class _StoreFile:
                 try:
                     self._write_one(database, entry)
                 except _REFUSING_ERRORS as exc:
-                    raise EntryRefusedError(text_of(exc), place=index) from exc
+                    raise EntryRefusedError(text_of(exc), index=index) from exc
         if self._identity_at_path() != self._identity:
             raise OutletError(f"the store {self.path} was moved or deleted: a new one is begun")
 

@@ -29,8 +29,8 @@ COLUMNS = (
 """Columns of a returned row."""
 
 
-class StoreQuestion(NamedTuple):
-    """A question to a store of results.
+class StoreQuery(NamedTuple):
+    """A query to a store of results.
 
     Attributes:
         since: earliest time; None for all rows.
@@ -42,7 +42,7 @@ class StoreQuestion(NamedTuple):
     since: datetime | None = None
     failed: bool = False
     camera: str = "**"
-    most: int = 1000
+    max_rows: int = 1000
 
 
 class StoredResults(NamedTuple):
@@ -52,7 +52,7 @@ class StoredResults(NamedTuple):
         rows: rows, the oldest first: ``id``, ``camera``, ``kind``, ``at``,
             ``application``, ``sequence``, ``latency``, ``error``, ``lost``, ``at_least``,
             ``value``, ``picture``.
-        total: number of results, errors and gaps that match the question's time and cameras,
+        total: number of results, errors and gaps that match the query's time and cameras,
             including those that are not in ``rows``.
         failed: number of errors, gaps, and results that did not pass.
         errors: number of errors.
@@ -77,7 +77,7 @@ class StoredResults(NamedTuple):
         return fields
 
 
-def read_store(path: Path, question: StoreQuestion) -> StoredResults:
+def read_store(path: Path, query: StoreQuery) -> StoredResults:
     """Return the results in a store, which an outlet may be writing; blocks.
 
     Raises:
@@ -89,29 +89,29 @@ def read_store(path: Path, question: StoreQuestion) -> StoredResults:
     try:
         with contextlib.closing(open_for_reading(path, timeout=5.0)) as database:
             database.set_progress_handler(lambda: time.monotonic() > deadline, STEPS_BETWEEN_CHECKS)
-            return _query(database, question)
+            return _query(database, query)
     except sqlite3.Error as exc:
         raise ConfigurationError(f"results {path}: expected a store of results: {exc}") from exc
 
 
-def _query(database: sqlite3.Connection, question: StoreQuestion) -> StoredResults:
+def _query(database: sqlite3.Connection, query: StoreQuery) -> StoredResults:
     database.create_function(
-        "chosen", 1, lambda name: name == "" or matches_any((question.camera,), name)
+        "chosen", 1, lambda name: name == "" or matches_any((query.camera,), name)
     )
     failed_condition = _failure_condition(database)
     conditions, values = ["1"], list[Any]()
-    if question.since is not None:
+    if query.since is not None:
         conditions.append("at >= ?")
-        values.append(question.since.astimezone(UTC).isoformat(timespec="microseconds"))
-    if question.camera != "**":
+        values.append(query.since.astimezone(UTC).isoformat(timespec="microseconds"))
+    if query.camera != "**":
         conditions.append("chosen(camera)")  # a gap of all cameras belongs to each one
     condition = " AND ".join(conditions)
-    row_condition = f"{condition} AND {failed_condition}" if question.failed else condition
+    row_condition = f"{condition} AND {failed_condition}" if query.failed else condition
     columns = ", ".join(COLUMNS)
     rows = database.execute(
         f"SELECT * FROM (SELECT rowid, {columns} FROM results WHERE {row_condition} "  # noqa: S608
         "ORDER BY at DESC, rowid DESC LIMIT ?) ORDER BY at, rowid",
-        (*values, question.most),
+        (*values, query.max_rows),
     ).fetchall()
     total, failed, errors, gaps, lost, at_least = database.execute(
         f"SELECT COUNT(*), COUNT(*) FILTER (WHERE {failed_condition}), "  # noqa: S608

@@ -84,7 +84,7 @@ async def cell(
             ),
             command=command,
             cameras=lambda: {"line1/cam1": True},
-            names=lambda _camera: dict(names or {}),
+            application_names=lambda _camera: dict(names or {}),
         )
         async with outlets:
             tasks = [

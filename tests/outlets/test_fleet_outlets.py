@@ -16,7 +16,7 @@ import pytest
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.fleet import FleetServer, MemoryBus, load_fleet
 from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
-from smartcam.outlets._inside import StoreQuestion, read_store
+from smartcam.outlets._inside import StoreQuery, read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.broker import broker, listener, needs_mosquitto
 from tests.outlets.outletkit import FarEnd, ListOutlet, until
@@ -57,7 +57,7 @@ async def test_results_of_an_agents_triggers_are_rows_by_the_layout(tmp_path: Pa
         camera = server.hosts["line1/cam1"].camera
         for _ in range(5):
             await camera.trigger(timeout=20)
-        await until(lambda: outlets.states["store"].account.delivered >= 5)
+        await until(lambda: outlets.states["store"].counts.delivered >= 5)
         numbers = await read_numbers(server)
         text, _ = await exposition(numbers, per_camera=False)
     assert b'smartcam_outlet_results_total{agent="' in text
@@ -98,8 +98,8 @@ async def test_results_of_a_software_camera_are_typed_and_those_that_failed_are_
         assert reading.settings.application_names == {"spot": 7}
         for _ in range(4):
             await reading.trigger(timeout=20)
-        await until(lambda: outlets.states["store"].account.delivered >= 4)
-        found = read_store(tmp_path / "results.sqlite", StoreQuestion(failed=True))
+        await until(lambda: outlets.states["store"].counts.delivered >= 4)
+        found = read_store(tmp_path / "results.sqlite", StoreQuery(failed=True))
         assert (found.total, found.failed) == (4, 2)
     assert rows(tmp_path, "SELECT ok, present_count FROM app_7 ORDER BY id") == [(1, 1), (0, 0)] * 2
     units = dict(rows(tmp_path, "SELECT column_name, unit FROM fields WHERE unit != ''"))
@@ -117,7 +117,7 @@ async def test_a_trigger_without_a_result_is_an_error_row(tmp_path: Path) -> Non
         await camera.stop()
         with pytest.raises(SmartCamError):
             await server.hosts["line1/cam1"].camera.trigger(timeout=5)
-        await until(lambda: outlets.states["store"].account.delivered >= 1)
+        await until(lambda: outlets.states["store"].counts.delivered >= 1)
     assert ("NotRunningError",) in rows(tmp_path, "SELECT error_kind FROM results")
 
 
@@ -130,7 +130,7 @@ async def test_a_stalled_far_end_holds_up_no_trigger(tmp_path: Path) -> None:
         async with serving(fleet(tmp_path, text)) as (server, outlets):
             for _ in range(10):  # each within its deadline, while the far end takes nothing
                 await server.hosts["line1/cam1"].camera.trigger(timeout=20)
-            found = outlets.states["list"].account
+            found = outlets.states["list"].counts
             assert (found.results, found.delivered, found.spooled) == (10, 0, 10)
     finally:
         OUTLETS._registered.pop("list")
@@ -223,7 +223,7 @@ async def test_fleet_outlets_shows_the_accounts(tmp_path: Path) -> None:
     assert "no spool yet" in out
     async with serving(path) as (server, outlets):
         await server.hosts["line1/cam1"].camera.trigger(timeout=20)
-        await until(lambda: outlets.states["store"].account.delivered == 1)
+        await until(lambda: outlets.states["store"].counts.delivered == 1)
         code, out, err = await command("fleet", "outlets", str(path), "--json")
     assert code == 0, err
     assert json.loads(out)["account"] == {
@@ -241,7 +241,7 @@ async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path
     async with FleetOutlets(server) as outlets, server:
         await server.wait_first_attempts()
         await server.hosts["line1/cam1"].camera.trigger(timeout=20)
-        await until(lambda: outlets.outlets.states["store"].account.delivered == 1)
+        await until(lambda: outlets.outlets.states["store"].counts.delivered == 1)
         url = f"fleet://127.0.0.1:{server.address.port}"
         code, out, err = await command("fleet", "outlets", url, "--json", "--timeout", "30")
         assert code == 0, err

@@ -54,8 +54,8 @@ async def test_a_process_that_is_killed_at_any_moment_writes_each_spooled_result
         process.kill()
         await process.communicate()
     async with Outlets(SECTION, tmp_path) as outlets:
-        await until(lambda: outlets.states["store"].account.spooled == 0)
-        account = outlets.states["store"].account
+        await until(lambda: outlets.states["store"].counts.spooled == 0)
+        account = outlets.states["store"].counts
         assert account.balanced
         assert not account.dropped
     written = rows(tmp_path, "SELECT COUNT(*), COUNT(DISTINCT id) FROM results WHERE kind != 'gap'")
@@ -79,9 +79,9 @@ async def test_a_clock_that_is_set_back_makes_no_id_come_twice(
     for step in (0, -3_600_000_000_000, 86_400_000_000_000, -7_200_000_000_000):
         monkeypatch.setattr(time, "time_ns", lambda step=step: begun + step)
         async with Outlets(SECTION, tmp_path) as outlets:
-            before = outlets.states["store"].account.delivered
+            before = outlets.states["store"].counts.delivered
             for n in range(10):
                 outlets.offer_result(result(n))
-            await until(lambda: outlets.states["store"].account.delivered == before + 10)  # noqa: B023
+            await until(lambda: outlets.states["store"].counts.delivered == before + 10)  # noqa: B023
     assert rows(tmp_path, "SELECT COUNT(*) FROM results") == [(40,)]
     assert rows(tmp_path, "SELECT COUNT(DISTINCT epoch) FROM results") == [(4,)]

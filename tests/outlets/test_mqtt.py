@@ -34,7 +34,7 @@ async def test_results_and_errors_arrive_with_their_ids_and_the_state_is_retaine
         async with Outlets(section(there.url), tmp_path) as outlets:
             outlets.state_changed("line1/cam1", {"connected": True, "application": 1})
             outlets.offer_result(result(5))
-            await until(lambda: outlets.states["mqtt"].account.delivered == 1)
+            await until(lambda: outlets.states["mqtt"].counts.delivered == 1)
             await until(lambda: any("result" in str(one.topic) for one in heard))
             (got,) = [one for one in heard if str(one.topic) == "smartcam/result/line1/cam1"]
             said = json.loads(got.payload)
@@ -54,7 +54,7 @@ async def test_what_comes_while_the_broker_is_dead_is_delivered_when_it_is_back(
     async with broker(tmp_path) as there, Outlets(section(there.url), tmp_path) as outlets:
 
         def account() -> Any:
-            found = outlets.states["mqtt"].account
+            found = outlets.states["mqtt"].counts
             assert found.balanced
             return found
 
@@ -98,7 +98,7 @@ async def test_over_a_line_that_is_cut_again_and_again_every_result_arrives_and_
                     for link in links:
                         link.transport.abort()
                     links.clear()
-            await until(lambda: outlets.states["mqtt"].account.delivered == 300)
+            await until(lambda: outlets.states["mqtt"].counts.delivered == 300)
             await until(lambda: len({one.payload for one in heard}) == 300)
         line.close()
     said = [json.loads(one.payload) for one in heard]
@@ -113,7 +113,7 @@ async def test_what_the_broker_refuses_is_told_and_not_lost(tmp_path: Path) -> N
     async with broker(tmp_path, lines) as there, Outlets(section(there.url), tmp_path) as outlets:
         outlets.offer_result(result(1))
         await until(lambda: "Not authorized" in outlets.states["mqtt"].trouble)
-        assert outlets.states["mqtt"].account.spooled == 1
+        assert outlets.states["mqtt"].counts.spooled == 1
 
 
 async def test_a_camera_whose_name_is_no_topic_keeps_nothing_back(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ async def test_a_camera_whose_name_is_no_topic_keeps_nothing_back(tmp_path: Path
             outlets.state_changed("a+b", {"connected": True})
             for name in ("a+b/#", "c"):
                 outlets.offer_result(result(1, name))
-            await until(lambda: outlets.states["mqtt"].account.delivered == 2)
+            await until(lambda: outlets.states["mqtt"].counts.delivered == 2)
         await until(lambda: sum("result" in str(one.topic) for one in heard) == 2)
         topics = {str(one.topic): json.loads(one.payload) for one in heard}
     assert topics["smartcam/result/a_b/_"]["camera"] == "a+b/#"
@@ -190,7 +190,7 @@ async def test_an_answer_that_the_broker_refuses_keeps_no_result_back(tmp_path: 
             for number in range(1, 51):
                 outlets.offer_result(result(number))
                 await asyncio.sleep(0.005)
-        await until(lambda: outlets.states["mqtt"].account.delivered == 50)
+        await until(lambda: outlets.states["mqtt"].counts.delivered == 50)
         await until(lambda: len(heard) >= 50)
     assert [json.loads(one.payload)["value"]["n"] for one in heard] == [*range(1, 51)]
     assert len(online) == 2  # it came, and left at the end
@@ -203,8 +203,8 @@ async def test_a_message_that_is_too_large_is_dropped_and_counted(tmp_path: Path
     ):
         for n, text in enumerate(["a", "x" * 5000, "b"]):
             outlets.offer_result(result(n, value={"text": text}))
-        await until(lambda: outlets.states["mqtt"].account.spooled == 0)
-        found = outlets.states["mqtt"].account
+        await until(lambda: outlets.states["mqtt"].counts.spooled == 0)
+        found = outlets.states["mqtt"].counts
         assert (found.delivered, found.dropped) == (2, {"refused": 1})
 
 
@@ -213,8 +213,8 @@ async def test_what_is_too_large_for_the_broker_keeps_nothing_else_back(tmp_path
     async with broker(tmp_path, lines) as there, Outlets(section(there.url), tmp_path) as outlets:
         for length in (1000, 5000, *range(1600, 1900, 3)):
             outlets.offer_result(result(1, value={"text": "x" * length}))
-        await until(lambda: outlets.states["mqtt"].account.spooled == 0)
-        found = outlets.states["mqtt"].account
+        await until(lambda: outlets.states["mqtt"].counts.spooled == 0)
+        found = outlets.states["mqtt"].counts
         assert not outlets.states["mqtt"].trouble
     assert found.results == 102
     assert 2 < found.dropped["refused"] < found.delivered
@@ -233,10 +233,10 @@ async def test_a_message_that_the_broker_never_takes_has_those_before_it_sent_on
         for number in range(20):
             value = {"n": number, "text": "x" * (5000 if number == 15 else 1)}
             outlets.offer_result(result(number, value=value))
-        await until(lambda: outlets.states["mqtt"].account.delivered == 15)
+        await until(lambda: outlets.states["mqtt"].counts.delivered == 15)
         await until(lambda: sum(b"true" in one.payload for one in online) > 7)
         assert outlets.states["mqtt"].trouble
-        assert outlets.states["mqtt"].account.spooled == 5
+        assert outlets.states["mqtt"].counts.spooled == 5
     assert len(heard) < 3 * 20  # and not all of them with each of 8 tries
 
 
@@ -340,9 +340,9 @@ async def test_a_password_comes_from_a_file_or_a_variable_and_is_in_no_log(
         for where in ({"file": "word"}, {"variable": "MQTT_SECRET"}):
             made = section(there.url, user="cell", password=where)
             async with Outlets(made, tmp_path) as outlets:
-                before = outlets.states["mqtt"].account.delivered
+                before = outlets.states["mqtt"].counts.delivered
                 outlets.offer_result(result(1))
-                await until(lambda: outlets.states["mqtt"].account.delivered > before)  # noqa: B023
+                await until(lambda: outlets.states["mqtt"].counts.delivered > before)  # noqa: B023
         made = section(there.url, user="cell", password={"variable": "MISSING_SECRET"})
         async with Outlets(made, tmp_path) as outlets:
             await until(lambda: "MISSING_SECRET is not set" in outlets.states["mqtt"].trouble)

@@ -28,7 +28,7 @@ async def test_a_broker_whose_authority_is_known_gets_results(tmp_path: Path) ->
         Outlets(section(there.port, ca="plant.pem"), tmp_path) as outlets,
     ):
         outlets.offer_result(result(1))
-        await until(lambda: outlets.states["mqtt"].account.delivered == 1)
+        await until(lambda: outlets.states["mqtt"].counts.delivered == 1)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ async def test_a_broker_that_is_not_trusted_gets_nothing(
     ):
         outlets.offer_result(result(1))
         await until(lambda: told in outlets.states["mqtt"].trouble)
-        account = outlets.states["mqtt"].account
+        account = outlets.states["mqtt"].counts
         assert (account.delivered, account.spooled) == (0, 1)
 
 
@@ -74,7 +74,7 @@ async def test_tls_at_one_side_only_is_trouble(
         async with Outlets(made, tmp_path) as outlets:
             outlets.offer_result(result(1))
             await until(lambda: bool(outlets.states["mqtt"].trouble))
-            assert outlets.states["mqtt"].account.spooled == 1
+            assert outlets.states["mqtt"].counts.spooled == 1
 
 
 @pytest.mark.parametrize("text", [None, "no certificate\n"])

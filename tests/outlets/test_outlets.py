@@ -29,7 +29,7 @@ def far() -> Iterator[FarEnd]:
 
 
 def account(outlets: Outlets) -> Any:
-    found = outlets.states["list"].account
+    found = outlets.states["list"].counts
     assert found.balanced, found
     return found
 
@@ -80,7 +80,7 @@ async def test_what_the_far_end_never_takes_is_dropped_counted_and_the_rest_deli
             for place, entry in enumerate(entries):
                 if entry.number == 4:
                     await super().deliver(entries[:place])
-                    raise EntryRefusedError("not this one", place=place)
+                    raise EntryRefusedError("not this one", index=place)
             await super().deliver(entries)
 
     OUTLETS.register("picky", Picky)
@@ -88,8 +88,8 @@ async def test_what_the_far_end_never_takes_is_dropped_counted_and_the_rest_deli
         async with Outlets({"picky": {}}, tmp_path) as outlets:
             for n in range(1, 8):
                 outlets.offer_result(result(n))
-            await until(lambda: outlets.states["picky"].account.spooled == 0)
-            found = outlets.states["picky"].account
+            await until(lambda: outlets.states["picky"].counts.spooled == 0)
+            found = outlets.states["picky"].counts
             assert found.balanced
             assert found.dropped == {"refused": 1}
     finally:
@@ -183,7 +183,7 @@ async def test_a_spool_that_is_damaged_while_it_is_used_is_begun_anew(
     far.there = False
     async with Outlets({"list": {}}, tmp_path) as outlets:
         outlets.offer_result(result(0))
-        await until(lambda: outlets._pumps["list"]._account.spooled == 1)
+        await until(lambda: outlets._pumps["list"]._counts.spooled == 1)
         spool = outlets._pumps["list"].spool
 
         def damage() -> None:
@@ -225,7 +225,7 @@ async def test_each_outlet_gets_the_cameras_that_it_names(far: FarEnd, tmp_path:
         for camera in ("line1/a", "line2/b", "line2/b/c", "line3/a"):
             outlets.offer_result(result(1, camera))
         assert account(outlets).results == 1
-        assert outlets.states["other"].account.results == 1
+        assert outlets.states["other"].counts.results == 1
 
 
 @pytest.mark.parametrize(

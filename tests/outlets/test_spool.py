@@ -17,8 +17,8 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets import OutletEntry
-from smartcam.outlets._entry import OutletAccount
-from smartcam.outlets._spool import ROW_BYTES, Spool, read_account
+from smartcam.outlets._entry import OutletCounts
+from smartcam.outlets._spool import ROW_BYTES, Spool, read_outlet_counts
 
 
 def entry(number: int, spool: Spool, camera: str = "cam", body: str = "{}") -> OutletEntry:
@@ -44,7 +44,7 @@ def test_what_is_added_is_there_in_order_after_a_restart(tmp_path: Path) -> None
     spool.close()
     again = opened(tmp_path)
     assert [one.number for one in again.head(100).entries] == [4, 5, 6, 7, 8, 9, 10]
-    assert again.account == OutletAccount(10, 3, 7, {})
+    assert again.counts == OutletCounts(10, 3, 7, {})
     assert again.epoch > first
     again.close()
 
@@ -65,7 +65,7 @@ def test_beyond_the_bound_the_oldest_make_room_and_a_gap_stands_in_front(tmp_pat
     spool = opened(tmp_path, 10 * (ROW_BYTES + 2))
     for n in range(1, 31):
         spool.add([entry(n, spool)])
-    assert spool.account == OutletAccount(30, 0, 10, {"full": 20})
+    assert spool.counts == OutletCounts(30, 0, 10, {"full": 20})
     found = spool.head(100).entries
     assert [(one.kind, one.number) for one in found[:2]] == [("gap", 20), ("result", 21)]
     assert gaps(spool) == [("cam", 20, 20)]
@@ -76,7 +76,7 @@ def test_beyond_the_bound_the_newest_are_refused_where_the_policy_says_so(tmp_pa
     spool = opened(tmp_path, 10 * (ROW_BYTES + 2), "drop_newest")
     for n in range(1, 31):
         spool.add([entry(n, spool)])
-    assert spool.account == OutletAccount(30, 0, 10, {"full": 20})
+    assert spool.counts == OutletCounts(30, 0, 10, {"full": 20})
     assert [one.number for one in spool.head(10).entries] == [*range(1, 11)]
     assert gaps(spool) == [("cam", 30, 20)]
     spool.close()
@@ -103,7 +103,7 @@ def test_an_entry_that_is_not_what_was_written_is_dropped_and_told(tmp_path: Pat
     assert [one.number for one in head if one.kind == "result"] == [1, 2, 4, 5]
     (gap,) = [one for one in head if one.kind == "gap"]
     assert (gap.camera, json.loads(gap.body)["lost"]) == ("", 1)
-    assert spool.account == OutletAccount(5, 0, 4, {"damaged": 1})
+    assert spool.counts == OutletCounts(5, 0, 4, {"damaged": 1})
     spool.close()
 
 
@@ -134,8 +134,8 @@ def test_counts_that_do_not_balance_are_damage(tmp_path: Path) -> None:
     spool._open_database.execute("UPDATE counts SET value = 3 WHERE name = 'results'")
     spool.close()
     again = opened(tmp_path)
-    assert again.account == OutletAccount(5, 0, 5, {})
-    assert any("does not balance" in one.body for one in again.head(10).entries)
+    assert again.counts == OutletCounts(5, 0, 5, {})
+    assert any("do not balance" in one.body for one in again.head(10).entries)
     again.close()
 
 
@@ -147,7 +147,7 @@ def test_what_was_in_flight_when_a_spool_began_anew_comes_again(tmp_path: Path) 
     spool.remove_delivered(waiting)
     head = [one.number for one in spool.head(10).entries if one.kind == "result"]
     assert head == [1, 2, 3, 4, 5]
-    assert spool.account == OutletAccount(5, 0, 5, {})
+    assert spool.counts == OutletCounts(5, 0, 5, {})
     spool.close()
 
 
@@ -157,7 +157,7 @@ def test_what_is_being_delivered_is_not_dropped(tmp_path: Path) -> None:
     waiting = spool.head(5)
     spool.add([entry(n, spool) for n in range(11, 21)])
     spool.remove_delivered(waiting)
-    account = spool.account
+    account = spool.counts
     assert account.balanced
     assert account.delivered == 5
     spool.close()
@@ -173,7 +173,7 @@ def test_a_second_process_is_refused(tmp_path: Path) -> None:
 def test_the_account_can_be_read_while_a_process_has_the_spool(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.add([entry(1, spool), entry(2, spool)])
-    assert read_account(tmp_path / "a.spool") == OutletAccount(2, 0, 2, {})
+    assert read_outlet_counts(tmp_path / "a.spool") == OutletCounts(2, 0, 2, {})
     spool.close()
 
 
@@ -195,20 +195,20 @@ def test_the_account_balances_whatever_is_done(tmp_path: Path, seed: int) -> Non
             spool.add(new)
         elif what == 3:
             waiting = spool.head(dice.randrange(1, 10))
-        elif what == 4 and waiting is not None and waiting.places:
+        elif what == 4 and waiting is not None and waiting.row_ids:
             refused = "no" if dice.random() < 0.3 else ""
-            spool.remove_delivered(waiting, dice.randrange(len(waiting.places)), refused)
+            spool.remove_delivered(waiting, dice.randrange(len(waiting.row_ids)), refused)
             waiting = None
         elif what == 5:
             spool.close()
             spool, waiting = opened(tmp_path, 4000, policy), None
-        assert spool.account.balanced, spool.account
-        assert spool.account == read_account(tmp_path / "a.spool")
+        assert spool.counts.balanced, spool.counts
+        assert spool.counts == read_outlet_counts(tmp_path / "a.spool")
         there = spool._open_database.execute("SELECT SUM(bytes) FROM entries").fetchone()[0] or 0
         assert spool.bytes == there
-    assert spool.account.results == number
+    assert spool.counts.results == number
     told = sum(lost for _, _, lost in gaps(spool))
-    assert told <= spool.account.dropped.get("full", 0)
+    assert told <= spool.counts.dropped.get("full", 0)
     spool.close()
 
 
@@ -221,10 +221,10 @@ def test_a_full_disk_keeps_nothing_of_a_write_and_counts_nothing(tmp_path: Path)
     spool._open_database.execute(f"PRAGMA max_page_count = {pages}")
     with pytest.raises(sqlite3.OperationalError, match="full"):
         spool.add([entry(n, spool, body="x" * 2000) for n in range(2, 200)])
-    assert spool.account == OutletAccount(1, 0, 1, {})
+    assert spool.counts == OutletCounts(1, 0, 1, {})
     spool._open_database.execute("PRAGMA max_page_count = 100000")
     spool.add([entry(n, spool, body="x" * 2000) for n in range(2, 200)])
-    assert spool.account == OutletAccount(199, 0, 199, {})
+    assert spool.counts == OutletCounts(199, 0, 199, {})
     spool.close()
 
 
@@ -263,7 +263,7 @@ def test_a_killed_process_loses_nothing_that_was_spooled_and_a_gap_tells_of_the_
         process.wait()
         process.stdout.close()
         spool = opened(tmp_path)
-        account = spool.account
+        account = spool.counts
         assert account.balanced
         assert account.results - said in (last, last + 1)  # one may be written and not said
         said = account.results
@@ -284,7 +284,7 @@ def test_a_spool_whose_tables_have_no_readable_names_is_put_aside(tmp_path: Path
     assert damaged != path.read_bytes()
     path.write_bytes(damaged)
     with pytest.raises(sqlite3.DatabaseError, match="malformed database schema"):
-        read_account(path)
+        read_outlet_counts(path)
     again = opened(tmp_path)
     assert [one.kind for one in again.head(10).entries] == ["gap"]
     assert [*tmp_path.glob("a.spool.damaged-*")]
@@ -302,7 +302,7 @@ def test_an_entry_at_another_place_than_its_own_is_damaged(tmp_path: Path) -> No
     head = again.head(10).entries
     assert [one.number for one in head if one.kind == "result"] == [1, 3, 4, 5]
     assert [one.kind for one in head[4:]] == ["gap"]
-    assert again.account == OutletAccount(5, 0, 4, {"damaged": 1})
+    assert again.counts == OutletCounts(5, 0, 4, {"damaged": 1})
     again.close()
 
 
@@ -319,7 +319,7 @@ def test_a_spool_whose_last_place_is_damaged_is_put_aside(tmp_path: Path, last: 
     again.add([entry(1, again)])
     kinds = [one.kind for one in again.head(10).entries]
     assert kinds.count("result") == 4
-    assert again.account.balanced
+    assert again.counts.balanced
     again.close()
 
 
@@ -357,7 +357,7 @@ def test_a_damaged_spool_is_put_aside_and_a_gap_tells_of_it(tmp_path: Path, seed
         data[:] = dice.randbytes(len(data))
     path.write_bytes(data)
     again = opened(tmp_path)
-    assert again.account.balanced
+    assert again.counts.balanced
     head = again.head(1000).entries
     kept = [one.number for one in head if one.kind == "result"]
     assert set(kept) <= {*range(1, 101)}
@@ -368,5 +368,5 @@ def test_a_damaged_spool_is_put_aside_and_a_gap_tells_of_it(tmp_path: Path, seed
         assert told
         assert [*tmp_path.glob("a.spool.damaged-*")]
     again.add([entry(1, again)])
-    assert again.account.balanced
+    assert again.counts.balanced
     again.close()

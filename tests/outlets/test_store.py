@@ -18,7 +18,7 @@ from smartcam._client._inside import Interpretation
 from smartcam.exceptions import ConfigurationError, EntryRefusedError
 from smartcam.models import PoseSigma
 from smartcam.outlets import OutletContext, OutletEntry, Outlets
-from smartcam.outlets._inside import StoreQuestion, columns_of, read_store
+from smartcam.outlets._inside import StoreQuery, columns_of, read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import result, until
 
@@ -133,7 +133,7 @@ async def test_an_entry_that_no_table_can_have_is_refused_and_those_before_it_ar
     made = store(tmp_path, [])
     with pytest.raises(EntryRefusedError) as refused:
         await written(made, entry(1, {"n": 1}), entry(2, {})._replace(body="{"), entry(3, {"n": 3}))
-    assert refused.value.place == 1
+    assert refused.value.index == 1
     assert rows(tmp_path, "SELECT number FROM results") == [(1,)]
     assert rows(tmp_path, "SELECT n FROM app_7") == [(1,)]
 
@@ -162,7 +162,7 @@ async def test_a_store_that_is_moved_away_is_begun_anew_and_nothing_is_lost(tmp_
 
         async def delivered(number: int) -> None:
             outlets.offer_result(result(number))
-            await until(lambda: outlets.states["sqlite"].account.delivered == number)
+            await until(lambda: outlets.states["sqlite"].counts.delivered == number)
 
         await delivered(1)
         for file in files(tmp_path):
@@ -212,7 +212,7 @@ async def test_a_store_whose_tables_have_no_readable_names_is_told(tmp_path: Pat
     assert damaged != path.read_bytes()
     path.write_bytes(damaged)
     with pytest.raises(ConfigurationError, match="malformed database schema"):
-        read_store(path, StoreQuestion(None, False, "**", 10))
+        read_store(path, StoreQuery(None, False, "**", 10))
     with pytest.raises(sqlite3.DatabaseError, match="malformed database schema"):
         await store(tmp_path).open()
 

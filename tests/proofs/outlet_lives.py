@@ -193,13 +193,13 @@ async def _live(
     (pump,) = outlets._pumps.values()
     pump.spool._max_bytes, pump.spool._policy = life.room, life.policy  # type: ignore[assignment]
     async with outlets:
-        told.say("epoch", pump.spool.epoch, pump._account.results)
+        told.say("epoch", pump.spool.epoch, pump._counts.results)
         _opened.append(True)
 
         def look() -> None:
             (state,) = outlets.states.values()
-            assert state.account.balanced, state.account
-            told.say("kept", pump._account.results)
+            assert state.counts.balanced, state.counts
+            told.say("kept", pump._counts.results)
 
         for n in range(life.offers):
             if life.full and n == life.offers // 3:
@@ -220,7 +220,7 @@ async def _live(
             look()
     _limit_files(resource.RLIM_INFINITY)
     (state,) = outlets.states.values()
-    told.say("account", json.dumps(state.account._asdict()))
+    told.say("account", json.dumps(state.counts._asdict()))
 
 
 async def _wait(outlets: Outlets) -> bool:
@@ -228,7 +228,7 @@ async def _wait(outlets: Outlets) -> bool:
     (pump,) = outlets._pumps.values()
     query = "SELECT COUNT(*) FROM entries"
     left = await pump._run_in_thread(lambda: pump.spool._open_database.execute(query).fetchone()[0])
-    return bool(left or pump.account.spooled)
+    return bool(left or pump.counts.spooled)
 
 
 def _limit_files(size: int) -> None:

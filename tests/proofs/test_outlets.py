@@ -42,7 +42,7 @@ def _cell() -> tuple[Cell, list[Lived], dict[str, Arrived]]:
         f"cam3/5/{n}": Arrived("cam3", 5, n, "result", value_of(0, n - 1), 0, False, None)
         for n in (1, 2)
     }
-    gap = Arrived("cam3", 5, 3, "gap", None, 0, True, "the process ended at once")
+    gap = Arrived("cam3", 5, 3, "gap", None, 0, True, "the process crashed")
     return cell, lives, {**found, "cam3/5/3/gap": gap}
 
 

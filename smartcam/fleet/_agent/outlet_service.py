@@ -154,7 +154,7 @@ class OutletService:
         name = question.key.rpartition("/")[2]
         if name == "accounts":
             accounts = {
-                name: {**state.account.fields(), "trouble": state.trouble}
+                name: {**state.counts.fields(), "trouble": state.trouble}
                 for name, state in self._states().items()
             }
             self._reply(question, name, {"error": "", "outlets": accounts})

@@ -189,7 +189,7 @@ def _outlet_families(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         "smartcam_outlet_dropped", "Results that were given up", labels=[*labels, "reason"]
     )
     for name, state in numbers.outlets.items():
-        values, account = [numbers.agent, name], state.account
+        values, account = [numbers.agent, name], state.counts
         received.add_metric(values, account.results)
         delivered.add_metric(values, account.delivered)
         spooled.add_metric(values, account.spooled)

@@ -8,7 +8,7 @@ import threading
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam._short_turns import short_turns
+from smartcam._switch_interval import short_switch_interval
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,7 +83,7 @@ class ToolThread:
             self._is_busy = False
             return
         try:
-            with short_turns(MAX_TURN_SECONDS):
+            with short_switch_interval(MAX_TURN_SECONDS):
                 result = function()
         except BaseException as exc:  # noqa: BLE001 - passed on by the future
             self._is_busy = False

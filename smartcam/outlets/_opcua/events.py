@@ -47,7 +47,7 @@ _NODE_IDS = ("FromState/Id", "ToState/Id", "Transition/Id", "NodeId")
 
 
 class Events:
-    """Raises events of cameras, each on the camera's node, its state machine and the server's.
+    """Raises events of cameras, each on the source's node and on the server's node.
 
     Args:
         server: server of asyncua, with the nodeset.

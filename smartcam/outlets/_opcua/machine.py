@@ -21,12 +21,12 @@ class VisionStates:
 
     def __init__(self) -> None:
         self.vision = "Preoperational"
-        self.automatic = ""
+        self.job_state = ""
 
     @property
     def text(self) -> str:
         """Both states as a text."""
-        return f"{self.vision} {self.automatic}".rstrip()
+        return f"{self.vision} {self.job_state}".rstrip()
 
     def allows(self, cause: str) -> bool:
         """Return True if a method causes a transition from the present state."""
@@ -44,17 +44,18 @@ class VisionStates:
         """
         transition = self._find_transition(target, cause)
         if transition is None:
-            raise WrongStateError(f"{cause or 'nothing'} leads from {self.text} to {target}")
+            cause = cause or "no transition without a method"
+            raise WrongStateError(f"{cause} does not lead from {self.text} to {target}")
         if transition.machine == AUTOMATIC:
-            self.automatic = target
+            self.job_state = target
         else:
             self.vision = target
-            self.automatic = "Initialized" if target == "Operational" else ""
+            self.job_state = "Initialized" if target == "Operational" else ""
         return transition
 
     def _find_transition(self, target: str, cause: str) -> Transition | None:
         """Return a transition from the present state; ``target`` "": to any state."""
-        states = {VISION: self.vision, AUTOMATIC: self.automatic}
+        states = {VISION: self.vision, AUTOMATIC: self.job_state}
         sources = {(transition.machine, transition.source) for transition in transitions()}
         for transition in transitions():
             if states[transition.machine] != transition.source or transition.cause != cause:

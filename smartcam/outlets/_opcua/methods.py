@@ -172,8 +172,8 @@ class Methods:
     # ------------------------------------------------------------------ states and jobs
 
     def _change_method(self, name: str, target: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
-        async def change(_cause: int = 0, why: str = "") -> list[ua.Variant]:
-            self._system.change_state(name, target, why)
+        async def change(_cause: int = 0, reason: str = "") -> list[ua.Variant]:
+            self._system.change_state(name, target, reason)
             return []
 
         return change
@@ -183,8 +183,8 @@ class Methods:
         return []
 
     def _end_method(self, name: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
-        async def end(_cause: int, why: str) -> list[ua.Variant]:
-            self._system.end_job(name, why)
+        async def end(_cause: int, reason: str) -> list[ua.Variant]:
+            self._system.end_job(name, reason)
             return []
 
         return end
@@ -363,7 +363,7 @@ def type_number(data_type: ua.NodeId, rank: int) -> int:
 
 
 def _argument(argument: ua.Variant, kind: int) -> Any:
-    """Return a client's argument as a plain value."""
+    """Return a client's argument as a plain value; ids and lists are returned unchanged."""
     value = argument.Value
     python_type = _PYTHON_TYPES.get(kind)
     if python_type is not None:
@@ -373,7 +373,7 @@ def _argument(argument: ua.Variant, kind: int) -> Any:
     if kind == ua.ObjectIds.String:
         return _text(value)
     if kind == 0 and not isinstance(value, list):
-        _text(value)
+        _text(value)  # raises for a wrong id
     return value
 
 

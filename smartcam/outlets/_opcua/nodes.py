@@ -11,7 +11,7 @@ from asyncua.common.instantiate_util import instantiate
 
 from smartcam.outlets._opcua.book import KeptResult
 from smartcam.outlets._opcua.nodeset import AUTOMATIC, VISION, Transition, node_ids, state_ids
-from smartcam.outlets._opcua.values import MAX_FIELDS, TYPES, check_value, variant_type
+from smartcam.outlets._opcua.values import MAX_FIELDS, TYPES, to_opcua_value, variant_type
 from smartcam.outlets._records import records_of
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ _PLAIN_VARIABLES: Mapping[str, tuple[ua.VariantType, Any]] = {
     "Value": (ua.VariantType.String, ""),
     "Count": (ua.VariantType.UInt32, 0),
 }
-"""Plain variables of a camera, with their initial values. For each result, ``Count`` is written
-after all other variables."""
+"""Variables for clients that do not support structures, with their types and initial values. For
+each result, ``Count`` is written after all other variables."""
 
 
 _TEXT = ua.VariantType.String
@@ -121,9 +121,9 @@ class CameraNodes:
         )
         await self._server.nodes.server.add_reference(self.root, ua.ObjectIds.HasNotifier)
         plain_node = await self._node("").add_object(self.id("Plain"), f"{self._own_index}:Plain")
-        for name, (kind, first) in _PLAIN_VARIABLES.items():
+        for name, (kind, initial) in _PLAIN_VARIABLES.items():
             await plain_node.add_variable(
-                self.id(f"Plain.{name}"), f"{self._own_index}:{name}", first, varianttype=kind
+                self.id(f"Plain.{name}"), f"{self._own_index}:{name}", initial, varianttype=kind
             )
         for name, (inputs, outputs) in _PLAIN_METHODS.items():
             await plain_node.add_method(
@@ -136,7 +136,7 @@ class CameraNodes:
                     for argument_name, kind in (*outputs, ("Error", ua.VariantType.Int32))
                 ],
             )
-        await self._show_states(states.vision, states.automatic)
+        await self._show_states(states.vision, states.job_state)
 
     def _node(self, path: str) -> Any:
         return self._server.get_node(self.id(path))
@@ -169,7 +169,7 @@ class CameraNodes:
 
     # ------------------------------------------------------------------ changes
 
-    def show_transition(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+    def show_transition(self, transition: Transition, job: VisionJob | None, reason: str) -> None:
         """Show a transition, and raise its events."""
         prepared = self.prepared
         vision = transition.target if transition.machine == VISION else "Operational"
@@ -180,7 +180,7 @@ class CameraNodes:
         async def publish() -> None:
             await self._show_states(vision, automatic)
             fields = self._transition_fields(transition)
-            message = f"{transition.name}{': ' * bool(why)}{why}"
+            message = f"{transition.name}{': ' * bool(reason)}{reason}"
             kinds = [*transition.effects]
             if transition.target == "Error" and "ErrorEventType" not in kinds:
                 kinds.append("ErrorEventType")  # according to the text of OPC 40100-1
@@ -243,21 +243,21 @@ class CameraNodes:
 
         self._publish_queue.put(publish)
 
-    def show_trouble(self, why: str) -> None:
+    def show_trouble(self, reason: str) -> None:
         """Show the reason why the camera cannot be used, as a condition; "" if it can be used."""
-        self._trouble, self._is_confirmed = why, not why
-        self._publish_queue.put(lambda: self._publish_trouble(why, confirmed=not why))
+        self._trouble, self._is_confirmed = reason, not reason
+        self._publish_queue.put(lambda: self._publish_trouble(reason, confirmed=not reason))
 
     def confirm_trouble(self) -> None:
         """Show that a client has confirmed the condition, if there is one."""
         if not self._is_confirmed:
-            self._is_confirmed, why = True, self._trouble
-            self._publish_queue.put(lambda: self._publish_trouble(why, confirmed=True))
+            self._is_confirmed, reason = True, self._trouble
+            self._publish_queue.put(lambda: self._publish_trouble(reason, confirmed=True))
 
-    async def _publish_trouble(self, why: str, *, confirmed: bool) -> None:
-        await self._write("Plain.Error", ua.Variant(why, ua.VariantType.String))
-        fields = _condition(self.id("Condition"), bool(why), confirmed) | {"ErrorString": why}
-        text = why or "the camera is there"
+    async def _publish_trouble(self, reason: str, *, confirmed: bool) -> None:
+        await self._write("Plain.Error", ua.Variant(reason, ua.VariantType.String))
+        fields = _condition(self.id("Condition"), bool(reason), confirmed) | {"ErrorString": reason}
+        text = reason or "the camera is there"
         await self._emit("VisionPersistentErrorConditionType", text, fields)
 
     # ------------------------------------------------------------------ values and events
@@ -350,7 +350,7 @@ class CameraNodes:
         for name, kind, _ in columns:
             path = f"Plain.{folder}.{name}"
             try:
-                value = ua.Variant(check_value(record[name], kind), variant_type(kind))
+                value = ua.Variant(to_opcua_value(record[name], kind), variant_type(kind))
             except (KeyError, TypeError, ValueError):
                 await self._write(path, ua.Variant(), ua.StatusCodes.BadNoData)
             else:
@@ -367,7 +367,7 @@ class CameraNodes:
             variable = await node.add_variable(
                 self.id(f"Plain.{folder}.{name}"),
                 ua.QualifiedName(name, self._own_index),
-                check_value(_ZEROS.get(kind, 0 if kind in TYPES else ""), kind),
+                to_opcua_value(_ZEROS.get(kind, 0 if kind in TYPES else ""), kind),
                 varianttype=variant_type(kind),
                 datatype=ua.NodeId(variant_type(kind).value),
             )

@@ -55,7 +55,10 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
 
         self._loop = asyncio.get_running_loop()
         context = OutletContext(
-            self.context.columns, self._command, self.context.cameras, self.context.names
+            self.context.columns,
+            self._command,
+            self.context.cameras,
+            self.context.application_names,
         )
         await asyncio.to_thread(self._thread.start)
         self._server = server = VisionServer(self.name, self.settings, self.folder, context)

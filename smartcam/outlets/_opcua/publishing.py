@@ -76,7 +76,7 @@ class PublishQueue:
                     await call()
                     failures = 0
                 except Exception:
-                    logger.exception("outlet: publishing")
+                    logger.exception("outlet: publishing failed")
                     failures += 1
                     if failures > MAX_FAILURES:
                         raise

@@ -180,7 +180,7 @@ class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are
         return name, password
 
     def verify_x509_token(self, isession: Any, token: Any, signature: Any) -> ProvenCertificate:
-        """Return a user's certificate; raise an error if it is unknown, or not signed with."""
+        """Return a user's certificate; raise an error if it is unknown or its key did not sign."""
         with self.failed_logins.counting_attempt(_address(isession)):
             if signature.Algorithm == _SHA1:
                 raise ServiceError(ua.StatusCodes.BadSecurityPolicyRejected)

@@ -99,13 +99,13 @@ class VisionServer:
         self.files = TransferFiles(server, own_index)
         await self._link_types()
         self.publish_queue.start()
-        names = filter(self.settings.chooses, self.context.cameras())
+        names = filter(self.settings.chooses, self.context.cameras().keys())
         for name in itertools.islice(names, MAX_CAMERAS):
             await self._make_camera(name)
         await server.start()
 
     async def _link_types(self) -> None:
-        """Have a camera's methods also carried out if a client names the node in the type."""
+        """Run a camera's method also if a client calls it by the node of the object type."""
         for kind in METHOD_TYPES:
             type_node = self.server.get_node(ua.NodeId(node_ids()[kind], self.spaces[0]))
             for method in await type_node.get_methods():
@@ -137,7 +137,7 @@ class VisionServer:
         await self.publish_queue.wait_failed()
 
     def new_job_id(self) -> str:
-        """Return a new id for a job; no other job has it, also not before a restart."""
+        """Return a new id for a job; ids are unique, also across restarts."""
         return f"{self._run_id}-{next(self._jobs)}"
 
     # ------------------------------------------------------------------ from cameras
@@ -204,8 +204,8 @@ class CameraView:
             self._command,
             self,
             picture=self._picture,
-            names=lambda: server.context.names(name),
-            new_job=server.new_job_id,
+            application_names=lambda: server.context.application_names(name),
+            make_job_id=server.new_job_id,
             simulated=dict(server.context.cameras()).get(name),
         )
         self._methods = Methods(
@@ -245,11 +245,11 @@ class CameraView:
 
     # ------------------------------------------------------------------ to clients
 
-    def show_transition(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+    def show_transition(self, transition: Transition, job: VisionJob | None, reason: str) -> None:
         """Show a transition, and raise its events."""
         application = self.system.prepared_application or 0
         self.nodes.prepared = self.system.recipe_name(application), application
-        self.nodes.show_transition(transition, job, why)
+        self.nodes.show_transition(transition, job, reason)
 
     def show_acquisition(self, job: VisionJob) -> None:
         """Raise the event that a job's picture is taken, after which the part may move."""
@@ -274,6 +274,6 @@ class CameraView:
         """Raise an event with a text."""
         self.nodes.show_message(text, kind, job)
 
-    def show_trouble(self, why: str) -> None:
+    def show_trouble(self, reason: str) -> None:
         """Show the reason why the camera cannot be used; "" if it can be used."""
-        self.nodes.show_trouble(why)
+        self.nodes.show_trouble(reason)

@@ -58,7 +58,7 @@ LATE_RESULT_WAIT = 60.0
 class VisionView(Protocol):
     """Shows a vision system to clients, by nodes and events; each call returns at once."""
 
-    def show_transition(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+    def show_transition(self, transition: Transition, job: VisionJob | None, reason: str) -> None:
         """Show a transition, and raise its events."""
 
     def show_acquisition(self, job: VisionJob) -> None:
@@ -70,7 +70,7 @@ class VisionView(Protocol):
     def show_message(self, text: str, kind: str, job: VisionJob | None) -> None:
         """Raise an event with a text."""
 
-    def show_trouble(self, why: str) -> None:
+    def show_trouble(self, reason: str) -> None:
         """Show the reason why the camera cannot be used; "" if it can be used."""
 
 
@@ -83,8 +83,9 @@ class VisionSystem:
         command: function that carries out a command, by the camera's name, a verb and its fields.
         view: view that shows the system to clients.
         picture: function that returns the file of a result's picture.
-        new_job: function that returns an id for a job.
-        names: function that returns the names of the camera's own applications, with their numbers.
+        make_job_id: function that returns an id for a job.
+        application_names: function that returns the names of the camera's own applications, with
+            their numbers.
         simulated: True for an emulated camera, False for a real one, None if this is not known.
     """
 
@@ -96,16 +97,16 @@ class VisionSystem:
         view: VisionView,
         *,
         picture: Callable[[Mapping[str, Any]], Path | None],
-        new_job: Callable[[], str],
-        names: Callable[[], Mapping[str, int]] = dict,
+        make_job_id: Callable[[], str],
+        application_names: Callable[[], Mapping[str, int]] = dict,
         simulated: bool | None = None,
     ) -> None:
         self.name, self.settings, self.view = name, settings, view
         self.states = VisionStates()
         self.application: int | None = None
         self.job: VisionJob | None = None
-        self._command, self._picture, self._new_job = command, picture, new_job
-        self._names = names
+        self._command, self._picture, self._make_job_id = command, picture, make_job_id
+        self._application_names = application_names
         self._simulated = simulated
         # whether the camera is connected; None: unknown
         self._connected: bool | None = None
@@ -144,18 +145,18 @@ class VisionSystem:
                 self.view.show_trouble("")
             self._update_states()
         elif was_connected is not False:
-            why = str(state.get("reason") or "the camera is not connected")
-            self._end_job(FAILED, why, may_come_late=False)
-            self.view.show_trouble(why)
+            reason = str(state.get("reason") or "the camera is not connected")
+            self._end_job(FAILED, reason, may_come_late=False)
+            self.view.show_trouble(reason)
             if self.states.vision in ("Preoperational", "Operational"):
-                self._move("Error", why=why)
+                self._move("Error", reason=reason)
 
     def _update_states(self) -> None:
         """Move to the states that correspond to the camera's state."""
         states = self.states
         if not self._connected:
             if self._connected is False and states.vision == "Preoperational":
-                self._move("Error", why="the camera is not connected")
+                self._move("Error", reason="the camera is not connected")
             return
         if states.vision == "Error":
             self._move("Operational" if self.settings.automatic else "Preoperational")
@@ -167,11 +168,11 @@ class VisionSystem:
             self._move("Operational")
         if self._is_preparing:
             return
-        if states.automatic == "Ready" and self._ready_application != self.application:
-            self._move("Initialized", why="the camera has another application")
+        if states.job_state == "Ready" and self._ready_application != self.application:
+            self._move("Initialized", reason="the camera has another application")
         is_wanted = not self._clients_prepare or self.application == self._client_application
         may_become_ready = self.settings.automatic and self.application and is_wanted
-        if states.automatic == "Initialized" and may_become_ready:
+        if states.job_state == "Initialized" and may_become_ready:
             self._become_ready("")
 
     def _become_ready(self, cause: str) -> None:
@@ -179,33 +180,33 @@ class VisionSystem:
         self._move("Ready", cause)
 
     def _move(
-        self, target: str, cause: str = "", *, job: VisionJob | None = None, why: str = ""
+        self, target: str, cause: str = "", *, job: VisionJob | None = None, reason: str = ""
     ) -> None:
-        self.view.show_transition(self.states.move(target, cause), job, why)
+        self.view.show_transition(self.states.move(target, cause), job, reason)
 
     # ------------------------------------------------------------------ methods
 
     @property
     def prepared_application(self) -> int | None:
         """The application that is ready for jobs; None if none is."""
-        is_ready = self.states.automatic not in ("", "Initialized")
+        is_ready = self.states.job_state not in ("", "Initialized")
         return self._ready_application if is_ready else None
 
-    def change_state(self, method: str, target: str, why: str = "") -> None:
+    def change_state(self, method: str, target: str, reason: str = "") -> None:
         """Carry out a method that only changes the state of the vision system.
 
         Args:
             method: ``Halt``, ``Reset`` or ``SelectModeAutomatic``.
             target: name of the state.
-            why: text that the client gave.
+            reason: text that the client gave.
 
         Raises:
             WrongStateError: the method is not allowed in this state.
         """
         self._check_allowed(method)
         self._clients_prepare, self._client_application = True, None
-        self._end_job(ABORTED, f"{method} {why}".rstrip())
-        self._move(target, method, why=why)
+        self._end_job(ABORTED, f"{method} {reason}".rstrip())
+        self._move(target, method, reason=reason)
         self._update_states()
 
     def _check_allowed(self, method: str) -> None:
@@ -216,7 +217,9 @@ class VisionSystem:
     def recipes(self) -> Mapping[str, int]:
         """Applications by name; names in the settings have priority over the camera's own."""
         named = self.settings.recipes
-        others = {name: number for name, number in self._names().items() if name not in named}
+        others = {
+            name: number for name, number in self._application_names().items() if name not in named
+        }
         return {**named, **others}
 
     def application_of(self, external: str, internal: str = "") -> int:
@@ -261,7 +264,7 @@ class VisionSystem:
         """
         if self._is_preparing:
             raise BusyError("another recipe is being prepared")
-        if self.states.automatic not in ("Initialized", "Ready"):
+        if self.states.job_state not in ("Initialized", "Ready"):
             raise WrongStateError(f"PrepareRecipe is not allowed in {self.states.text}")
         self._clients_prepare, self._client_application, self._is_preparing = True, None, True
         prepared: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -288,20 +291,20 @@ class VisionSystem:
     async def _prepare(self, application: int, prepared: asyncio.Future[None]) -> None:
         """Prepare an application, and set the outcome."""
         try:
-            if self.states.automatic == "Ready":
-                self._move("Initialized", why="another recipe is prepared")
+            if self.states.job_state == "Ready":
+                self._move("Initialized", reason="another recipe is prepared")
             if application != self.application:
                 timeout = self.settings.switch_timeout
                 await self._carry_out("switch", application=application, timeout=timeout)
             await self._start_camera()
             self.application = application
-            if self.states.automatic != "Initialized":
+            if self.states.job_state != "Initialized":
                 raise WrongStateError(f"the state became {self.states.text} meanwhile")
             self._client_application = application
             self._become_ready("PrepareRecipe")
         except (SmartCamError, TimeoutError) as exc:
             prepared.set_exception(exc)
-            prepared.exception()  # no caller may wait any more: mark the error as retrieved
+            prepared.exception()  # perhaps no caller waits any more: mark the error as retrieved
         else:
             prepared.set_result(None)
         finally:
@@ -335,26 +338,26 @@ class VisionSystem:
         self._check_allowed(method)
         if recipe and self.application_of(recipe) != self.prepared_application:
             raise UnknownRecipeError(f"{recipe!r:.80} is not ready: prepare it first")
-        self.job = job = VisionJob(self._new_job(), single, *ids, self.prepared_application)
+        self.job = job = VisionJob(self._make_job_id(), single, *ids, self.prepared_application)
         self._move("SingleExecution" if single else "ContinuousExecution", method, job=job)
         job.task = self._spawn(
             lambda: self._run_single(job) if single else self._start_continuous(job)
         )
         return job
 
-    def end_job(self, method: str, why: str = "") -> None:
+    def end_job(self, method: str, reason: str = "") -> None:
         """End the running job.
 
         Args:
             method: ``Stop`` or ``Abort``.
-            why: text that the client gave.
+            reason: text that the client gave.
 
         Raises:
             WrongStateError: no job is running.
         """
         self._check_allowed(method)
-        job = self._end_job(ABORTED, f"{method} {why}".rstrip())
-        self._move("Ready", method, job=job, why=why)
+        job = self._end_job(ABORTED, f"{method} {reason}".rstrip())
+        self._move("Ready", method, job=job, reason=reason)
         self._update_states()
 
     # ------------------------------------------------------------------ jobs
@@ -422,16 +425,16 @@ class VisionSystem:
         except (SmartCamError, TimeoutError) as exc:
             self._job_failed(job, str(exc) or type(exc).__name__, type(exc).__name__)
 
-    def _job_failed(self, job: VisionJob | None, why: str, kind: str = "Error") -> None:
+    def _job_failed(self, job: VisionJob | None, reason: str, kind: str = "Error") -> None:
         if job is None or self.job is not job:
             return
-        self._end_job(FAILED, why, kind=kind)
-        if self.states.automatic in ("SingleExecution", "ContinuousExecution"):
-            self._move("Ready", job=job, why=why)
+        self._end_job(FAILED, reason, kind=kind)
+        if self.states.job_state in ("SingleExecution", "ContinuousExecution"):
+            self._move("Ready", job=job, reason=reason)
         self._update_states()
 
     def _end_job(
-        self, state: int, why: str, *, kind: str = "Aborted", may_come_late: bool = True
+        self, state: int, reason: str, *, kind: str = "Aborted", may_come_late: bool = True
     ) -> VisionJob | None:
         """End the running job, if there is one, and publish its end."""
         job, self.job = self.job, None
@@ -454,10 +457,10 @@ class VisionSystem:
         if not job.result_published.is_set() and (job.is_single or state == FAILED):
             job.result_published.set()
             at = datetime.now(UTC)
-            fields = {"error": why, "kind": kind}
+            fields = {"error": reason, "kind": kind}
             result_id = f"{self.name}/job/{job.id}"
             ended = VisionResult(
-                *(result_id, self.name, state, job.application, job, at, fields, why, None),
+                *(result_id, self.name, state, job.application, job, at, fields, reason, None),
                 self._simulated,
             )
             self.view.show_result(ended)

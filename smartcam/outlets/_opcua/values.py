@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from smartcam.outlets._outlet import Column
 
 MAX_FIELDS = 500
-"""Largest number of fields of a layout's structure; further fields are only in the JSON."""
+"""Largest number of fields of a layout's structure; a result with more is sent as JSON."""
 
 MAX_RECORDS = 1000
-"""Largest number of records of a result that become structures; further ones are only in JSON."""
+"""Largest number of records that become structures; a result with more is sent as JSON."""
 
 MAX_STRUCTURES = 2000
 """Largest number of structures of one server, which has one for each layout of an application."""
@@ -62,7 +62,7 @@ def variant_type(kind: str) -> ua.VariantType:
     return TYPES[kind][0] if kind in TYPES else ua.VariantType.String
 
 
-def check_value(value: Any, kind: str) -> Any:
+def to_opcua_value(value: Any, kind: str) -> Any:
     """Return a value for OPC UA; None becomes "" or NaN.
 
     Raises:
@@ -103,7 +103,7 @@ class Structure(NamedTuple):
     def _pack(self, record: Mapping[str, Any]) -> bytes:
         parts: list[bytes] = []
         for name, kind, _ in self.columns:
-            value = check_value(record[name], kind)
+            value = to_opcua_value(record[name], kind)
             if isinstance(value, str):
                 parts.append(Primitives.String.pack(value))
             else:

@@ -19,12 +19,12 @@ _requested: Final[dict[object, float]] = {}  # requested seconds, by the request
 _original: Final[list[float]] = []  # the original interval while a shorter one is set
 
 
-def shorten_turns(owner: object, seconds: float) -> None:
-    """Limit the length of a thread's turns, until :func:`leave_turns`.
+def shorten_switch_interval(owner: object, seconds: float) -> None:
+    """Limit Python's switch interval, until :func:`restore_switch_interval`.
 
     Args:
         owner: any object that can be a dict's key; a new request replaces its last one.
-        seconds: largest length of a turn.
+        seconds: largest interval.
     """
     if not _requested:
         _original[:] = [sys.getswitchinterval()]
@@ -32,21 +32,21 @@ def shorten_turns(owner: object, seconds: float) -> None:
     _apply()
 
 
-def leave_turns(owner: object) -> None:
-    """End an object's request for short turns. Harmless when called twice."""
+def restore_switch_interval(owner: object) -> None:
+    """End an object's request for a short interval. Harmless when called twice."""
     if _requested.pop(owner, None) is not None:
         _apply()
 
 
 @contextmanager
-def short_turns(seconds: float) -> Iterator[None]:
-    """Limit the length of a thread's turns within a block."""
+def short_switch_interval(seconds: float) -> Iterator[None]:
+    """Limit Python's switch interval within a block."""
     owner = object()
-    shorten_turns(owner, seconds)
+    shorten_switch_interval(owner, seconds)
     try:
         yield
     finally:
-        leave_turns(owner)
+        restore_switch_interval(owner)
 
 
 def _apply() -> None:
