@@ -259,7 +259,7 @@ def _inside(face: Face, node: Function, called: str) -> str:
     """Return the lines that are inside a context of the event loop's thread."""
     is_reader = "[FrameReader]" in _returns(face, node)
     end, given = (") as reader:", "SyncFrameReader(reader, self)") if is_reader else ("):", "self")
-    line = _filled("        with self._inside(", [called, *_passed(node)], end)
+    line = _filled("        with self._enter_in_loop(", [called, *_passed(node)], end)
     return f"{line}            yield {given}\n"
 
 

@@ -12,7 +12,7 @@ import inspect
 import math
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
-from smartcam._arguments import as_plain_value, check_all, wrong_argument
+from smartcam._arguments import as_plain_value, check_iterable, wrong_argument
 from smartcam.exceptions import SmartCamError
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def an_integer(value: Any, name: str, owner: str) -> Any:
 
 def a_list(value: Any, name: str, owner: str) -> Any:
     """Return the items of a sequence; a text is refused."""
-    return check_all(value, name, "a list", owner)
+    return check_iterable(value, name, "a list", owner)
 
 
 def numbers(value: Any, name: str, owner: str) -> Any:

@@ -44,7 +44,7 @@ MAX_OPTION_SECONDS = 86_400.0
 """Largest value in seconds of an option of a connection that is a time limit."""
 
 MAX_CONNECT_ATTEMPTS = 100
-"""Largest number of links that may be tried for a dialect."""
+"""Largest number of connections that may be tried to make a session."""
 
 MIN_PAYLOAD_LIMIT_BYTES = 16
 """Least value of ``max_length``, the largest payload that a client accepts."""
@@ -66,7 +66,7 @@ def excerpt(value: object) -> str:
         return f"{type(value).__name__} that cannot be shown"
 
 
-def shown_time(seconds: float, *, coarse: bool = False) -> str:
+def duration_text(seconds: float, *, coarse: bool = False) -> str:
     """Return a time as an error's text shows it: ``2.5 s``, ``4.2 ms``.
 
     Seconds have at most two digits after the point, or with ``coarse`` always one. A time that is
@@ -171,7 +171,7 @@ def check_seconds_or_none(
     return None if value is None else check_seconds(value, name, owner, exclusive=exclusive)
 
 
-def check_moment(value: object, name: str, owner: str = "") -> float:
+def check_clock_seconds(value: object, name: str, owner: str = "") -> float:
     """Return a time of any clock: any finite number of seconds."""
     if type(value) is float and math.isfinite(value):
         return value
@@ -254,7 +254,7 @@ def check_kind(value: T, kind: type[Any], name: str, expected: str, owner: str =
     return value
 
 
-def check_all(value: Iterable[T], name: str, expected: str, owner: str = "") -> tuple[T, ...]:
+def check_iterable(value: Iterable[T], name: str, expected: str, owner: str = "") -> tuple[T, ...]:
     """Return the items of an iterable; a text is refused."""
     with contextlib.suppress(Exception):  # a class of the user may raise anything
         if not isinstance(value, (str, bytes)):
@@ -262,14 +262,14 @@ def check_all(value: Iterable[T], name: str, expected: str, owner: str = "") -> 
     raise wrong_argument(name, expected, value, owner)
 
 
-def check_instant(value: datetime | None, name: str, owner: str = "") -> datetime | None:
+def check_aware_datetime(value: datetime | None, name: str, owner: str = "") -> datetime | None:
     """Return a date and time with a time zone, or None."""
     if value is not None and (not isinstance(value, datetime) or value.tzinfo is None):
         raise wrong_argument(name, "a datetime with a time zone, or None", value, owner)
     return value
 
 
-def check_time(value: datetime, name: str, owner: str = "") -> datetime:
+def check_datetime(value: datetime, name: str, owner: str = "") -> datetime:
     """Return a date with a time."""
     return check_kind(value, datetime, name, "a datetime", owner)
 

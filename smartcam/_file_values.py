@@ -100,10 +100,8 @@ def matches_any(patterns: Sequence[str], camera: str) -> bool:
 
 
 def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits) -> bool:
-    """Return True if items match a pattern whose part ``many`` matches any number of items.
-
-    ``indices``: indices of the parts of ``pattern`` that may match the next item.
-    """
+    """Return True if items match a pattern whose part ``many`` matches any number of items."""
+    # indices of the parts of the pattern that may match the next item
     indices = _skip_many({0}, pattern, many)
     for item in items:
         repeated = {i for i in indices if i < len(pattern) and pattern[i] == many}

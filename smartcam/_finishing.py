@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 async def finish(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
     """Close a resource in a task of its own, completely; closing has to be bounded and idempotent.
 
-    If that task is cancelled, perhaps before its first step, the caller closes the resource.
+    If that task is cancelled, perhaps before its first step, the calling task closes the resource.
 
     Raises:
         Exception: the error of closing.

@@ -2,7 +2,8 @@
 
 A fork has a copy of all memory, but only the thread that called ``fork``. A lock that another
 thread held at that moment stays locked in the fork forever, and what other threads had begun is
-never finished. So no module here has a lock of its own, and objects with locks are notified.
+never finished. So no module has a lock of its own, and objects with locks that are shared in a
+process register themselves here.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 class KnowsForks(Protocol):
     """An object that is notified of forks."""
 
-    def forked(self) -> None:
+    def on_fork(self) -> None:
         """Reset the state that belongs to other threads; must not wait. Called in the fork."""
 
 
@@ -31,7 +32,7 @@ def notify_of_forks(notified: KnowsForks) -> None:
 
 def _notify_all() -> None:
     for notified in tuple(_objects_to_notify):
-        notified.forked()
+        notified.on_fork()
 
 
 if hasattr(os, "register_at_fork"):

@@ -58,7 +58,7 @@ def records_html(value: Any) -> str:
     """Return a table of a record of a layout, or of several, with the units in its header."""
     records: Sequence[Any] = value if isinstance(value, list) else [value]
     kind: Any = type(records[0])
-    units = kind._units  # noqa: SLF001 - of records, as their fields
+    units = kind._units  # noqa: SLF001 - public for records, as is _fields
     names = [f"{name} [{units[name]}]" if name in units else name for name in kind._fields]
     return _table(names, ([_cell(field) for field in record] for record in records))
 

@@ -43,23 +43,23 @@ _encode = json.JSONEncoder(separators=(",", ":")).encode
 _encode_finite = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 
 _HEADER = '{"seq":%s,"stamp":%s,"frame_id":%s}'
-_PART = (
+_LOCALIZATION = (
     '{"feature_id":%s,"quality":%r,"photo_index":%d,"pose":{"header":%s,'
     '"position":{"x":%r,"y":%r,"z":%r},"orientation":{"x":%r,"y":%r,"z":%r,"w":%r}}}'
 )
 
 
-def object_text(fields: Mapping[str, object]) -> str:
-    """Return the text of an object."""
-    return f"{{{','.join([f'{_quoted(name)}:{text_of(item)}' for name, item in fields.items()])}}}"
+def object_json(fields: Mapping[str, object]) -> str:
+    """Return an object as JSON."""
+    return f"{{{','.join([f'{_quoted(name)}:{json_of(item)}' for name, item in fields.items()])}}}"
 
 
-def bytes_text(data: bytes) -> str:
-    """Return the text of bytes: hex, which needs no quoting."""
+def bytes_json(data: bytes) -> str:
+    """Return bytes as JSON: a text of hex, which needs no quoting."""
     return f'"{data.hex()}"'
 
 
-def text_of(value: object) -> str:
+def json_of(value: object) -> str:
     """Return the text of a value."""
     if type(value) is str:
         return _quoted(value)
@@ -70,7 +70,7 @@ def text_of(value: object) -> str:
     if type(value) is datetime:
         return _time_text(value)
     if type(value) is bytes:
-        return bytes_text(value)
+        return bytes_json(value)
     return _container_text(value)
 
 
@@ -86,7 +86,7 @@ def _time_text(at: datetime) -> str:
     return text
 
 
-def hex_text(text: str) -> str:
+def hex_json(text: str) -> str:
     """Return the JSON text of a string that is probably hex."""
     if (
         len(text) > MIN_HEX_CHARACTERS
@@ -99,7 +99,7 @@ def hex_text(text: str) -> str:
 
 def _container_text(value: object) -> str:
     if type(value) is list:
-        text = _parts_text(value)
+        text = _localizations_json(value)
         if text is not None:
             return text
     elif type(value) is dict and _INTEGERS.issuperset(map(type, value.values())):
@@ -141,7 +141,10 @@ def _table_text(table: Any) -> str | None:
 
 @functools.lru_cache(maxsize=256)
 def _row_format(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | None:
-    """Return a row's format, the indices of its texts and of its floats; None for other columns."""
+    """Return a row's format, the indices of its texts and of its floats.
+
+    None if a column is of another kind than those in ``_FORMATS``.
+    """
     kinds = [dtype.fields[name][0] for name in dtype.names or ()]
     if not kinds or any(
         kind.kind not in _FORMATS or (kind.kind == "f" and kind.itemsize > MAX_FLOAT_BYTES)
@@ -157,7 +160,7 @@ def _row_format(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | No
     return f"{{{format_text}}}", texts, floats
 
 
-def _parts_text(value: list[object]) -> str | None:
+def _localizations_json(value: list[object]) -> str | None:
     """Return the text of localizations; None if :func:`jsonable` has to make it."""
     texts: list[str] = []
     header: object = None
@@ -177,9 +180,9 @@ def _parts_text(value: list[object]) -> str | None:
         if part_header is not header:  # parts of one result share a header
             if type(part_header) is not Header:
                 return None
-            header, header_text = part_header, _HEADER % (*map(text_of, part_header),)
+            header, header_text = part_header, _HEADER % (*map(json_of, part_header),)
         front = _quoted(feature_id), quality, photo_index, header_text
-        texts.append(_PART % (*front, *numbers[1:]))
+        texts.append(_LOCALIZATION % (*front, *numbers[1:]))
     return f"[{','.join(texts)}]"
 
 

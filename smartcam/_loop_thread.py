@@ -280,11 +280,11 @@ class LoopThread:
         return self._mailbox is not None and not self._forked
 
     @property
-    def inside(self) -> bool:
+    def is_current_thread(self) -> bool:
         """True if the caller is in the loop's own thread."""
         return self._thread is not None and threading.get_ident() == self._thread.ident
 
-    def forked(self) -> None:
+    def on_fork(self) -> None:
         """Note that this process is a fork; the thread, if any, belongs to its parent."""
         self._forked = self._thread is not None
 
@@ -344,7 +344,7 @@ class LoopThread:
         self._refuse_fork()
         if self._mailbox is None:
             raise self._not_running_error()
-        if self.inside:
+        if self.is_current_thread:
             raise LocalProtocolError(
                 f"{self._name}: called in its own thread (by a predicate, an observer or an "
                 "interpreter), which would wait for itself"

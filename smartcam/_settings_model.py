@@ -41,7 +41,10 @@ OPTIONS: dict[str, tuple[Any, str]] = {
         Annotated[str, Field(strict=True, max_length=MAX_NAME_CHARACTERS), PLAIN],
         "name in logs and results; default HOST:PORT",
     ),
-    "application": (ApplicationId | None, "id or name of the application to load and run"),
+    "application": (
+        ApplicationId | None,
+        "id of the application to load and run; a name was replaced by its id before",
+    ),
     "application_names": (
         Annotated[dict[Text, ApplicationId], Field(max_length=1000)],
         "names of applications and their ids; a name may replace any id",
@@ -52,11 +55,11 @@ OPTIONS: dict[str, tuple[Any, str]] = {
         "transforms localizations into the robot's frame: one for all applications, or a mapping "
         "from application id to one, or to None to leave its values as they are",
     ),
-    "y_down": (Flag, "the camera's y axis points down; poses get y up"),
+    "y_down": (Flag, "the camera's y axis points down; it is reversed, so that poses have y up"),
     "lenient": (Flag, "any byte but 0 counts as true in a bool"),
     "connect_timeout": (Seconds, "longest wait for a session, all attempts"),
     "connect_attempts": (_integer(1, MAX_CONNECT_ATTEMPTS), "number of attempts for each dialect"),
-    "switch_timeout": (Seconds, "longest wait for a switch"),
+    "switch_timeout": (Seconds, "longest wait for a change of the application"),
     "request_timeout": (Seconds, "longest wait for the answer to a request"),
     "close_timeout": (Seconds, "longest wait for the camera to close the connection"),
     "liveness_timeout": (

@@ -163,7 +163,7 @@ class SyncCameraBase(Generic[ValueT]):
         self, function: Callable[P, Coroutine[Any, Any, T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """Run a coroutine, which has its own deadlines, in the event loop."""
-        if _in_event_loop() and not self._thread.inside:
+        if _in_event_loop() and not self._thread.is_current_thread:
             raise LocalProtocolError(
                 f"{self.name}: smartcam.sync would hold up the event loop that runs here; "
                 f'in it: async with smartcam.connect("{self.url}") as camera'
@@ -181,28 +181,28 @@ class SyncCameraBase(Generic[ValueT]):
         return self._do(lambda: SyncSubscription(subscribe(*args, **kwargs), self._thread, self))
 
     @contextlib.contextmanager
-    def _inside(
+    def _enter_in_loop(
         self,
         function: Callable[P, contextlib.AbstractAsyncContextManager[T]],
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Generator[T]:
         """Enter a context in the loop's thread, and leave it after the block, also after Ctrl-C."""
-        inside = _Inside(function(*args, **kwargs))
+        context = _LoopContext(function(*args, **kwargs))
         try:
-            yield self._wait(inside.enter)
+            yield self._wait(context.enter)
         except BaseException as exc:
-            if inside.is_entered:
-                self._wait(functools.partial(inside.leave, exc))
+            if context.is_entered:
+                self._wait(functools.partial(context.leave, exc))
             raise
         else:
-            self._wait(functools.partial(inside.leave, None))
+            self._wait(functools.partial(context.leave, None))
         finally:
-            if inside.is_entered:  # Ctrl-C came before leaving began
-                self._thread.post(lambda: _start_closing(inside.leave(None)))
+            if context.is_entered:  # Ctrl-C came before leaving began
+                self._thread.post(lambda: _start_closing(context.leave(None)))
 
 
-class _Inside(Generic[T]):
+class _LoopContext(Generic[T]):
     """A context that is entered and left in the loop's thread.
 
     Attributes:
@@ -243,8 +243,8 @@ def _start_closing(work: Coroutine[Any, Any, None]) -> None:
 class SyncSubscription(Generic[ItemT]):
     """A bounded stream of items: ``for item in subscription``, and ``with`` to close it.
 
-    Like :class:`smartcam.streams.Subscription`, it subscribes when it is made, and its counts
-    always agree. If several threads iterate, each item goes to one of them.
+    Like :class:`smartcam.streams.Subscription`, it subscribes when it is made, and offered items
+    are always those taken, dropped and queued. If several threads iterate, each item goes to one.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ class SyncSubscription(Generic[ItemT]):
 
         Raises:
             ResponseTimeoutError: no item came in time.
-            ConnectionClosedError: the stream has ended in order.
+            ConnectionClosedError: the stream has ended normally.
             SmartCamError: an item that is an error (the stream stays usable), or the stream's end.
         """
         check_seconds(timeout, "timeout", self._camera.name)
@@ -303,7 +303,7 @@ class SyncSubscription(Generic[ItemT]):
 
     def _next(self, timeout: float | None) -> ItemT:
         timeout = check_seconds_or_none(timeout, "timeout", self._camera.name)
-        if _in_event_loop() and not self._thread.inside:
+        if _in_event_loop() and not self._thread.is_current_thread:
             raise LocalProtocolError(
                 f"{self._camera.name}: smartcam.sync would hold up the event loop that runs here; "
                 "in it: async for item in a stream of smartcam.connect(...)"
@@ -358,7 +358,7 @@ class SyncFrameReaderBase:
         """Return the newest frame that was not returned yet.
 
         Raises:
-            StopIteration: the source ended in order.
+            StopIteration: the source ended normally.
             FrameTimeoutError: no frame came in time; the next call waits again.
             FrameSourceError: the source has failed.
         """

@@ -252,7 +252,7 @@ class _EngineUse:
         self.is_forked: bool = False
         notify_of_forks(self)
 
-    def forked(self) -> None:
+    def on_fork(self) -> None:
         """Note in a fork that the engine's threads do not run there."""
         self.is_forked = self.has_begun
 

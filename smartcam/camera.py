@@ -19,14 +19,14 @@ from smartcam._arguments import (
     check_bytes,
     check_callable,
     check_choice,
+    check_clock_seconds,
+    check_datetime,
     check_flag,
     check_integer,
     check_message_id,
-    check_moment,
     check_number,
     check_seconds,
     check_seconds_or_none,
-    check_time,
     wrong_argument,
 )
 from smartcam._client._inside import ClientCounters, Interpretation, Listeners, TriggerRequest
@@ -66,7 +66,7 @@ DEFAULT_MAX_QUEUE_BYTES = 1 << 26
 known cameras send. The interpreted values may need several times as many bytes."""
 
 MAX_INTERPRETATIONS = 32
-"""Largest number of values of ``interpret_as`` that are texts whose interpreters a client keeps."""
+"""Largest number of interpreters that a client caches, by the text of ``interpret_as``."""
 
 DEFAULT_TRIGGER_TIMEOUT = 5.0
 """Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
@@ -75,8 +75,8 @@ WAIT = "wait"
 """Value of ``when_busy`` with which a trigger waits until the camera is ready for it."""
 
 DEFAULT_RECONNECT_TIMEOUT = 60.0
-"""Seconds to wait for a new session: a reboot takes about 30 (mvBlueGEMINI manual p. 31, published
-for the sibling)."""
+"""Seconds to wait for a new session: a reboot takes about 30 (mvBlueGEMINI manual p. 31, about a
+similar camera)."""
 
 
 FRAME_TIMEOUT = 5.0
@@ -178,7 +178,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @abc.abstractmethod
     def _end_of_streams(self) -> tuple[SmartCamError | None] | None:
-        """Return the error with which streams ended, or None, in a tuple; None if they go on."""
+        """Return None while streams go on; else a tuple of their error, (None,) without one."""
 
     @abc.abstractmethod
     async def _trigger(
@@ -312,7 +312,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """
 
     def statistics(self) -> Statistics:
-        """Return all counters, over all sessions. Their sums agree at any time."""
+        """Return all counters, over all sessions; ``received`` is always the sum of the fates."""
         streams = self._listeners.streams()
         return self._counters.statistics(s.statistics() for s in streams if not s.ended)
 
@@ -361,7 +361,8 @@ class Camera(abc.ABC, Generic[ValueT]):
             batch: return lists of all waiting results, at least one, instead of single results: for
                 a camera that sends thousands a second. ``max_queue`` counts results, not lists.
             min_interval: seconds; results that come sooner after the last kept result are dropped.
-            max_queue: results kept for a slow reader. One read of the link brings up to 32 KiB.
+            max_queue: results kept for a slow reader; best at least as many as 32 KiB hold, which
+                may come at once.
             max_queue_bytes: largest number of bytes of the kept containers together
                 (``Result.raw``; values may be larger). A larger single container is kept if the
                 queue is empty.
@@ -581,9 +582,9 @@ class Camera(abc.ABC, Generic[ValueT]):
         trigger, and only the container with this number is the result. Otherwise, over TCP, a Query
         is sent before the trigger: containers that arrive before its answer are older. Before that,
         the client handles an earlier trigger that was given up: it waits a moment for the result,
-        or prevents it (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP
-        without ``@sequence`` a late result can be mistaken for that of the next trigger: no message
-        tells them apart.
+        or prevents it (Stop, Query, Start; that a stopped inspection has no result is concluded,
+        not documented). Over UDP without ``@sequence`` a late result can be mistaken for that of
+        the next trigger: no message tells them apart.
 
         Args:
             application: id, or name in ``application_names``, of the application to run for this
@@ -719,7 +720,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Enter run mode; return when the camera reports Running and is not BUSY.
 
         Raises:
-            UnsupportedError: the camera always runs (``bid``).
+            UnsupportedError: with this dialect the camera always runs (``bid``).
             ResponseTimeoutError: the camera did not report this within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
@@ -732,10 +733,10 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def stop(self, *, timeout: float = 10.0) -> None:
         """Leave run mode; return when the camera no longer reports Running.
 
-        A running inspection gives no result (inferred).
+        A running inspection gives no result (concluded, not documented).
 
         Raises:
-            UnsupportedError: the camera always runs (``bid``).
+            UnsupportedError: with this dialect the camera always runs (``bid``).
             ResponseTimeoutError: the camera did not report this within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
@@ -844,11 +845,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; nothing stays open.
         """
-        form = self._check_form(encoding, quality, STREAM_ENCODINGS)
-        rate = self._check_rate(bitrate, latency)
+        frame_request = self._check_encoding(encoding, quality, STREAM_ENCODINGS)
+        limits = self._check_limits(bitrate, latency)
         decode = check_flag(decode, "decode", self.name)
         timeout = check_seconds_or_none(timeout, "timeout", self.name, exclusive=True)
-        return self._frames(StreamRequest(*form, *rate, decode, timeout))
+        return self._frames(StreamRequest(*frame_request, *limits, decode, timeout))
 
     async def newest_frame(
         self,
@@ -874,10 +875,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
-        form = self._check_form(encoding, quality, FRAME_ENCODINGS)
+        frame_request = self._check_encoding(encoding, quality, FRAME_ENCODINGS)
         max_age = check_age(max_age, "max_age", self.name)
         timeout = check_seconds(timeout, "timeout", self.name)
-        return await self._newest_frame(max_age, form, timeout)
+        return await self._newest_frame(max_age, frame_request, timeout)
 
     async def frame_after(
         self,
@@ -902,20 +903,22 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
-        form = self._check_form(encoding, quality, FRAME_ENCODINGS)
+        frame_request = self._check_encoding(encoding, quality, FRAME_ENCODINGS)
         if moment is not None:
-            moment = check_moment(moment, "moment", self.name)
+            moment = check_clock_seconds(moment, "moment", self.name)
         timeout = check_seconds(timeout, "timeout", self.name)
-        return await self._frame_after(moment, form, timeout)
+        return await self._frame_after(moment, frame_request, timeout)
 
     def _frames(self, wanted: StreamRequest) -> contextlib.AbstractAsyncContextManager[FrameReader]:
         raise self._no_frames_error()
 
-    async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
+    async def _newest_frame(
+        self, max_age: float, frame_request: FrameRequest, timeout: float
+    ) -> FleetFrame:
         raise self._no_frames_error()
 
     async def _frame_after(
-        self, moment: float | None, form: FrameRequest, timeout: float
+        self, moment: float | None, frame_request: FrameRequest, timeout: float
     ) -> FleetFrame:
         raise self._no_frames_error()
 
@@ -974,15 +977,15 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     def _not_shared_error(self, then: str) -> UnsupportedError:
         return UnsupportedError(
-            f"{self.name}: the camera is at the wire, where it serves one client, and not one of a "
-            f"fleet: {then}; smartcam serve shares it, and fleet://HOST/NAME is its address then"
+            f"{self.name}: this camera is connected directly and serves one client: {then}; "
+            "smartcam serve shares it, and fleet://HOST/NAME is its address then"
         )
 
     def _no_frames_error(self) -> UnsupportedError:
         return UnsupportedError(
-            f"{self.name}: a camera at the wire gives results, no frames: open what takes its "
-            "pictures by smartcam.frames.open(URL), or share the camera by a fleet file with "
-            "frames: URL"
+            f"{self.name}: a camera that is connected directly gives results, no frames: open the "
+            "source of its pictures by smartcam.frames.open(URL), or share the camera by a fleet "
+            "file with frames: URL"
         )
 
     async def get_clock(self, *, timeout: float | None = None) -> datetime:
@@ -1000,23 +1003,24 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def _get_clock(self, timeout: float) -> datetime: ...
 
     async def set_clock(self, when: datetime) -> None:
-        """Set the camera's clock to the fields of ``when``; only result codes confirm it.
+        """Set the camera's clock to the fields of ``when``; confirmed only by result codes, if any.
 
         Raises:
             CommandRejectedError: the camera refused.
 
-        Source: mvBlueGEMINI manual p. 29 (published, sibling): invalid values may be dropped.
+        Source: mvBlueGEMINI manual p. 29, about a similar camera: invalid values may be dropped.
         """
-        await self._set_clock(check_time(when, "when", self.name))
+        await self._set_clock(check_datetime(when, "when", self.name))
 
     @abc.abstractmethod
     async def _set_clock(self, when: datetime) -> None: ...
 
     async def set_input(self, data: bytes) -> None:
-        """Send input data for the next inspection; only result codes confirm it.
+        """Send input data for the next inspection; confirmed only by result codes, if any.
 
         ``trigger(input=...)`` sends the data of its own trigger. The camera queues input containers
-        for its inspections; the Input Container bit shows that their numbers differ.
+        for its inspections; the Input Container bit shows that there are more of one than of the
+        other.
         """
         await self._set_input(check_bytes(data, "data", self.name))
 
@@ -1027,8 +1031,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Set the number of the next run (0 to 4294967295); nothing confirms it.
 
         If the layout has an ``@sequence`` field, the next :meth:`trigger` uses this number; without
-        this call, :meth:`trigger` chooses its own numbers. If something else triggers a run before,
-        that run gets this number: then do not call this method.
+        this call, :meth:`trigger` chooses its own numbers. Do not call it if anything else may
+        trigger the camera: the next run gets the number, whatever triggered it.
 
         Raises:
             ConfigurationError: the number has more than 32 bits.
@@ -1045,8 +1049,8 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def reboot(self) -> None:
         """Restart the camera; return when the session has ended.
 
-        The camera is away for about 30 seconds then (published for a sibling) and comes back with
-        the last application, stopped. :meth:`wait_connected` waits for it.
+        The camera is away for about 30 seconds then, as a similar one, and comes back with the
+        last application, stopped. :meth:`wait_connected` waits for it.
 
         Raises:
             UnsupportedError: the dialect has no such request (``bid``).
@@ -1100,10 +1104,10 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Return the timeout of a call in seconds: as given, or the default."""
         return default if timeout is None else check_seconds(timeout, "timeout", self.name)
 
-    def _check_form(
+    def _check_encoding(
         self, encoding: str, quality: int | None, encodings: Collection[str]
     ) -> FrameRequest:
-        """Check an encoding and a quality; the agent checks whether they fit together."""
+        """Check encoding and quality of frames; the agent checks whether they fit together."""
         if quality is not None:
             quality = check_integer(quality, "quality", 1, 100, self.name)
         encoding = check_choice(encoding, "encoding", STREAM_ENCODINGS, self.name)
@@ -1113,7 +1117,7 @@ class Camera(abc.ABC, Generic[ValueT]):
             )
         return FrameRequest(encoding, quality)
 
-    def _check_rate(
+    def _check_limits(
         self, bitrate: float | None, latency: float | None
     ) -> tuple[float | None, float | None]:
         """Check the limits of a stream's bit rate and latency."""
@@ -1131,7 +1135,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Address of the camera itself, as far as it is known."""
         return self.settings.address
 
-    def _read_by(self, spec: object) -> None:
+    def _set_interpreter(self, spec: object) -> None:
         """Interpret results by ``spec`` from now on; None: by the settings.
 
         This holds for every user of this object.
@@ -1190,7 +1194,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         end = self._end_of_streams()
         if end is not None:
             queue.end(end[0])
-        queue.keep(self)
+        queue.hold_source(self)
         subscribers.add(queue)
         self._on_listener_added(subscribers)
         return queue

@@ -50,7 +50,7 @@ __all__ = ["SmartCamera"]
 
 
 class SmartCamera(Camera[ValueT]):
-    """A camera at the wire: this client talks to the camera itself, and has the only session.
+    """A camera that is connected directly: this client has the only session with it.
 
     Once another client has taken the camera, this client has ended: every method that needs a
     session raises :exc:`~smartcam.ConnectionTakenError`. Make a new client then.
@@ -99,8 +99,8 @@ class SmartCamera(Camera[ValueT]):
         self.settings: CameraSettings = replace(self.settings, address=address)
         self._supervisor.use_settings(self.settings)
 
-    def _read_by(self, spec: object) -> None:
-        super()._read_by(spec)
+    def _set_interpreter(self, spec: object) -> None:
+        super()._set_interpreter(spec)
         self._results.interpretation = self._default
 
     def _require_session(self) -> None:
@@ -203,7 +203,7 @@ class SmartCamera(Camera[ValueT]):
 
     async def _switch_application(self, application: int | str, timeout: float) -> None:
         async with self._lock.hold(timeout) as deadline:
-            self._commands.make_load_request(application)
+            self._commands.make_load_request(application)  # refuses what cannot be loaded
             await self._status.refresh(deadline)
             await self._commands.switch(application, deadline, start=self._commands.is_in_run_mode)
 

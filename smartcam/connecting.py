@@ -107,10 +107,10 @@ def connect(
 
     With ``calibration`` the value of every result is a list of localizations in the robot's frame,
     as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
-    an observer. The calibration gets the values that ``interpret_as`` gives, turned to y up with
-    ``y_down``. The frame in their headers is the camera's ``name``, which has to be the
-    ``camera_frame`` of a calibration that has one. No value is returned uncalibrated: a value that
-    is no list of localizations, or that the calibration refuses, gives an
+    an observer. The calibration gets the values that ``interpret_as`` gives; with ``y_down``, their
+    y axis is reversed before. The frame in their headers is the camera's ``name``, which has to be
+    the ``camera_frame`` of a calibration that has one. No value is returned uncalibrated: a value
+    that is no list of localizations, or that the calibration refuses, gives an
     :exc:`~smartcam.InterpretationError` with the cause chained. An interpreter that never gives
     localizations (raw, record, table, strings50) is a ConfigurationError at once; if a single
     trigger names one, its value stays as it is. A mapping gives each application id its own

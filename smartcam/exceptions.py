@@ -16,7 +16,7 @@
     ├── CommandRejectedError                   the camera refused; the active application
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── NotAllowedError (PermissionError)      the role of this program's certificate forbids it
-    ├── ReservationLostError               the camera was not this program's alone all the time
+    ├── ReservationLostError               others may have used the camera during a reservation
     ├── CameraFaultError                       the camera reports System Error
     ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
     ├── FrameSourceError (OSError)             a source of pictures: gone, in use, stuck
@@ -276,7 +276,9 @@ class NotAllowedError(SmartCamError, PermissionError):
 
 
 class ReservationLostError(SmartCamError):
-    """A reservation ended, or may have ended, before its block; others may have used the camera.
+    """A reservation ended, or may have ended, before the end of its block.
+
+    Others may have used the camera.
 
     A command that raises this error was not carried out.
     """
@@ -309,7 +311,7 @@ class FrameSourceError(SmartCamError, OSError):
 
     Attributes:
         source: name of the source.
-        available: formats, devices or controls that the source has instead, as a text.
+        available: names of the formats, devices or controls that the source has instead.
     """
 
     def __init__(self, message: str, *, source: str = "", available: tuple[str, ...] = ()) -> None:

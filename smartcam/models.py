@@ -210,15 +210,15 @@ class PoseSigma(NamedTuple):
     z: float | None = None
 
     @property
-    def place(self) -> float:
+    def worst_xy(self) -> float:
         """The standard deviation in x and y along the worst direction, in the unit of ``x``."""
         mean, half = (self.x**2 + self.y**2) / 2, (self.x**2 - self.y**2) / 2
         return math.sqrt(mean + math.hypot(half, self.correlation_xy * self.x * self.y))
 
     @property
     def millimetres(self) -> float:
-        """:attr:`place` in millimetres, of a pose whose position is in metres."""
-        return 1e3 * self.place
+        """:attr:`worst_xy` in millimetres, of a pose whose position is in metres."""
+        return 1e3 * self.worst_xy
 
     @property
     def degrees(self) -> float:
@@ -293,7 +293,7 @@ class Calibration(Protocol):
         """Return one localization for each, in the same order, with its pose in the robot's frame.
 
         The client calls it in its event loop, once for the localizations of each result container,
-        none included; it must not wait. It may be called again for the same container.
+        also for an empty list; it must not wait. It may be called again for the same container.
 
         Args:
             localizations: localizations of one container; their header has the camera's name as its
@@ -470,8 +470,8 @@ class SubscriberStatistics:
         dropped: items lost to the policy or to ``min_interval``.
         queued: items waiting.
         queued_bytes: bytes of the queued containers; 0 for statuses and events.
-        missed: items of a fleet's camera that were lost, since the program was cut off from its
-            agent for longer than the agent keeps them; 0 for a camera at the wire.
+        missed: items of a fleet's camera that were lost, because the program had no connection to
+            its agent for longer than the agent keeps them; 0 for a directly connected camera.
     """
 
     name: str

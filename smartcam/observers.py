@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam._arguments import check_all, wrong_argument
+from smartcam._arguments import check_iterable, wrong_argument
 from smartcam._user_code import ENDS_PROGRAM
 
 if TYPE_CHECKING:
@@ -102,7 +102,8 @@ class Observer:
         """Handle a frame as ``on_frame`` does, before it is decoded.
 
         An observer that overrides this method gets every frame here, and ``on_frame`` is not called
-        unless a subclass overrides that again. Another thread may call ``frame.entry()``.
+        unless a class derived from that observer overrides ``on_frame``. Another thread may call
+        ``frame.entry()``.
         """
         self.on_frame(frame.entry())
 
@@ -184,7 +185,7 @@ class Observers:
             self._add_observers(observers)
 
     def _add_observers(self, observers: Iterable[Observer]) -> None:
-        self._all = check_all(observers, "observers", "a list of observers")
+        self._all = check_iterable(observers, "observers", "a list of observers")
         for observer in self._all:
             hooks = (getattr(observer, hook, None) for hook in _HOOKS)
             if isinstance(observer, type) or not all(map(callable, hooks)):

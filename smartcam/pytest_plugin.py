@@ -73,7 +73,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Pytest: show the findings about clients; the judge of cameras shows its own."""
+    """Pytest: show the findings about clients; the suite that checks cameras shows its own."""
     from smartcam.conformance._inside import terminal_summary
 
     terminal_summary(terminalreporter)
@@ -183,7 +183,8 @@ def _given_options(request: pytest.FixtureRequest) -> dict[str, Any]:
     given: dict[str, Any] = {}
     for marker in reversed(list(request.node.iter_markers("smartcam"))):
         if marker.args:
-            pytest.fail("the marker smartcam takes names only: application=7", pytrace=False)
+            text = "the marker smartcam takes keyword arguments only, such as application=7"
+            pytest.fail(text, pytrace=False)
         given |= marker.kwargs
     known = MARKER_OPTIONS | _options(given)
     unknown = sorted(given.keys() - known)

@@ -30,7 +30,7 @@ class PluginInfo(NamedTuple):
     Attributes:
         name: name by which users ask for it.
         target: ``module:attribute`` that it is loaded from.
-        origin: ``built-in`` or the distributions that provide it.
+        origin: ``built-in``, ``registered``, or the distributions that provide it.
     """
 
     name: str
@@ -185,11 +185,11 @@ def _entry_points_text(distribution: Distribution) -> str | None:
 
 
 def _distributions() -> Iterator[Distribution]:
-    from importlib.metadata import distributions  # built-in plug-ins do without
+    from importlib.metadata import distributions  # slow, and built-in plug-ins do not need it
 
     try:
         yield from distributions()
-    except Exception as exc:  # noqa: BLE001 - so may what other people put on sys.meta_path
+    except Exception as exc:  # noqa: BLE001 - finders on sys.meta_path may raise anything
         _log.warning("installed distributions cannot be listed to their end: %r", exc)
 
 
@@ -217,7 +217,7 @@ INTERPRETERS = Registry(
         "strings50": "smartcam.interpreters._basic:Strings50Interpreter",
         "table": "smartcam.interpreters._basic:TableInterpreter",
     },
-    # the thesis' keywords for the first two
+    # the thesis' keywords for localizations and strings50
     aliases={"Localizations": "localizations", "50ByteStrings": "strings50"},
 )
 

@@ -90,7 +90,7 @@ class Queue(Generic[T]):
         self._bytes = 0  # bytes of all parcels, part of which may belong to items that are gone
         self._missed = 0
         self.since: float = -math.inf  # time of the subscription, on the clock of the items
-        self._evicted = 0  # dropped items that had been queued; only queued items have numbers
+        self._evicted = 0  # dropped items that had been queued; only these were numbered
 
     @property
     def ended(self) -> bool:
@@ -108,7 +108,7 @@ class Queue(Generic[T]):
         if self._items or self._ended:
             ready.set()
 
-    def keep(self, source: object) -> None:
+    def hold_source(self, source: object) -> None:
         """Keep a reference to the items' source, since a program may keep only the stream."""
         if not self._ended:
             self._source = source
@@ -354,12 +354,12 @@ class Subscribers(Generic[T]):
     Adding and removing a queue take the same time for any number of queues.
     """
 
-    __slots__ = ("_references_copy", "added_count", "horizon", "references")
+    __slots__ = ("_references_copy", "added_count", "offered_at", "references")
 
     def __init__(self) -> None:
         self.added_count: int = 0  # number of queues added so far
         # time of the items that are offered now; queues with a later ``since`` do not get them
-        self.horizon: float = math.inf
+        self.offered_at: float = math.inf
         # the queues; every message tests whether there is one
         self.references: dict[weakref.ref[Queue[T]], None] = {}
         # copy to iterate over while queues are removed; None if it has to be made again
@@ -383,7 +383,7 @@ class Subscribers(Generic[T]):
         """True if a queue would take an item that is offered now."""
         for reference in self._references_copy or self._copy_references():
             queue = reference()
-            if queue is not None and not queue.ended and queue.since <= self.horizon:
+            if queue is not None and not queue.ended and queue.since <= self.offered_at:
                 return True
         return False
 
@@ -391,13 +391,13 @@ class Subscribers(Generic[T]):
         """Hand an item of ``size`` bytes to each queue."""
         for reference in self._references_copy or self._copy_references():
             queue = reference()
-            if queue is not None and queue.since <= self.horizon:
+            if queue is not None and queue.since <= self.offered_at:
                 queue.offer(item, now, size)
 
     def __iter__(self) -> Iterator[Queue[T]]:
         for reference in self._references_copy or self._copy_references():
             queue = reference()
-            if queue is not None and queue.since <= self.horizon:
+            if queue is not None and queue.since <= self.offered_at:
                 yield queue
 
     def _copy_references(self) -> list[weakref.ref[Queue[T]]]:

@@ -409,7 +409,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
 
         As :meth:`smartcam.Camera.application`.
         """
-        with self._inside(self._camera.application, application):
+        with self._enter_in_loop(self._camera.application, application):
             yield self
 
     def start(self, *, timeout: float = 10.0) -> None:
@@ -451,7 +451,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
         timeout: float | None = FRAME_TIMEOUT,
     ) -> Generator[SyncFrameReader]:
         """Read the camera's frames: :meth:`smartcam.Camera.frames`."""
-        with self._inside(
+        with self._enter_in_loop(
             self._camera.frames,
             encoding=encoding,
             quality=quality,
@@ -501,7 +501,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
 
         As :meth:`smartcam.Camera.reserve`.
         """
-        with self._inside(self._camera.reserve, timeout):
+        with self._enter_in_loop(self._camera.reserve, timeout):
             yield self
 
     def take_back(self, *, timeout: float | None = None) -> None:

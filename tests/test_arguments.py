@@ -23,7 +23,7 @@ import smartcam.fleet
 import smartcam.frames
 import smartcam.sync
 from smartcam import Backoff, ConfigurationError
-from smartcam._arguments import shown_time
+from smartcam._arguments import duration_text
 from smartcam.conformance.camera import ConformanceOptions
 from smartcam.emulator import (
     EmulatedCamera,
@@ -500,5 +500,5 @@ async def test_odd_arguments_are_refused_everywhere_else() -> None:
     ],
 )
 def test_shown_time_never_says_0_for_what_is_more(seconds: float, fine: str, coarse: str) -> None:
-    assert shown_time(seconds) == fine
-    assert shown_time(seconds, coarse=True) == coarse
+    assert duration_text(seconds) == fine
+    assert duration_text(seconds, coarse=True) == coarse

@@ -410,7 +410,7 @@ def test_sigma_of_a_place_is_that_of_the_worst_direction(x: float, y: float, xy:
     sigma = PoseSigma(x, y, 0.01, correlation_xy=xy)
     covariance = [[x * x, xy * x * y], [xy * x * y, y * y]]
     worst = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
-    assert sigma.place == pytest.approx(worst)
+    assert sigma.worst_xy == pytest.approx(worst)
     assert sigma.millimetres == pytest.approx(1000 * worst)
     assert sigma.degrees == pytest.approx(math.degrees(0.01))
 

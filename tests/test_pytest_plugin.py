@@ -207,7 +207,7 @@ def test_marker_says_what_the_camera_is(pytester: pytest.Pytester) -> None:
     ("marker", "text"),
     [
         ("colour='red'", "the marker smartcam has no option 'colour'; it has active, *"),
-        ("7", "the marker smartcam takes names only: application=7"),
+        ("7", "the marker smartcam takes keyword arguments only, such as application=7"),
         ("dialect='b17'", "*emulator: dialect 'b17' is unknown; known are handbook*"),
         ("scenario='none.yaml'", "the marker smartcam: scenario none.yaml: *No such file*"),
         ("applications=[1]", "the marker smartcam: application 1: *valid dictionary*"),

@@ -209,7 +209,7 @@ def test_parse_address_bare_host_with_model_is_its_protocols(
         ("bvs://h?colour=red", "unknown 'colour'; known are 'dialect', 'quirks'"),
         ("bvs://h?user=me", "unknown 'user'; known are 'dialect', 'quirks'"),
         ("bvs://h?dialect=latin", "bvs has no dialect 'latin'; it has handbook, thesis, b16, bid"),
-        ("bvs://h?quirks=code", "quirks are a dialect's: name the dialect, too"),
+        ("bvs://h?quirks=code", "quirks belong to a dialect: name the dialect, too"),
         ("bvs://h?dialect=b16&quirks=a&quirks=b", "names two quirks"),
         (
             "bvs://h?dialect=b16&quirks=loud",

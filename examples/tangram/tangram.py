@@ -110,7 +110,7 @@ async def main(folder: Path) -> None:
                 off[name] = math.hypot(x - at_u, -y - at_v) / PIXELS_PER_MM
         name = min(off, key=off.__getitem__)
         worst = max(worst, off[name])
-        said = f"{name:16} at {x:6.1f}, {y:7.1f} px, sigma {part.pose.sigma.place:.4f} px"
+        said = f"{name:16} at {x:6.1f}, {y:7.1f} px, sigma {part.pose.sigma.worst_xy:.4f} px"
         print(said)  # noqa: T201
     said = f"{len(result.value)} of {len(scene.pieces)} pieces, all within {worst:.3f} mm"
     print(said)  # noqa: T201

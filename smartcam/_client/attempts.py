@@ -9,7 +9,7 @@ import socket
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._arguments import shown_time
+from smartcam._arguments import duration_text
 from smartcam.exceptions import (
     CommandRejectedError,
     ConnectionLostError,
@@ -80,7 +80,7 @@ class Attempt:
         system = lost if isinstance(lost, OSError) else error
         if timeout and not isinstance(error, SmartCamError):
             received_text = f"{self.received} bytes, then silence" if self.received else "silence"
-            self.outcome = f"{received_text} for {shown_time(waited, coarse=True)}"
+            self.outcome = f"{received_text} for {duration_text(waited, coarse=True)}"
         elif isinstance(system, OSError) and system.errno is not None and system.errno > 0:
             words = os.strerror(system.errno)  # plainer than "Connect call failed"
             # on Windows strerror() does not know the numbers of Winsock

@@ -14,7 +14,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam._arguments import shown_time
+from smartcam._arguments import duration_text
 from smartcam.exceptions import SmartCamError
 from smartcam.protocols import messages as m
 
@@ -99,7 +99,7 @@ class _Watch:
         else:
             end = self._asked_at + self._timeout
             if now >= end:
-                reason = f"no sign of life for {shown_time(now - heard_at, coarse=True)}"
+                reason = f"no sign of life for {duration_text(now - heard_at, coarse=True)}"
                 self._link.give_up(TimeoutError(reason))
                 return
             # the camera may answer, so check again when the next Query is due

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam._arguments import shown_time
+from smartcam._arguments import duration_text
 from smartcam.exceptions import ResponseTimeoutError, SmartCamError
 from smartcam.protocols.messages import SwitchAnswer, TriggerAnswer
 
@@ -113,7 +113,7 @@ class Polling:
         elif (
             self._connection.features.keeps_order and now - self._open_since >= self._answer_timeout
         ):
-            open_for = shown_time(now - self._open_since, coarse=True)
+            open_for = duration_text(now - self._open_since, coarse=True)
             silence = f"no status within {open_for} of being asked for"
             link.give_up(ResponseTimeoutError(f"{self._connection.name}: {silence}"))
             return

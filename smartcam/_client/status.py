@@ -7,7 +7,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam._arguments import shown_time
+from smartcam._arguments import duration_text
 from smartcam.exceptions import LocalProtocolError, ResponseTimeoutError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
@@ -85,7 +85,7 @@ class StatusRequests:
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
-                f"{self._connection.name}: waited {shown_time(waited)} for {awaited}; "
+                f"{self._connection.name}: waited {duration_text(waited)} for {awaited}; "
                 f"status: {self.last}",
                 waited=waited,
             ) from exc

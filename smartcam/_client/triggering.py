@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from smartcam._arguments import shown_time
+from smartcam._arguments import duration_text
 from smartcam._client.correlation import (
     EvidenceByAcknowledgement,
     EvidenceByAnswer,
@@ -395,7 +395,7 @@ class Triggers:
         arrived = f"{len(pending.results)} of {pending.wanted} results"
         return TriggerTimeoutError(
             f"{self._name}: {arrived if pending.results else 'no result'} within "
-            f"{shown_time(waited)} of the trigger; status: {self._status.last}"
+            f"{duration_text(waited)} of the trigger; status: {self._status.last}"
             f"{_missing_messages_text(pending)}",
             waited=waited,
         )
@@ -494,7 +494,7 @@ class Triggers:
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
                     f"{self._name}: the camera did not wait for a trigger within "
-                    f"{shown_time(waited)}; status: {self._status.last}{hint}",
+                    f"{duration_text(waited)}; status: {self._status.last}{hint}",
                     waited=waited,
                 ) from exc
 
@@ -556,7 +556,7 @@ class Triggers:
             await self._status.wait_asking_again(_is_not_overtriggered, now + grace)
             return
         raise OvertriggeredError(
-            f"{self._connection.name}: Overtriggered has stayed set for {shown_time(grace)}. As "
+            f"{self._connection.name}: Overtriggered has stayed set for {duration_text(grace)}. As "
             "long as it is, the camera cannot show that it drops a trigger, so none was sent. It "
             "may fall when the application is stopped and started"
         )

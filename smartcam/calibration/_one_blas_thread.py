@@ -26,10 +26,10 @@ class OneBlasThread(ContextDecorator):
     """
 
     def __init__(self) -> None:
-        self.forked()
+        self.on_fork()
         notify_of_forks(self)
 
-    def forked(self) -> None:
+    def on_fork(self) -> None:
         """Reset the state in a fork; its BLAS may stay limited to one thread."""
         self._lock = threading.Lock()
         self._depths: Counter[int] = Counter()  # number of nested uses in each thread

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from smartcam._arguments import check_all, check_integer, check_text
+from smartcam._arguments import check_integer, check_iterable, check_text
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.protocols import Protocol, Transport
@@ -100,7 +100,7 @@ def choose_ports(
     known = tcp_protocols()
     chosen = [*known]
     if names is not None:
-        given_names = check_all(names, "protocols", "names of protocols", "find")
+        given_names = check_iterable(names, "protocols", "names of protocols", "find")
         chosen = [*dict.fromkeys(check_text(name, "protocol", "find") for name in given_names)]
     for name in chosen:
         if name not in known:
@@ -114,7 +114,7 @@ def choose_ports(
     for name in chosen:
         port = known[name].default_port
         by_port[port] = (*by_port.get(port, ()), known[name])
-    for number in check_all(more_ports, "ports", "numbers of ports", "find"):
+    for number in check_iterable(more_ports, "ports", "numbers of ports", "find"):
         port = check_integer(number, "port", 1, 0xFFFF, "find")
         port_protocols = by_port.get(port, ())
         by_port[port] = (

@@ -14,9 +14,9 @@ from contextlib import aclosing
 from typing import TYPE_CHECKING
 
 from smartcam._arguments import (
-    check_all,
     check_flag,
     check_integer,
+    check_iterable,
     check_number,
     check_text,
     excerpt,
@@ -169,7 +169,7 @@ class CameraSearch:
         networks = [check_text(text, "network", "find", most=MAX_NETWORK_TEXT) for text in networks]
         exclude = [
             check_text(text, "exclude", "find", most=MAX_NETWORK_TEXT)
-            for text in check_all(exclude, "exclude", "texts of addresses", "find")
+            for text in check_iterable(exclude, "exclude", "texts of addresses", "find")
         ]
         self._networks = [(text, read_span(text)) for text in networks]
         self._excluded = [(text, read_span(text, include_ends=True)) for text in exclude]

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from smartcam._arguments import check_callable, check_moment, check_seconds
+from smartcam._arguments import check_callable, check_clock_seconds, check_seconds
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ class ManualClock(Clock):
 
     def call_at(self, when: float, callback: Callable[[], None]) -> TimerHandle:
         """Call ``callback`` inside the :meth:`advance` that reaches ``when``."""
-        when = check_moment(when, "when", "clock")
+        when = check_clock_seconds(when, "when", "clock")
         timer = _Timer(check_callable(callback, "callback", "clock"))
         entry = (nanoseconds(when), next(self._numbers), timer)
         heapq.heappush(self._timers, entry)

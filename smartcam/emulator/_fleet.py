@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from smartcam._arguments import check_all, check_kind
+from smartcam._arguments import check_iterable, check_kind
 from smartcam._server import Server
 from smartcam.emulator._makes import emulated_class
 from smartcam.emulator._scenario.file import load_scenarios
@@ -54,7 +54,7 @@ class EmulatedFleet(Server):
         given = (
             load_scenarios(scenarios, dialect=dialect)
             if isinstance(scenarios, (str, Path))
-            else check_all(scenarios, "scenarios", "a file's path, or scenarios", "emulator")
+            else check_iterable(scenarios, "scenarios", "a file's path, or scenarios", "emulator")
         )
         self._cameras: dict[str, WireCamera] = {}
         for scenario in given:

@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam._arguments import check_age, check_moment, check_seconds_or_none
+from smartcam._arguments import check_age, check_clock_seconds, check_seconds_or_none
 from smartcam.exceptions import FrameSourceError, FrameTimeoutError
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class FrameReader:
 
         Cancellation: safe; frames that came before are skipped.
         """
-        moment = check_moment(moment, "moment")
+        moment = check_clock_seconds(moment, "moment")
         timeout = check_seconds_or_none(timeout, "timeout")
         for candidate in (self._last, self._next):
             if candidate is not None and candidate.began >= moment:
@@ -161,8 +161,8 @@ class FrameReader:
 
         Cancellation: safe.
         """
-        check_moment(since, "since")
-        check_moment(until, "until")
+        check_clock_seconds(since, "since")
+        check_clock_seconds(until, "until")
         loop = asyncio.get_running_loop()
         while not self._has_ended and loop.time() < until:
             if self._next is not None and self.last_arrival >= since:

@@ -16,7 +16,7 @@ from smartcam._arguments import (
     check_age,
     check_callable,
     check_choice,
-    check_moment,
+    check_clock_seconds,
     check_number,
     check_seconds,
     check_seconds_or_none,
@@ -342,7 +342,7 @@ class FrameSource(FrameSink):
 
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the first frame exposed after a moment, as :meth:`FrameReader.after` does."""
-        moment = check_moment(moment, "moment")
+        moment = check_clock_seconds(moment, "moment")
         timeout = check_seconds_or_none(timeout, "timeout")
         async with self.reader() as reader:
             if self._newest_frame is not None and self._newest_frame.began >= moment:

@@ -2,8 +2,8 @@
 
 An interpreter keeps nothing between results and guesses nothing. The shortest one is a function
 over a :class:`Reader`; an interpreter with a layout is a subclass of :class:`Interpreter`.
-:func:`resolve` turns the user's ``interpret_as`` into an interpreter; only the functions whose
-names begin with ``run`` call it.
+:func:`resolve` turns the user's ``interpret_as`` into an interpreter; interpreters are called only
+by the functions whose names begin with ``run``.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ class Interpreter(ABC):
     """Text of the layout that is used if the user gives no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "optional"
-    """``none``: no layout must be given; ``optional``: one may be; ``required``: one must be."""
+    """``none``: a layout is refused; ``optional``: one may be given; ``required``: one must be."""
 
     def __init__(self, layout: Layout | None = None) -> None:
         name = type(self).__name__.removesuffix("Interpreter").lower()
@@ -260,11 +260,11 @@ class PlainInterpreter(Interpreter):
 
     def __init_subclass__(cls) -> None:
         """Use the default :meth:`read_all` if only :meth:`read` is overridden."""
-        read, read_all = (
+        read_depth, read_all_depth = (
             next(index for index, base in enumerate(cls.__mro__) if name in vars(base))
             for name in ("read", "read_all")
         )
-        if read < read_all:
+        if read_depth < read_all_depth:
             cls.read_all = PlainInterpreter.read_all  # type: ignore[method-assign]
 
     @abstractmethod
@@ -472,7 +472,7 @@ def _check_name(spec: str, name: str, tail: str) -> None:
         if suggestion:
             raise PluginError(
                 f"interpreter {excerpt(name)} is unknown, did you mean {suggestion!r}? "
-                f"known are {', '.join(known)} (a group may have that name in a "
+                f"known are {', '.join(known)} (if it is a group's name in a layout, pass "
                 f"Layout({excerpt(spec)}))",
                 name=name,
             )

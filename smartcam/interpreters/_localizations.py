@@ -57,6 +57,9 @@ _CORRELATIONS = ("correlation_xy", "correlation_xt", "correlation_yt")
 MAX_QUALITY = 1.0 + 1e-6
 """Largest quality: 1, with room for the rounding of a 32-bit float."""
 
+MAX_CORRELATION = MAX_QUALITY
+"""Largest absolute value of a correlation, with the same room."""
+
 MAX_NAMES = 64
 """Largest number of feature names that are kept as texts. An application has a handful, but a peer
 could send any number."""
@@ -243,7 +246,7 @@ class LocalizationsInterpreter(PlainInterpreter):
                 xy, xt = -xy, -xt
             sigma = PoseSigma(x, y, theta, xy, xt, yt)
             is_known = min(x, y, theta) >= 0 and math.isfinite(x + y + theta)
-            if is_known and max(abs(xy), abs(xt), abs(yt)) <= MAX_QUALITY:
+            if is_known and max(abs(xy), abs(xt), abs(yt)) <= MAX_CORRELATION:
                 result.append(part._replace(pose=part.pose.with_sigma(sigma)))
             else:
                 result.append(part)

@@ -52,8 +52,8 @@ class Layout:
 
     Args:
         text: the layout text; new lines are white space, ``#`` begins a comment.
-        lenient: whether any byte except zero is a true bool; otherwise only 0xFF is true and only
-            0x00 false, as the camera sends them.
+        lenient: whether any byte except zero counts as True in a bool; otherwise only 0xFF is True
+            and only 0x00 False, as the camera sends them.
         start: index at which the layout begins in ``text``; positions of mistakes still count from
             the start of ``text``.
 
@@ -118,7 +118,7 @@ class Layout:
 
     @property
     def lenient(self) -> bool:
-        """True if any byte except zero is a true bool."""
+        """True if any byte except zero counts as True in a bool."""
         return self._lenient
 
     @property

@@ -131,7 +131,7 @@ class RecordCodec:
     Args:
         fields: the fields, without padding between them.
         byte_order: byte order of numbers.
-        lenient: whether any byte except zero is a true bool.
+        lenient: whether any byte except zero counts as True in a bool.
 
     Attributes:
         size: size of a record, bytes.

@@ -10,7 +10,7 @@ from pydantic import Field as ModelField
 from smartcam.exceptions import ConfigurationError, LayoutError
 from smartcam.layout._text import TYPES, UNITS, LayoutSpec, parse_text, to_text
 from smartcam.layout._text import Field as LayoutField
-from smartcam.layout._yamls import BadYamlError, load, yaml_module
+from smartcam.layout._yaml_parsing import BadYamlError, load, yaml_module
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from smartcam.layout._classes import describes_layout, read_class
     from smartcam.layout._codec import split_rows
     from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, Field, misfit_error
-    from smartcam.layout._texts import pack_texts
+    from smartcam.layout._text_cells import pack_texts
     from smartcam.layout._units import ShownUnits, units_of
     from smartcam.layout._yaml_files import file_schema, read_model
-    from smartcam.layout._yamls import BadYamlError, compose, load
+    from smartcam.layout._yaml_parsing import BadYamlError, compose, load
 
 __all__ = [
     "SI_SYMBOLS",
@@ -41,9 +41,9 @@ if not TYPE_CHECKING:
             "_classes": "describes_layout read_class",
             "_codec": "split_rows",
             "_text": "Field SI_SYMBOLS TYPES UNITS misfit_error",
-            "_texts": "pack_texts",
+            "_text_cells": "pack_texts",
             "_units": "ShownUnits units_of",
             "_yaml_files": "file_schema read_model",
-            "_yamls": "BadYamlError compose load",
+            "_yaml_parsing": "BadYamlError compose load",
         },
     )

@@ -87,7 +87,7 @@ def units_of(value: object, layout: Layout | None = None) -> Mapping[str, str]:
         try:
             spec = compile_text(read_class(kind).text, 0, lenient=False).spec
         except LayoutError:
-            return {}  # a class of another interpreter, which describes no layout
+            return {}  # its text is no layout: results of this class are interpreted otherwise
         return units_by_name(spec.head or spec.fields)
     dtype: Any = getattr(value, "dtype", None)
     return units_by_name(layout.fields) if layout and getattr(dtype, "names", None) else {}

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from smartcam._arguments import check_path, excerpt
 from smartcam._suggestions import did_you_mean, hint
 from smartcam.exceptions import ConfigurationError
-from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS, BadYamlError, compose, construct
+from smartcam.layout._yaml_parsing import MAX_YAML_TEXT_CHARACTERS, BadYamlError, compose, construct
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -165,7 +165,7 @@ def _mistakes_text(
     file_label: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]
 ) -> str:
     texts = [
-        # only the first line of a layout's error, which gives the position: a marker follows it
+        # of a layout's error only the first line, with the position; the others mark it by a caret
         ": ".join([f"line {_find_line(root, place)}", *_place_text(place), text.partition("\n")[0]])
         for place, text in itertools.islice(findings, _MAX_MISTAKES)
     ]
@@ -206,7 +206,7 @@ def _refuse_repeated_keys(root: Any, label: str) -> None:
             continue
         keys: set[str] = set()
         for key, value in cast("list[tuple[Any, Any]]", node.value):
-            # the text of another key would be as long as all values that its aliases stand for
+            # a list or mapping as a key is not shown: with its aliases it could be huge
             if key.id != "scalar":
                 raise ConfigurationError(
                     f"{label}, line {key.start_mark.line + 1}: expected a text as a key, got a "

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, Field
 
 from smartcam._extras import load
-from smartcam._json import object_text
+from smartcam._json import object_json
 from smartcam.exceptions import (
     ConfigurationError,
     EntryRefusedError,
@@ -353,7 +353,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             while self._unsent_states:
                 camera = self._unsent_states.pop()
                 try:
-                    text = object_text({"camera": camera, **self._states[camera]})
+                    text = object_json({"camera": camera, **self._states[camera]})
                     topic = self._topic("state", camera)
                     await client.publish(topic, text, qos=1, retain=True)
                 except BaseException:
@@ -385,7 +385,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             )
             properties.CorrelationData = correlation
         with contextlib.suppress(load("aiomqtt").MqttError):  # then the client gets no answer
-            await client.publish(topic, object_text(reply), qos=1, properties=properties)
+            await client.publish(topic, object_json(reply), qos=1, properties=properties)
 
     async def _carry_out(self, verb: str, camera: str, payload: object) -> dict[str, Any]:
         fields: dict[str, Any] = {"camera": camera}
@@ -410,7 +410,7 @@ def _entry_message(entry: OutletEntry) -> bytes:
         if '"camera":' not in entry.body
         else {"id": entry.id}
     )
-    return f"{object_text(head)[:-1]},{entry.body[1:]}".encode()
+    return f"{object_json(head)[:-1]},{entry.body[1:]}".encode()
 
 
 def _command_fields(payload: object) -> dict[str, Any]:

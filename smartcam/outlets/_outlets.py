@@ -7,7 +7,7 @@ import sqlite3
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._arguments import check_callable, check_kind, check_path
-from smartcam._json import object_text
+from smartcam._json import object_json
 from smartcam._server import Server
 from smartcam._switch_interval import restore_switch_interval, shorten_switch_interval
 from smartcam._user_code import ENDS_PROGRAM, text_of
@@ -185,7 +185,7 @@ class Outlets(Server):
     ) -> None:
         """Pass an error to the outlets; return at once."""
         fields = {"camera": camera, "error": error, "kind": kind, "triggered_at": triggered_at}
-        text = object_text(fields)
+        text = object_json(fields)
         for pump in self._pumps_for(camera):
             pump.offer(camera, at.timestamp(), len(text), lambda: ("error", None, text))
 
@@ -214,13 +214,13 @@ def _entry_content(
             result = result._replace(value=value, sequence=sequence)
         fields = result._asdict()
         del fields["raw"]
-        return "result", application, object_text(fields)
+        return "result", application, object_json(fields)
     except ENDS_PROGRAM:
         raise
     except BaseException as exc:  # noqa: BLE001 - an interpreter is a plug-in
         text = str(exc) if isinstance(exc, SmartCamError) else text_of(exc)
         failure = {"raw": result.raw, "error": text, "kind": type(exc).__name__}
-        return "error", application, object_text({**result._asdict(), "value": None, **failure})
+        return "error", application, object_json({**result._asdict(), "value": None, **failure})
 
 
 def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:

@@ -7,7 +7,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, overload
 
-from smartcam._arguments import check_instant, check_kind, check_path, check_text
+from smartcam._arguments import check_aware_datetime, check_kind, check_path, check_text
 from smartcam._extras import from_part
 from smartcam.exceptions import (
     ConfigurationError,
@@ -258,8 +258,8 @@ def load_recording(
         MissingExtraError: the library that inflates its chunks is not installed.
     """
     path = check_path(path, "path", "recording")
-    since = check_instant(since, "since", f"recording {path}")
-    until = check_instant(until, "until", f"recording {path}")
+    since = check_aware_datetime(since, "since", f"recording {path}")
+    until = check_aware_datetime(until, "until", f"recording {path}")
     found = _FolderScan(path, since, until)
     if not path.is_dir():
         found.add_file(_FileScan(path))

@@ -253,7 +253,7 @@ class Recorder(Observer):
         with contextlib.suppress(RecordingError):  # the first error is raised
             self.close()
 
-    def forked(self) -> None:
+    def on_fork(self) -> None:
         """Record nothing in a fork of the process that writes the file."""
         self._condition, self._failure = threading.Condition(), concurrent.futures.Future()
         self._thread, self._items, self._waiting_bytes = None, [], 0

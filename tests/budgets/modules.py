@@ -64,7 +64,7 @@ PARSERS_OF: dict[str, str] = {
     "layout._files": "layouts as YAML",
     "layout._tables": "containers: table",
     "layout._yaml_files": "scenarios",
-    "layout._yamls": "YAML",
+    "layout._yaml_parsing": "YAML",
     "outlets._mqtt": "MQTT: commands",
     "protocols._bvs": "frames of a camera, handbook",
     "protocols._framed.dialect": "frames of a camera, handbook",

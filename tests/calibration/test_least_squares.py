@@ -183,7 +183,7 @@ def test_nested_limit_stays_at_one_thread() -> None:
 def test_a_copy_in_a_fork_begins_anew() -> None:
     one = OneBlasThread()
     with one:
-        one.forked()
+        one.on_fork()
         with one:
             assert set(threads()) == {1}
     assert not one._depths  # a thread that was inside before the fork has no effect in the child

@@ -137,7 +137,7 @@ def test_sigma_in_pixels_becomes_metres_of_the_robot() -> None:
     seen_half = calibration.to_robot(half).pose.sigma
     assert seen_half is not None
     # half a pixel is a third of a millimetre there
-    beyond = np.sqrt(seen_half.place**2 - known.place**2)
+    beyond = np.sqrt(seen_half.worst_xy**2 - known.worst_xy**2)
     assert 0.8 < beyond / (0.5 * 0.5 / 750) < 1.3
     assert 0.009 < seen_half.theta < 0.012
 

@@ -220,7 +220,7 @@ def test_doctor_leaves_triggers_to_who_has_reserved_the_camera(fleet: str) -> No
 @pytest.mark.parametrize(
     ("args", "text"),
     [
-        (("probe",), "this wants the camera's own address, which begins with bvs://"),
+        (("probe",), "the camera's own address is needed here, which begins with bvs://"),
         (("status", "--trace", "frames.jsonl"), "frames of fleet://"),
         (("doctor", "--trace", "frames.jsonl"), "frames of fleet://"),
     ],

@@ -459,7 +459,7 @@ async def test_camera_at_the_wire_says_what_to_do() -> None:
     async with Plant() as plant, smartcam.connect(plant.box.url) as camera:
         assert "frames: URL" in str(await gone(camera.newest_frame()))
         assert "smartcam.frames.open" in str(await gone(camera.frame_after()))
-        with pytest.raises(UnsupportedError, match="at the wire"):
+        with pytest.raises(UnsupportedError, match="connected directly"):
             camera.frames()
 
 

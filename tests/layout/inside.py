@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from smartcam.layout import _compiled, _yaml_files, _yamls
+from smartcam.layout import _compiled, _yaml_files, _yaml_parsing
 from smartcam.layout._text import MAX_TEXT_CHARACTERS, parse_text
-from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS
+from smartcam.layout._yaml_parsing import MAX_YAML_TEXT_CHARACTERS

@@ -330,7 +330,7 @@ async def test_commands_of_the_table_are_answered() -> None:
             await camera.request("S")
         with pytest.raises(CommandRejectedError, match="not now"):
             await camera.request("I77?")
-        with pytest.raises(ConfigurationError, match="version is the dialect's"):
+        with pytest.raises(ConfigurationError, match="dialect fixes the protocol's version"):
             await camera.request("v01")
         with pytest.raises(UnsupportedError, match="ifm: dialect v3 has no Stop"):
             await camera.stop()

@@ -21,7 +21,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam._json import MIN_HEX_CHARACTERS as LONG
-from smartcam._json import object_text, plain, text_of
+from smartcam._json import json_of, object_json, plain
 from smartcam.interpreters import Context, resolve
 from smartcam.layout import Layout
 from smartcam.models import (
@@ -100,8 +100,8 @@ PART: Any = Localization("a", 1.0, 0, Pose(Header(1, at(1), "x"), Position(1, 2,
 @example({"value": [PART], "at": at(1), "raw": b"\x00\xff", "nan": [math.nan], "-": -0.0})
 def test_text_is_that_of_the_standard_library(fields: dict[str, Any]) -> None:
     text = json.dumps(jsonable(fields), separators=(",", ":"))
-    assert object_text(fields) == text_of(fields) == text
-    assert object_text(plain(fields)) == text
+    assert object_json(fields) == json_of(fields) == text
+    assert object_json(plain(fields)) == text
 
 
 COLUMNS = st.sampled_from(["<i2", ">i4", "u1", "<u8", "<f2", "<f4", ">f8", "?", "S3", "U2"])
@@ -124,7 +124,7 @@ def test_text_of_a_table_is_that_of_the_standard_library(
     dtype = np.dtype([*columns.items()])
     count = int(np.prod(shape))
     table = np.frombuffer(data, dtype=dtype, count=count).reshape(shape)
-    assert text_of(table) == json.dumps(jsonable(table), separators=(",", ":"))
+    assert json_of(table) == json.dumps(jsonable(table), separators=(",", ":"))
 
 
 @pytest.mark.parametrize(
@@ -133,9 +133,9 @@ def test_text_of_a_table_is_that_of_the_standard_library(
 def test_text_is_made_while_another_thread_imports_numpy(
     value: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = text_of(value)
+    text = json_of(value)
     monkeypatch.setitem(sys.modules, "numpy", types.ModuleType("numpy"))  # as it is at first
-    assert text_of(value) == json.dumps(jsonable(value), separators=(",", ":")) == text
+    assert json_of(value) == json.dumps(jsonable(value), separators=(",", ":")) == text
 
 
 @given(VALUES | st.lists(LOCALIZATIONS) | st.lists(VALUES | LOCALIZATIONS))

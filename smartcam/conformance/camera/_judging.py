@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from smartcam._arguments import check_all, check_kind, check_text
+from smartcam._arguments import check_iterable, check_kind, check_text
 from smartcam.conformance.camera._items import ITEMS
 from smartcam.conformance.camera._options import ConformanceOptions
 from smartcam.conformance.camera._raw_client import LinkClosedError
@@ -40,7 +40,7 @@ def judge(options: ConformanceOptions, names: Iterable[str] | None = None) -> Ca
     check_kind(options, ConformanceOptions, "options", "ConformanceOptions", "judge")
     wanted_names = None
     if names is not None:
-        name_list = check_all(names, "names", "names of checks", "judge")
+        name_list = check_iterable(names, "names", "names of checks", "judge")
         wanted_names = {check_text(name, "names", "judge") for name in name_list}
     unknown = sorted((wanted_names or set()) - {item.name for item in ITEMS})
     if unknown:

@@ -21,7 +21,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
-from smartcam._arguments import check_all, check_callable, check_path, check_text
+from smartcam._arguments import check_callable, check_iterable, check_path, check_text
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ class CommandClient(Client):
                 raise ConfigurationError(f"client command {text!r}: {exc}") from exc
         else:
             expected = "a text, or the program and its arguments"
-            values = check_all(command, "client command", expected)
+            values = check_iterable(command, "client command", expected)
             words = [check_text(text, "client command") for text in values]
         self._template = words
         self._cwd = None if cwd is None else str(check_path(cwd, "cwd", "client command"))

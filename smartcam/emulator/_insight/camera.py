@@ -14,10 +14,10 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from smartcam._arguments import (
-    check_all,
     check_application_or_name,
     check_flag,
     check_integer,
+    check_iterable,
     check_seconds,
     check_text,
     check_texts,
@@ -119,7 +119,7 @@ class EmulatedInSight(LineCamera):
         model = check_text(model, "model", owner, least=1, most=100)
         if active is not None:
             active = check_application_or_name(active, "active", owner)
-        jobs = check_all(jobs, "jobs", "a list of jobs", owner)
+        jobs = check_iterable(jobs, "jobs", "a list of jobs", owner)
         users, evaluations, info = (
             None if given is None else check_texts(given, option, owner)
             for option, given in (("users", users), ("evaluations", evaluations), ("info", info))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from smartcam._arguments import check_all, check_text
+from smartcam._arguments import check_iterable, check_text
 from smartcam._suggestions import did_you_mean
 from smartcam.emulator._application import Application, make_application
 from smartcam.emulator._bvs.quirks import Quirks
@@ -54,11 +54,11 @@ def make_plan(
         base = load_scenario(scenario, dialect=changes.get("dialect"))
     if "quirks" in changes:
         changes["quirks"] = validated(Quirks, changes["quirks"], "quirks")
-    checked = check_all(applications, "applications", "a list of applications", "emulator")
+    checked = check_iterable(applications, "applications", "a list of applications", "emulator")
     added = [make_application(application) for application in checked]
     ids = {application.id for application in added}
     changes["applications"] = (*added, *(a for a in base.applications if a.id not in ids))
-    timeline = check_all(timeline, "timeline", "a list of cues", "emulator")
+    timeline = check_iterable(timeline, "timeline", "a list of cues", "emulator")
     cues = (validated(Cue, cue, f"cue {number}") for number, cue in enumerate(timeline, start=1))
     changes["timeline"] = (*base.timeline, *cues)
     plan = base.model_copy(update=changes)

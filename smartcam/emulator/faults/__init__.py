@@ -39,7 +39,7 @@ from pydantic import (
     model_validator,
 )
 
-from smartcam._arguments import check_all
+from smartcam._arguments import check_iterable
 from smartcam.emulator._data import Seconds
 from smartcam.emulator.faults._base import (
     MAX_BYTES,
@@ -521,7 +521,7 @@ def make_faults(given: Iterable[BaseFault | Mapping[str, Any]]) -> tuple[Fault, 
             the field.
     """
     converted: list[Fault] = []
-    faults = check_all(given, "faults", "a list of faults", "emulator")
+    faults = check_iterable(given, "faults", "a list of faults", "emulator")
     for number, fault in enumerate(faults, start=1):
         try:
             converted.append(_ADAPTER.validate_python(fault))

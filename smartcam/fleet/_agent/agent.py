@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from smartcam._arguments import check_moment, check_seconds
+from smartcam._arguments import check_clock_seconds, check_seconds
 from smartcam._client._inside import new_tuple
 from smartcam._finishing import close_all
 from smartcam.exceptions import (
@@ -673,7 +673,7 @@ class Agent:
             timeout = check_seconds(timeout, "timeout", host.name)
             if deadline is not None:
                 remaining = (
-                    check_moment(deadline, "deadline", host.name)
+                    check_clock_seconds(deadline, "deadline", host.name)
                     + reply_grace(timeout) / 2
                     - agent_clock()
                 )

@@ -11,10 +11,10 @@ from smartcam._arguments import (
     check_age,
     check_application,
     check_application_or_name,
+    check_clock_seconds,
     check_flag,
     check_integer,
     check_message_id,
-    check_moment,
     check_text,
     wrong_argument,
 )
@@ -284,7 +284,7 @@ async def _frame(call: ProgramCall) -> Answer:
     return await call.host.frames.send_frame(
         _frame_order(call),
         max_age=call.argument("max_age", check_age),
-        after=call.argument("after", check_moment),
+        after=call.argument("after", check_clock_seconds),
         fresh=bool(call.argument("fresh", check_flag)),
     ), []
 
@@ -375,7 +375,7 @@ async def _hello(call: ProgramCall) -> Answer:
 async def _find(call: ProgramCall) -> Answer:
     """Return the number of the first result since a time of the agent's clock."""
     results = call.host.results
-    since = call.required("since", check_moment)
+    since = call.required("since", check_clock_seconds)
     return {"first": results.first_since(since), "following": results.following}, []
 
 

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
 from smartcam._client._inside import Interpretation
-from smartcam._json import object_text
+from smartcam._json import object_json
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._program.program_name import in_words
 from smartcam.fleet._program.reading import result_fields, split_run
@@ -34,7 +34,7 @@ Kind = Literal["results", "status", "events"]
 
 def as_json(fields: Mapping[str, object]) -> bytes:
     """Return fields as JSON in UTF-8."""
-    return object_text(fields).encode()
+    return object_json(fields).encode()
 
 
 class Topics:

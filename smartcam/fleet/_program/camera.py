@@ -847,7 +847,7 @@ class FleetCamera(Camera[ValueT]):
         self, encoding: StreamEncoding = "raw", quality: int | None = None
     ) -> FrameSource:
         """Return the source that :meth:`frames` reads, for several readers; not opened yet."""
-        form = self._check_form(encoding, quality, STREAM_ENCODINGS)
+        form = self._check_encoding(encoding, quality, STREAM_ENCODINGS)
         return self._frame_source(
             StreamRequest(*form, bitrate=None, latency=None, decode=True, timeout=FRAME_TIMEOUT)
         )

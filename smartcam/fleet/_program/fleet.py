@@ -14,8 +14,8 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Generic
 
 from smartcam._arguments import (
+    check_aware_datetime,
     check_flag,
-    check_instant,
     check_integer,
     check_seconds,
     check_text,
@@ -548,7 +548,7 @@ class Fleet:
         Cancellation: safe.
         """
         owner = "stored_results"
-        at = check_instant(since, "since", owner)
+        at = check_aware_datetime(since, "since", owner)
         request = StoredRequest(
             since=None if at is None else at.astimezone(UTC).isoformat(),
             failed=check_flag(failed, "failed", owner),

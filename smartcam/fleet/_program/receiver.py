@@ -88,9 +88,11 @@ class FleetListeners(Listeners):
         self._wanted_since[future] = clock
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
-        horizon = self.results.horizon
+        offered_at = self.results.offered_at
         later_waits = [
-            wait for wait in self._next_results if self._wanted_since.get(wait, -math.inf) > horizon
+            wait
+            for wait in self._next_results
+            if self._wanted_since.get(wait, -math.inf) > offered_at
         ]
         taken = super()._take_next_results()
         if later_waits:
@@ -104,10 +106,10 @@ class FleetListeners(Listeners):
         A stream that was started while these results came cannot know how many of them it should
         have got: it counts all of them.
         """
-        self.results.horizon = math.inf if following is None else following.clock
+        self.results.offered_at = math.inf if following is None else following.clock
         for stream in self.results:
             stream.miss(count)
-        self.results.horizon = math.inf
+        self.results.offered_at = math.inf
 
 
 class OwnTrigger:
@@ -439,7 +441,7 @@ class Receiver:
     def _pass_run(self, run: ResultRun) -> None:
         """Pass results to the listeners that came before these results."""
         listeners = self._listeners
-        listeners.results.horizon = run.clock
+        listeners.results.offered_at = run.clock
         try:
             now = asyncio.get_running_loop().time()
             own_trigger = (
@@ -467,7 +469,7 @@ class Receiver:
                 self._counters.count(fate)
                 self._offer(single, outcome, now, owned=False)
         finally:
-            listeners.results.horizon = math.inf
+            listeners.results.offered_at = math.inf
 
     def _offer(
         self, run: ResultRun, outcome: Result | InterpretationError, now: float, *, owned: bool

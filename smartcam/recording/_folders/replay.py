@@ -7,7 +7,7 @@ import contextlib
 import functools
 from typing import TYPE_CHECKING, Any
 
-from smartcam._arguments import check_all, check_callable, check_flag, check_text
+from smartcam._arguments import check_callable, check_flag, check_iterable, check_text
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.recording._reader import check_recording
@@ -64,7 +64,7 @@ class FleetReplay(Server):
     ) -> None:
         check_recording(recording, "replay")
         if cameras is not None:
-            given = check_all(cameras, "cameras", "names of cameras", "replay")
+            given = check_iterable(cameras, "cameras", "names of cameras", "replay")
             cameras = [check_text(camera, "cameras", "replay") for camera in given]
         speed, loop = check_speed(speed), check_flag(loop, "loop", "replay")
         self._recording, self._listen = recording, check_text(listen, "listen", "replay", least=1)

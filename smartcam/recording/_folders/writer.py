@@ -102,7 +102,7 @@ class FolderWriter:
         self._thread: threading.Thread | None = None
         notify_of_forks(self)
 
-    def forked(self) -> None:
+    def on_fork(self) -> None:
         """Write nothing in a fork of the process that has the folder; leave out all records."""
         self._condition, self._waiting = threading.Condition(), _DiskQueue()
         self._thread, self._is_closing = None, True

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 from smartcam._extras import load
-from smartcam._json import object_text
+from smartcam._json import object_json
 from smartcam.models import (
     ApplicationChanged,
     CameraEvent,
@@ -260,11 +260,11 @@ def _event_text(event: CameraEvent) -> str:
     if previous is not None:
         name = "previous_status" if isinstance(event, StatusChanged) else "previous_application"
         fields[name] = previous
-    return object_text({"event": type(event).__name__, **fields})
+    return object_json({"event": type(event).__name__, **fields})
 
 
 def _error_text(error: RecordedError) -> str:
-    return object_text(_object(error))
+    return object_json(_object(error))
 
 
 # ---------------------------------------------------------------------- from JSON

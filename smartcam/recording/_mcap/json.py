@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from smartcam._json import NULL, hex_text, text_of
+from smartcam._json import NULL, hex_json, json_of
 from smartcam.observers import TraceEntry
 from smartcam.protocols.messages import Sender
 
@@ -36,13 +36,13 @@ def frame_text(entry: TraceEntry) -> str:
         if type(end) is str and end and data.endswith(end) and len(data) % 2 == len(end) % 2 == 0:
             data_from = (len(data) - len(end)) // 2
             fields = {name: value for name, value in fields.items() if name != "data"}
-    number = "" if message_id is None else f'"message_id":{text_of(message_id)},'
-    body = "" if fields is None else f'"fields":{text_of(fields)},'
-    data_text = hex_text(data) if type(data) is str else text_of(data)
+    number = "" if message_id is None else f'"message_id":{json_of(message_id)},'
+    body = "" if fields is None else f'"fields":{json_of(fields)},'
+    data_text = hex_json(data) if type(data) is str else json_of(data)
     data_from_text = "" if data_from is None else f',"data_from":{data_from}'
     return (
-        f'{{"at":{text_of(at)},"camera":{text_of(camera)},"direction":{text_of(direction)},'
-        f'{number}"message":{text_of(message)},{body}"hex":{data_text}{data_from_text}}}'
+        f'{{"at":{json_of(at)},"camera":{json_of(camera)},"direction":{json_of(direction)},'
+        f'{number}"message":{json_of(message)},{body}"hex":{data_text}{data_from_text}}}'
     )
 
 
@@ -89,7 +89,7 @@ class FrameTexts:
         if cached is None:
             entry = raw.entry()
             text = frame_text(entry)
-            time_text = f'{{"at":{text_of(at)}'
+            time_text = f'{{"at":{json_of(at)}'
             end = f'","data_from":{len(entry.hex) // 2 - len(payload) + data_offset}}}'
             if text.startswith(time_text) and text.endswith(data + end):
                 if len(self._cached_texts) >= MAX_CACHED_FRAME_TEXTS:
@@ -97,7 +97,7 @@ class FrameTexts:
                 start = text[len(time_text) : len(text) - len(data) - len(end)]
                 self._cached_texts[key] = start, end, dialect
             return text, data_of(entry)
-        start, end = f'{{"at":{text_of(at)}{cached[0]}', cached[1]
+        start, end = f'{{"at":{json_of(at)}{cached[0]}', cached[1]
         properties = at, camera, dialect, sender, message_id, len(payload), payload[:data_offset]
         self._last = (*properties, start, end)
         return f"{start}{data}{end}", data
@@ -130,22 +130,22 @@ def result_text(result: Result[Any], raw_frame: int | None = None) -> str:
             write ``raw`` itself.
     """
     camera, application, sequence, number, triggered_at, received_at, latency, raw, value = result
-    text = f'{{"camera":{text_of(camera)},"application":{text_of(application)}'
+    text = f'{{"camera":{json_of(camera)},"application":{json_of(application)}'
     if sequence is not None:
-        text += f',"sequence":{text_of(sequence)}'
-    text += f',"number":{text_of(number)}'
+        text += f',"sequence":{json_of(sequence)}'
+    text += f',"number":{json_of(number)}'
     if triggered_at is not None:
-        text += f',"triggered_at":{text_of(triggered_at)}'
-    text += f',"received_at":{text_of(received_at)}'
-    if latency is not None and (field_text := text_of(latency)) != NULL:
+        text += f',"triggered_at":{json_of(triggered_at)}'
+    text += f',"received_at":{json_of(received_at)}'
+    if latency is not None and (field_text := json_of(latency)) != NULL:
         text += f',"latency":{field_text}'
     if raw_frame is None:
-        text += f',"raw":{text_of(raw)}'
+        text += f',"raw":{json_of(raw)}'
     if value is raw:
         end = f',"value_from":{VALUE_IS_RAW}}}'
     else:
         end = "}"
-        field_text = text_of(value)
+        field_text = json_of(value)
         if field_text != NULL:
             text += f',"value":{field_text}'
     if raw_frame is not None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from smartcam._client._inside import localizations_of
-from smartcam._json import text_of
+from smartcam._json import json_of
 from smartcam.exceptions import RosMessageError
 from smartcam.ros2._cameras.reading import (
     calibration_of,
@@ -201,7 +201,7 @@ class ResultMessages:
         text, error = "", ""
         if parts is None and not isinstance(result.value, bytes):
             try:
-                text = text_of(result.value)
+                text = json_of(result.value)
             except Exception as exc:  # noqa: BLE001 - a plug-in's value
                 error = utf8(f"the value is no JSON: {exc!r:.200}")
         return self._classes.Result(

@@ -11,7 +11,7 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._client._inside import has_pixel_positions
-from smartcam._json import object_text
+from smartcam._json import object_json
 from smartcam._thesis import MAX_TIMEOUT, THESIS, spec_of_text
 from smartcam._thesis_calibration import CALIBRATION
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
@@ -167,7 +167,7 @@ class CameraServices:
     # ------------------------------------------------------------------ std_srvs
 
     async def _trigger(self, _: object) -> str:
-        return object_text((await self._camera.trigger())._asdict())
+        return object_json((await self._camera.trigger())._asdict())
 
     async def _start(self, _: object) -> str:
         await self._camera.start()

@@ -95,7 +95,7 @@ class RosThesisCamera:
 
     def read_as(self, spec: str | None) -> None:
         """Interpret results by ``spec`` from now on; None: by the settings."""
-        self._camera._read_by(spec)  # noqa: SLF001 - smartcam's own
+        self._camera._set_interpreter(spec)  # noqa: SLF001 - smartcam's own
 
     def is_calibrated(self, application: int) -> bool:
         """Return True if an application has a calibration to a robot's frame."""

@@ -63,9 +63,9 @@ def test_text_becomes_the_fields_bytes(field: str, text: str, data: bytes) -> No
         ("real32", "0x10", "no number"),
         ("real32", "1e39", "too large"),
         ("real64", "1e999", "too large"),
-        ("string[3]", "four", "at most 3 bytes of UTF-8 were expected"),
-        ("string[3]", "\xb0\xb0", "at most 3 bytes of UTF-8 were expected"),
-        ("string[3]", "a\0", "at most 3 bytes of UTF-8 were expected"),
+        ("string[3]", "four", "at most 3 bytes of UTF-8 without a zero were expected"),
+        ("string[3]", "\xb0\xb0", "at most 3 bytes of UTF-8 without a zero were expected"),
+        ("string[3]", "a\0", "at most 3 bytes of UTF-8 without a zero were expected"),
     ],
 )
 def test_text_that_is_no_value_names_field_and_cell(field: str, text: str, why: str) -> None:

@@ -57,6 +57,7 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
             ) from exc
         parts.append(part)
         offset += len(part)
+        # the head's field that counts the records
         if index < len(layout.head) and field.name == layout.repeat and text is not None:
             used_count = len(layout.head) + _parse_integer(text) * len(layout.fields)
     return b"".join(parts)
@@ -64,11 +65,11 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
 
 def _cell_fields(layout: Layout, count: int) -> Sequence[Field]:
     """Return the field of each of ``count`` cells; raise InterpretationError if they do not fit."""
-    records = layout.repeat
-    if not isinstance(records, int):
+    record_count = layout.repeat  # a number, the name of the field that counts them, or None
+    if not isinstance(record_count, int):
         cells_of_records = max(0, count - len(layout.head))
-        records = 1 if records is None else -(-cells_of_records // len(layout.fields))
-    expected = len(layout.head) + records * len(layout.fields)
+        record_count = 1 if record_count is None else -(-cells_of_records // len(layout.fields))
+    expected = len(layout.head) + record_count * len(layout.fields)
     if expected != count:
         cause = "" if count else "; ?cells=B2,C2 in the URL names those that are read"
         raise InterpretationError(
@@ -76,7 +77,7 @@ def _cell_fields(layout: Layout, count: int) -> Sequence[Field]:
             expected=expected,
             got=count,
         )
-    return (*layout.head, *layout.fields * records)
+    return (*layout.head, *layout.fields * record_count)
 
 
 def _pack_field(field: Field, text: str | None) -> bytes:
@@ -86,7 +87,7 @@ def _pack_field(field: Field, text: str | None) -> bytes:
     if field.type == "string":
         raw = text.encode()
         if len(raw) > field.size or b"\0" in raw:
-            raise ValueError(f"at most {field.size} bytes of UTF-8 were expected")
+            raise ValueError(f"at most {field.size} bytes of UTF-8 without a zero were expected")
         return raw.ljust(field.size, b"\0")
     if field.type == "bool":
         number = _parse_integer(text)

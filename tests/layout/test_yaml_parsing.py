@@ -14,7 +14,7 @@ from smartcam.layout import Layout
 from smartcam.layout._inside import BadYamlError, load
 from tests.layout.bombs import laughs, merges
 from tests.layout.inside import _yaml_files as yaml_files
-from tests.layout.inside import _yamls as yamls
+from tests.layout.inside import _yaml_parsing as yamls
 
 
 @pytest.mark.parametrize("text", [laughs(30), merges(40), laughs(9), "- a\n" * 6000])
