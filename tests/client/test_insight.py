@@ -200,7 +200,7 @@ async def test_connect_to_something_else_says_what_came() -> None:
         ),
         ("insight://h?cells=a-b", "'a-b' is no name of a cell"),
         ("insight://op:%E2%82%AC@h", "'insight://op:***@h': password: only Latin-1"),
-        ("insight://op:se#cret@h", "'insight://op:***@h' is no URL; in a password each of / ? #"),
+        ("insight://op:se#cret@h", "'insight://op:***@h' is no URL; in a password write / ? #"),
         ("insight://op:cret@h:x", "'insight://op:***@h:x' is no URL"),
         ("insight://op%0A@h", "user: only Latin-1 without line ends can be sent"),
         ("insight://h?dialect=native&quirks=loud", "dialect native has no quirk 'loud'"),
