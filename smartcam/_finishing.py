@@ -37,14 +37,21 @@ async def finish(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
 async def close_all(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -> None:
     """Close several resources at the same time; each closing has to be bounded and idempotent.
 
-    If the task of one is cancelled, perhaps before its first step, the caller closes that resource.
+    If the task of one is cancelled, perhaps before its first step, the calling task closes that
+    resource.
 
     Raises:
         Exception: the first error; raised when all have ended.
 
     Cancellation: passed on to each; takes effect when all have ended.
     """
-    closing = {asyncio.ensure_future(close()): close for close in closes}
+    begun: set[Callable[[], Coroutine[Any, Any, None]]] = set()
+
+    async def run(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        begun.add(close)
+        await close()
+
+    closing = {asyncio.ensure_future(run(close)): close for close in closes}
     if not closing:
         return
     try:
@@ -53,6 +60,9 @@ async def close_all(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -
         for task in closing:
             task.cancel()
         await asyncio.wait(closing)
+        for close in closing.values():
+            if close not in begun:  # somebody cancelled all tasks at once
+                await close()
         raise
     for task, close in closing.items():
         if task.cancelled():
