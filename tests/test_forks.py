@@ -149,6 +149,23 @@ with tempfile.TemporaryDirectory() as folder:
     )
 
 
+def test_types_of_ros_whose_lock_was_held_are_there_in_a_fork() -> None:
+    run(
+        """
+from smartcam.ros2 import RosTypes
+
+types = RosTypes()
+held(types._shared._lock)
+
+def child():
+    types.message("std_msgs/msg/String")
+    types.add("here/msg/Own", "int32 n")
+
+in_a_fork(child)
+"""
+    )
+
+
 def test_value_that_another_thread_makes_is_made_in_a_fork_too() -> None:
     run(
         """

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam._forks import cached_property
+from smartcam._forks import cached_property, notify_of_forks
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, RosMessageError
 from smartcam.ros2._types.built_in import MESSAGES, SERVICES
@@ -277,6 +277,11 @@ class RosTypes:
         self._added: dict[str, str] = {}
         self._messages: dict[str, MessageType] = {}
         self._services: dict[str, ServiceType] = {}
+        notify_of_forks(self)
+
+    def on_fork(self) -> None:
+        """Take a new lock: another thread may have held the old one when this process forked."""
+        self._lock = threading.RLock()
 
     def __repr__(self) -> str:
         return f"<RosTypes {self.distribution}>"
