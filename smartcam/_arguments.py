@@ -85,16 +85,16 @@ def wrong_argument(name: str, expected: str, value: object, owner: str = "") -> 
 
 
 def check_integer(
-    value: object, name: str, least: int, most: int | None = None, owner: str = ""
+    value: object, name: str, minimum: int, maximum: int | None = None, owner: str = ""
 ) -> int:
-    """Return an integer from ``least`` to ``most``; None: without an upper limit.
+    """Return an integer from ``minimum`` to ``maximum``; None: without an upper limit.
 
     Integers of numpy and others with ``__index__`` are accepted, ``bool`` is not.
     """
     number = value if type(value) is int else _as_integer(value)
-    if number is None or number < least or (most is not None and number > most):
-        up_to = "or more" if most is None else f"to {most}"
-        raise wrong_argument(name, f"an integer, {least} {up_to}", value, owner)
+    if number is None or number < minimum or (maximum is not None and number > maximum):
+        up_to = "or more" if maximum is None else f"to {maximum}"
+        raise wrong_argument(name, f"an integer, {minimum} {up_to}", value, owner)
     return number
 
 
@@ -129,21 +129,21 @@ def as_plain_value(value: object) -> object:
 def check_number(
     value: object,
     name: str,
-    least: float,
-    most: float,
+    minimum: float,
+    maximum: float,
     owner: str = "",
     *,
     exclusive: bool = False,
     unit: str = "a number",
 ) -> float:
-    """Return a finite number from ``least`` to ``most``; with ``exclusive`` not ``least`` itself.
+    """Return a finite number in bounds; with ``exclusive`` not ``minimum`` itself.
 
     Numbers of numpy and fractions are accepted; ``bool``, texts and arrays are not.
     """
     number = value if type(value) is float else _as_float(value)
-    if number is None or not least <= number <= most or (exclusive and number == least):
+    if number is None or not minimum <= number <= maximum or (exclusive and number == minimum):
         raise wrong_argument(
-            name, f"{unit}, {'above ' if exclusive else ''}{least:g} to {most:g}", value, owner
+            name, f"{unit}, {'above ' if exclusive else ''}{minimum:g} to {maximum:g}", value, owner
         )
     return number
 

@@ -35,7 +35,7 @@ _NUMBER = r"(\d{1,12}(?:\.\d{1,6})?)"
 _PATTERN = re.compile(r"[a-z0-9_*-]+(?:/[a-z0-9_*-]+)*", re.ASCII)
 
 
-def _amount(units: Mapping[str, int], least: float, most: float, example: str) -> Any:
+def _amount(units: Mapping[str, int], minimum: float, maximum: float, example: str) -> Any:
     """Return a validator of numbers; their unit may be missing, and in upper or lower case."""
     factors = {unit.lower(): factor for unit, factor in units.items()}
     text = re.compile(rf"{_NUMBER} ?([a-z]+)", re.ASCII)
@@ -53,8 +53,10 @@ def _amount(units: Mapping[str, int], least: float, most: float, example: str) -
                 f"expected a number with a unit, such as {example!r}; units are "
                 f"{', '.join(units)}; got {given!r:.60}"
             )
-        if not least <= value <= most:
-            raise ValueError(f"expected {least:g} to {most:g} {next(iter(units))}, got {value:g}")
+        if not minimum <= value <= maximum:
+            raise ValueError(
+                f"expected {minimum:g} to {maximum:g} {next(iter(units))}, got {value:g}"
+            )
         return value
 
     return PlainValidator(read)

@@ -288,7 +288,7 @@ class LoopThread:
         """Note that this process is a fork; the thread, if any, belongs to its parent."""
         self._forked = self._thread is not None
 
-    def call(
+    def run_coroutine(
         self, function: Callable[[], Coroutine[Any, Any, T]], timeout: float | None = None
     ) -> T:
         """Call a function in the thread, and run the coroutine that it returns to its end.
@@ -307,8 +307,8 @@ class LoopThread:
         """
         return cast("T", self._call(function, timeout))
 
-    def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in the thread and return its value; errors as of :meth:`call`."""
+    def call_function(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function in the thread and return its value; errors as :meth:`run_coroutine`."""
         return cast("T", self._call(lambda: function(*args, **kwargs), CALL_TIMEOUT))
 
     def _call(self, function: Callable[[], object], timeout: float | None) -> Any:
@@ -323,7 +323,7 @@ class LoopThread:
         return call.result()
 
     def submit(self, work: Coroutine[Any, Any, T]) -> Future[T]:
-        """Start a coroutine in the thread without waiting; errors as of :meth:`call`."""
+        """Start a coroutine in the thread without waiting; errors as of :meth:`run_coroutine`."""
         try:
             self._refuse_fork()
             if self._loop is None:

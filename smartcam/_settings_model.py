@@ -25,8 +25,8 @@ PLAIN = BeforeValidator(as_plain_value)
 """Lets a strict type accept numbers and texts of any class, such as numpy's."""
 
 
-def _integer(least: int, most: int) -> Any:
-    return Annotated[int, Field(strict=True, ge=least, le=most), PLAIN]
+def _integer(minimum: int, maximum: int) -> Any:
+    return Annotated[int, Field(strict=True, ge=minimum, le=maximum), PLAIN]
 
 
 Seconds = Annotated[

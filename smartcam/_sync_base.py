@@ -168,11 +168,11 @@ class SyncCameraBase(Generic[ValueT]):
                 f"{self.name}: smartcam.sync would hold up the event loop that runs here; "
                 f'in it: async with smartcam.connect("{self.url}") as camera'
             )
-        return self._thread.call(lambda: function(*args, **kwargs))
+        return self._thread.run_coroutine(lambda: function(*args, **kwargs))
 
     def _do(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Call a function, which does not wait, in the event loop."""
-        return self._thread.run(function, *args, **kwargs)
+        return self._thread.call_function(function, *args, **kwargs)
 
     def _subscribed(
         self, subscribe: Callable[P, Any], *args: P.args, **kwargs: P.kwargs
@@ -264,11 +264,11 @@ class SyncSubscription(Generic[ItemT]):
 
     def statistics(self) -> SubscriberStatistics:
         """Return the numbers of offered, taken, dropped and queued items so far."""
-        return self._thread.run(self._subscription.statistics)
+        return self._thread.call_function(self._subscription.statistics)
 
     def close(self) -> None:
         """Unsubscribe; queued items count as dropped. Idempotent."""
-        self._thread.run(self._subscription.close)
+        self._thread.call_function(self._subscription.close)
 
     def get(self, timeout: float) -> ItemT:
         """Return the next item.
@@ -308,7 +308,7 @@ class SyncSubscription(Generic[ItemT]):
                 f"{self._camera.name}: smartcam.sync would hold up the event loop that runs here; "
                 "in it: async for item in a stream of smartcam.connect(...)"
             )
-        item = self._thread.call(lambda: self._next_item(timeout))
+        item = self._thread.run_coroutine(lambda: self._next_item(timeout))
         if item is _END:
             raise StopIteration
         return cast("ItemT", item)

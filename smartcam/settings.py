@@ -412,9 +412,9 @@ _BOUNDS: dict[str, tuple[type[float], float, float]] = {
 def _accept_usual(option: str, value: Any) -> Any:
     """Return an option's plain value if it is certainly valid, else ``_UNUSUAL``."""
     if option in _BOUNDS:
-        kind, least, most = _BOUNDS[option]
+        kind, minimum, maximum = _BOUNDS[option]
         if type(value) is kind or (kind is float and type(value) is int):
-            return kind(value) if least <= value <= most else _UNUSUAL
+            return kind(value) if minimum <= value <= maximum else _UNUSUAL
         is_allowed_none = value is None and option in {"application", "liveness_timeout"}
         return None if is_allowed_none else _UNUSUAL
     if option == "name":

@@ -72,7 +72,7 @@ def test_sync_without_eventfd(monkeypatch: pytest.MonkeyPatch) -> None:
     thread = _loop_thread.LoopThread("as on Windows")
     thread.start()
     try:
-        assert thread.call(lambda: asyncio.sleep(0, "done")) == "done"
+        assert thread.run_coroutine(lambda: asyncio.sleep(0, "done")) == "done"
     finally:
         thread.stop()
 

@@ -361,10 +361,10 @@ class Requests:
     def _unsent_error(self, message: m.Message) -> ResponseTimeoutError:
         return self._timeout_error(message, "could not send", "in time: an earlier answer is owed")
 
-    def _timeout_error(self, message: m.Message, failure: str, why: str) -> ResponseTimeoutError:
+    def _timeout_error(self, message: m.Message, failure: str, reason: str) -> ResponseTimeoutError:
         dialect = self._connection.dialect
         return ResponseTimeoutError(
-            f"{self.name}: {failure} {dialect.message_label(message)} {why}; "
+            f"{self.name}: {failure} {dialect.message_label(message)} {reason}; "
             f"status: {self._state.status}",
             message_id=dialect.message_id(message),
         )

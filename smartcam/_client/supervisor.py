@@ -207,9 +207,9 @@ class Supervisor:
                         return
                     await changed.wait()
         except TimeoutError as exc:
-            why = self._counters.last_error or "none yet"
+            last_error = self._counters.last_error or "none yet"
             raise ResponseTimeoutError(
-                f"{self._name}: no session within {timeout:g} s; the last error: {why}",
+                f"{self._name}: no session within {timeout:g} s; the last error: {last_error}",
                 waited=timeout,
             ) from exc
 

@@ -551,9 +551,9 @@ local function dissect(tvb, pinfo, tree, datagram)
     offset = offset + size
   end
   while offset < length do
-    local head, why = head_at(stream, tvb, offset)
+    local head, reason = head_at(stream, tvb, offset)
     local size = head and head.dialect.header + head.size
-    if (head and offset + size > length) or why == "more" then
+    if (head and offset + size > length) or reason == "more" then
       if datagram or not whole or pinfo.can_desegment == 0 then
         refuse(length - offset, e.unfinished,
           whole and "the rest of the frame is missing" or "cut in the capture")

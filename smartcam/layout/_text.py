@@ -238,7 +238,7 @@ def misfit_error(
 ) -> InterpretationError:
     """Return the error for a value that does not match its field.
 
-    ``offset``: place of the value, bytes from the container's beginning. In the text, ``where``
+    ``offset``: offset of the value, bytes from the container's beginning. In the text, ``where``
     precedes the field and ``more`` follows ``expected``.
     """
     return InterpretationError(

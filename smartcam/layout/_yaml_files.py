@@ -51,8 +51,8 @@ def read_model(
         label: kind of the file for errors, such as ``scenario``.
         kind: pydantic model of the file's fields.
         such_as: name of a field, as an example for errors.
-        find_mistake: function that returns the place of a value that cannot work and the reason, or
-            None.
+        find_mistake: function that returns the path of keys to a value that cannot work, and the
+            reason; or None.
 
     Raises:
         ConfigurationError: the file cannot be read or a field of it is wrong; the text names file,
@@ -125,10 +125,10 @@ def _field_hint(kind: type[BaseModel], item: ErrorDetails) -> str:
     """Return a hint with the field or word that was probably meant."""
     if item["type"] != "extra_forbidden":
         return hint(item, ())
-    *place, _ = item["loc"]
+    *key_path, _ = item["loc"]
     schema = _schema(kind)
     branches = [*_branches(schema, schema)]
-    for part in place:
+    for part in key_path:
         children = [child for branch in branches for child in _child_schemas(schema, branch, part)]
         branches = children or branches  # pydantic's path also contains the types of a union
     return hint(
@@ -166,14 +166,16 @@ def _mistakes_text(
 ) -> str:
     texts = [
         # of a layout's error only the first line, with the position; the others mark it by a caret
-        ": ".join([f"line {_find_line(root, place)}", *_place_text(place), text.partition("\n")[0]])
-        for place, text in itertools.islice(findings, _MAX_MISTAKES)
+        ": ".join(
+            [f"line {_find_line(root, key_path)}", *_path_text(key_path), text.partition("\n")[0]]
+        )
+        for key_path, text in itertools.islice(findings, _MAX_MISTAKES)
     ]
     return f"{file_label}, {'; '.join(texts)}"
 
 
-def _place_text(place: Sequence[int | str]) -> list[str]:
-    return [".".join(str(part) for part in place)] if place else []
+def _path_text(key_path: Sequence[int | str]) -> list[str]:
+    return [".".join(str(part) for part in key_path)] if key_path else []
 
 
 def _find_line(node: Any, loc: Sequence[int | str]) -> int:

@@ -24,7 +24,7 @@ class LineReader:
         self._max_line = max_line
         self._encoding = encoding
         self._buffer = bytearray()
-        self._search_start = 0  # place where the search for a line end goes on
+        self._search_start = 0  # offset where the search for a line end goes on
 
     def __len__(self) -> int:
         """Return the number of bytes that are kept."""

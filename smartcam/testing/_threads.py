@@ -41,10 +41,10 @@ class _ThreadProxy:
     _target: object
 
     def __getattr__(self, name: str) -> Any:
-        value = self._thread.run(getattr, self._target, name)
+        value = self._thread.call_function(getattr, self._target, name)
         if not callable(value):
             return value
-        return lambda *args, **kwargs: self._thread.run(value, *args, **kwargs)
+        return lambda *args, **kwargs: self._thread.call_function(value, *args, **kwargs)
 
 
 @dataclass(eq=False, repr=False)
@@ -64,7 +64,7 @@ class _HostedInThread:
         if self._owns_thread:
             self._thread.start()
         try:
-            self._thread.call(self._hosted.start, CALL_TIMEOUT)
+            self._thread.run_coroutine(self._hosted.start, CALL_TIMEOUT)
         except BaseException:
             self.stop()
             raise
@@ -72,7 +72,7 @@ class _HostedInThread:
     def stop(self) -> None:
         """Stop the object in the thread; the log can still be read. Harmless when called twice."""
         try:
-            self._thread.call(self._hosted.stop, CALL_TIMEOUT)
+            self._thread.run_coroutine(self._hosted.stop, CALL_TIMEOUT)
         except ConfigurationError:
             return  # the object does not run
         finally:
@@ -232,11 +232,11 @@ class ThreadedCamera(_HostedInThread):
 
     def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
         """Add faults; as :meth:`~smartcam.emulator.EmulatedCamera.inject`."""
-        self._thread.run(self._emulator.inject, *faults)
+        self._thread.call_function(self._emulator.inject, *faults)
 
     def clear_faults(self) -> None:
         """Remove waiting faults, and end lasting ones."""
-        self._thread.run(self._emulator.clear_faults)
+        self._thread.call_function(self._emulator.clear_faults)
 
     def command(self, name: str) -> None:
         """Give a command of the timeline.
@@ -244,7 +244,7 @@ class ThreadedCamera(_HostedInThread):
         Raises:
             ConfigurationError: no cue has it.
         """
-        self._thread.run(self._emulator.command, name)
+        self._thread.call_function(self._emulator.command, name)
 
     def advance(self, seconds: float) -> None:
         """Advance the camera's manual clock; all events until the new time have happened on return.
@@ -255,11 +255,13 @@ class ThreadedCamera(_HostedInThread):
         clock = self._emulator.clock
         if not isinstance(clock, ManualClock):
             raise ConfigurationError("the emulator runs in real time: give it manual_clock=True")
-        self._thread.run(clock.advance, seconds)
+        self._thread.call_function(clock.advance, seconds)
 
     def run(self, function: Callable[..., T]) -> T:
         """Call ``function`` with the emulated camera, in its thread."""
-        return self._thread.run(check_callable(function, "function", "run"), self._emulator)
+        return self._thread.call_function(
+            check_callable(function, "function", "run"), self._emulator
+        )
 
     def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
@@ -272,7 +274,7 @@ class ThreadedCamera(_HostedInThread):
             ResponseTimeoutError: the messages did not come in time.
         """
         timeout = check_seconds(timeout, "timeout", "wait_received")
-        self._thread.call(
+        self._thread.run_coroutine(
             lambda: self._emulator.wait_received(what, count=count, timeout=timeout),
             timeout + CALL_TIMEOUT,
         )
@@ -307,7 +309,7 @@ class ThreadedCamera(_HostedInThread):
     def _call_in_thread(self, function: Callable[[], T]) -> T:
         """Call a function in the emulator's thread, or in this thread if that one has ended."""
         try:
-            return self._thread.run(function)
+            return self._thread.call_function(function)
         except ConfigurationError:
             return function()
 

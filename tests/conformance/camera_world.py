@@ -102,11 +102,11 @@ def emulated(
     emulator = EmulatedCamera(**given)
     if sin is not None:
         sin(emulator)
-    thread.call(emulator.start)
+    thread.run_coroutine(emulator.start)
     try:
         yield emulator
     finally:
-        thread.call(emulator.stop)
+        thread.run_coroutine(emulator.stop)
 
 
 def judge_case(thread: LoopThread, case: Case) -> CameraReport:

@@ -308,7 +308,9 @@ def test_judge_item_interrupted_puts_application_and_run_mode_back(
         camera = CameraUnderTest(short_options(emulator.url))
         with pytest.raises(KeyboardInterrupt):
             judge_item(camera, item)
-        thread.call(lambda: emulator.wait_received(m.Disconnect, count=2, timeout=60), timeout=120)
+        thread.run_coroutine(
+            lambda: emulator.wait_received(m.Disconnect, count=2, timeout=60), timeout=120
+        )
         assert emulator.device.active_application == APPLICATION
         assert emulator.device.running == (running or dialect == "bid")
         assert not emulator.has_session
@@ -320,7 +322,7 @@ def test_judge_camera_that_dies_says_what_could_not_be_put_back(thread: LoopThre
     def dies(camera: CameraUnderTest) -> None:
         with camera.session() as client:
             camera.ensure_stopped(client)
-            thread.call(emulator.stop)
+            thread.run_coroutine(emulator.stop)
             client.round_trip()
 
     item = Check(name="dies", about="", sources={"": "x, y"}, run=dies)

@@ -215,16 +215,16 @@ def test_suite_that_is_broken_off_leaves_the_camera_as_it_was(
             *("--pyargs", "smartcam.conformance.camera", "--camera-url", emulator.url),
             *("--camera-silence", "60", "-k", "second-stop"),
         )
-        thread.call(
+        thread.run_coroutine(
             lambda: emulator.wait_received(m.Stop, count=2, timeout=PATIENCE), timeout=2 * PATIENCE
         )
-        assert not thread.run(lambda: emulator.device.running)
+        assert not thread.call_function(lambda: emulator.device.running)
         process.send_signal(signal.SIGINT)
         printed, _ = process.communicate(timeout=PATIENCE)
         assert process.returncode == pytest.ExitCode.INTERRUPTED
         assert "at first: application 5, in run mode; restored" in printed
-        assert thread.run(lambda: emulator.device.running)
-        thread.call(
+        assert thread.call_function(lambda: emulator.device.running)
+        thread.run_coroutine(
             lambda: emulator.wait_received(m.Disconnect, count=3, timeout=PATIENCE),
             timeout=2 * PATIENCE,
         )

@@ -31,10 +31,10 @@ def test_the_judge_finds_no_difference_to_a_documented_camera(
     quirks = {"reboot_time": 0.2}
     device = SoftwareDevice(camera, dialect=dialect, transport=transport, quirks=quirks)
     with loop_thread() as thread:
-        thread.call(device.start)
+        thread.run_coroutine(device.start)
         try:
             report = judge(short_options(device.url, application=40, other_application=7))
         finally:
-            thread.call(device.stop)
+            thread.run_coroutine(device.stop)
     assert report.differing == []
     assert report.quirks["busy_while_processing"] is True

@@ -173,8 +173,8 @@ def test_call_that_does_not_return_is_given_up(monkeypatch: pytest.MonkeyPatch) 
 
     try:
         with pytest.raises(ResponseTimeoutError, match=r"smartcam.slow did not answer within 0.05"):
-            thread.call(for_ever, 0.05)
+            thread.run_coroutine(for_ever, 0.05)
         with pytest.raises(TimeoutError, match="its own"):
-            thread.call(too_late)
+            thread.run_coroutine(too_late)
     finally:
         thread.stop()

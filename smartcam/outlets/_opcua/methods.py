@@ -249,7 +249,7 @@ class Methods:
         return [self._id("RecipeIdInternalDataType", str(application))]
 
     async def _recipes(
-        self, external: Any, product: Any, prepared: int, most: int, first: int, timeout: int
+        self, external: Any, product: Any, prepared: int, max_count: int, first: int, timeout: int
     ) -> list[ua.Variant]:
         del timeout  # the answer does not need a handle
         ready, name = self._system.prepared_application, _text(external)
@@ -263,7 +263,7 @@ class Methods:
             if not name or name in (self._system.recipe_name(number), str(number))
             if not _text(product)
         ]
-        page = matching[first : first + _limit(most)]
+        page = matching[first : first + _limit(max_count)]
         listed = [self._values.identity("RecipeIdInternalDataType", str(number)) for number in page]
         complete = first + len(page) >= len(matching)
         return [_boolean(complete), _number(len(page)), _number(0), _list(listed)]
@@ -292,7 +292,7 @@ class Methods:
         return outputs
 
     async def _results(self, state: int, *arguments: Any) -> list[ua.Variant]:
-        *ids, most, first, timeout = arguments
+        *ids, max_count, first, timeout = arguments
         wanted = [
             (name, text)
             for name, filter_id in zip(_FILTERS, ids, strict=True)
@@ -309,7 +309,7 @@ class Methods:
                 for identity, text in zip(identities, texts, strict=True)
             )
 
-        limit = _limit(most)
+        limit = _limit(max_count)
         matching = self._book.find_results(self._nodes.name, matches)
         page = [*itertools.islice(matching, first, first + limit + 1)]
         listed = [kept.structure for kept in page[:limit]]

@@ -112,7 +112,7 @@ class StatusBits:
         return Status(status | remaining << self.unnamed_shift)
 
     def write(self, status: Status) -> int:
-        """Return the word on the wire; bits without a place there are left out."""
+        """Return the word on the wire; bits that are not there are left out."""
         if not self.unnamed_shift:
             return int(status)
         bits = int(status)
@@ -189,8 +189,8 @@ class Codec:
     @property
     def lengths(self) -> range:
         """The accepted lengths of a body."""
-        least = self.size if self._code is None else min(self._code.size, self.size)
-        return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS_BYTES + 1)
+        shortest = self.size if self._code is None else min(self._code.size, self.size)
+        return range(shortest, sys.maxsize if self.has_data else self.size + MAX_SURPLUS_BYTES + 1)
 
     def fits(self, size: int) -> bool:
         """Return True if a body has the documented length."""

@@ -634,7 +634,7 @@ class Machine:
         self._deliveries_left -= 1
         if len(results) > 1 or len(events) > MAX_KNOWN_DELIVERY_FRAMES:
             return
-        at, begin, end = len(events), len(buffer), len(buffer)  # place of the result's data
+        at, begin, end = len(events), len(buffer), len(buffer)  # position of the result's data
         make = None
         framer.start = 0
         for number in range(len(events)):

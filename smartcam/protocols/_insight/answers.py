@@ -28,7 +28,7 @@ MAX_IMAGE_BYTES = 1 << 26
 three bytes."""
 
 _BMP_MAGIC = b"BM"
-_BMP_SIZE_AT = slice(2, 6)  # place of the file's size, UINT32 little endian
+_BMP_SIZE_AT = slice(2, 6)  # offset of the file's size, UINT32 little endian
 
 
 class CommandAnswer(NamedTuple):
