@@ -85,7 +85,7 @@ ATTRIBUTES: dict[type[Exception], dict[str, Any]] = {
     e.FrameFormatError: SOURCE,
     e.FrameFeatureError: SOURCE,
     e.FrameTimeoutError: SOURCE,
-    e.EntryRefusedError: {"place": 3},
+    e.EntryRefusedError: {"index": 3},
     e.RemoteProtocolError: FRAME,
     e.FrameError: FRAME,
     e.MessageError: FRAME,
@@ -97,7 +97,7 @@ DEFAULTS: dict[str, Any] = {
     "text": "", "position": 0, "name": "", "extra": "", "host": "", "port": 0, "attempts": (),
     "message_id": None, "waited": 0.0, "code": 0, "active_application": None, "offset": 0,
     "data": b"", "field": "", "expected": None, "got": None, "source": "", "available": (),
-    "role": "", "certificate": "", "application": None, "tool": "", "place": 0,
+    "role": "", "certificate": "", "application": None, "tool": "", "index": 0,
 }  # fmt: skip
 
 SPECIAL: dict[tuple[type[Exception], str], Any] = {

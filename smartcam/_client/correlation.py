@@ -33,7 +33,7 @@ from typing import Literal
 from smartcam.models import Status
 
 OwedFate = Literal["late", "streamed"]
-"""How the result of a given-up trigger is counted when it arrives; streams get it in both cases."""
+"""Fate as which a given-up trigger's result is counted; streams get the result in both cases."""
 
 NUMBER_STEP = 1000
 """Step by which each trigger's number is lower than the number of the trigger before.

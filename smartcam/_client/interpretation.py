@@ -446,7 +446,7 @@ def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _ApplicationSetup:
-    """How one application's containers are interpreted.
+    """The way in which one application's containers are interpreted.
 
     Attributes:
         interpreter: interpreter of the containers.

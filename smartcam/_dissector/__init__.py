@@ -45,7 +45,7 @@ def lua_tables() -> dict[str, Any]:
     """Return the tables of the Lua code, as plain values by the names of the Lua variables."""
     dialects = BVS.dialects
     rows = [row for dialect in dialects.values() for row in dialect.table]
-    groups = BVS.detection[Transport.TCP]
+    tried = [dialect for group in BVS.detection[Transport.TCP] for dialect in group]
     return {
         "PORT": DEFAULT_PORT,
         "MAX_LENGTH": DEFAULT_MAX_LENGTH,
@@ -53,7 +53,7 @@ def lua_tables() -> dict[str, Any]:
         "STATUSES": [_status_name(member) for member in Status],
         "IDS": _names_by_id(rows),
         "DIALECTS": [_dialect_table(dialect) for dialect in dialects.values()],
-        "TRIED_TOGETHER": [[one.name, *one.quirks] for group in groups for one in group],
+        "TRIED_TOGETHER": [[dialect.name, *dialect.quirks] for dialect in tried],
     }
 
 

@@ -12,7 +12,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.gateway._counts import GatewayCounts
 from smartcam.gateway._lines import AnswerWriter
 from smartcam.gateway._link import RobotLink
-from smartcam.gateway._parts import PartConverter
+from smartcam.gateway._parts import Converter
 from smartcam.gateway._requests import GatewayCamera
 from smartcam.gateway._settings import GatewaySettings
 
@@ -46,7 +46,7 @@ class Gateway(Server):
 
     def __init__(self, camera: Camera, settings: GatewaySettings | None = None) -> None:
         self.settings: GatewaySettings = settings or GatewaySettings()
-        parts = PartConverter(self.settings, camera.settings.interpret_as)
+        parts = Converter(self.settings, camera.settings.interpret_as)
         self._counts = GatewayCounts()
         self._shared = GatewayCamera(camera, self.settings, parts, self._counts)
         self._writer = AnswerWriter(self.settings.style, parts.names)

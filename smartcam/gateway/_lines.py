@@ -90,11 +90,11 @@ class RobotAnswer(NamedTuple):
     text: str = ""
 
 
-class RequestTooLongError(ValueError):
+class TooLongError(ValueError):
     """A request is longer than :data:`MAX_LINE_BYTES`."""
 
 
-class AnswerError(ValueError):
+class WriteError(ValueError):
     """An answer is too long, or has a number that a controller cannot read."""
 
 
@@ -122,7 +122,7 @@ class RequestReader:
         """Add received bytes; return the requests that are complete now.
 
         Raises:
-            RequestTooLongError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
+            TooLongError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
         """
         data, requests = self._unread + data, []
         start = _skip_blanks(data, 0)
@@ -133,7 +133,7 @@ class RequestReader:
             start = _skip_blanks(data, end)
         self._unread = data[start:].lstrip(_BLANKS)
         if len(self._unread) > MAX_LINE_BYTES:
-            raise RequestTooLongError(f"a request has more than {MAX_LINE_BYTES} bytes")
+            raise TooLongError(f"a request has more than {MAX_LINE_BYTES} bytes")
         return requests
 
     def _find_end(self, data: bytes, start: int) -> int:
@@ -181,7 +181,7 @@ class AnswerWriter:
         """Return the bytes of an answer.
 
         Raises:
-            AnswerError: the answer is too long, or a number cannot be written.
+            WriteError: the answer is too long, or a number cannot be written.
         """
         style = self._style
         values = [self._value(value) for value in answer.values]
@@ -198,7 +198,7 @@ class AnswerWriter:
                 " " if char == self._style.separator else char for char in to_one_line(value)
             )
         if not abs(value) < MAX_NUMBER:
-            raise AnswerError(f"{value} is no number that a controller reads")
+            raise WriteError(f"{value} is no number that a controller reads")
         if isinstance(value, int):
             return str(int(value))
         return f"{round(value, self._style.decimals) + 0.0:.{self._style.decimals}f}"
@@ -209,7 +209,7 @@ class AnswerWriter:
         line = style.separator.join([*head, *values])
         room = style.max_bytes - len(style.line_end)
         if len(line) > room:
-            raise AnswerError(f"an answer has {len(line)} characters, {room} are allowed")
+            raise WriteError(f"an answer has {len(line)} characters, {room} are allowed")
         if answer.text:
             line = f"{line}{style.separator}{self._words(answer)}"[:room]
         return line
@@ -220,7 +220,7 @@ class AnswerWriter:
         padded = values + ["0"] * (len(self.names) - len(values))
         head = [str(item) for item in (tag, int(answer.code), answer.left) if item is not None]
         if len(head) + len(padded) > MAX_BRACKETED_NUMBERS:
-            raise AnswerError(
+            raise WriteError(
                 f"an answer has {len(head) + len(padded)} numbers, {MAX_BRACKETED_NUMBERS} are read"
             )
         return f"({','.join([*head, *padded])})"

@@ -9,13 +9,7 @@ import socket
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
-from smartcam.gateway._lines import (
-    AnswerCode,
-    AnswerError,
-    RequestReader,
-    RequestTooLongError,
-    RobotAnswer,
-)
+from smartcam.gateway._lines import AnswerCode, RequestReader, RobotAnswer, TooLongError, WriteError
 from smartcam.gateway._requests import PART_WORDS, RobotRequests
 
 if TYPE_CHECKING:
@@ -93,7 +87,7 @@ class RobotLink(asyncio.Protocol):
         self._restart_idle_timer()
         try:
             requests = self._reader.feed(data)
-        except RequestTooLongError as exc:
+        except TooLongError as exc:
             self._report_error(RobotAnswer(AnswerCode.TOO_LONG, text=str(exc)), None)
             self._close("a request is too long")
             return
@@ -152,7 +146,7 @@ class RobotLink(asyncio.Protocol):
         """Write an answer, or an error if it cannot be written; return True for an error."""
         try:
             data = self._writer.write(answer, tag)
-        except AnswerError as exc:
+        except WriteError as exc:
             answer = self._robot_requests.replace_answer(str(exc))
             data = self._writer.write(answer, tag)
         self._transport.write(data)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 PartValues = list[float | str]
 
 
-class PartConverter:
+class Converter:
     """Converts results: poses to the robot's convention, other values to the robot's units.
 
     Args:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from smartcam.camera import Camera
     from smartcam.gateway._counts import GatewayCounts
     from smartcam.gateway._lines import RobotRequest
-    from smartcam.gateway._parts import PartConverter, PartValues
+    from smartcam.gateway._parts import Converter, PartValues
     from smartcam.gateway._settings import GatewaySettings
     from smartcam.models import Result
 
@@ -75,15 +75,11 @@ class GatewayCamera:
     """
 
     def __init__(
-        self,
-        camera: Camera,
-        settings: GatewaySettings,
-        converter: PartConverter,
-        counts: GatewayCounts,
+        self, camera: Camera, settings: GatewaySettings, converter: Converter, counts: GatewayCounts
     ) -> None:
         self.camera: Camera = camera
         self.settings: GatewaySettings = settings
-        self.converter: PartConverter = converter
+        self.converter: Converter = converter
         self.counts: GatewayCounts = counts
         self.trigger_lock = asyncio.Lock()
 

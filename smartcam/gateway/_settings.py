@@ -175,9 +175,7 @@ class GatewaySettings(BaseModel):
 class GatewayFile(GatewaySettings):
     """A gateway and its camera in one file."""
 
-    url: str | None = Field(
-        default=None, description="URL of the camera, or of a camera that a fleet shares"
-    )
+    url: str | None = Field(default=None, description="URL of the camera, also of one in a fleet")
     emulated: bool = Field(default=False, description="an emulated camera instead")
     application: int | None = Field(
         default=None,
@@ -190,8 +188,7 @@ class GatewayFile(GatewaySettings):
     )
     y_down: bool = Field(default=False, description="the camera's y axis points down")
     calibration: str | None = Field(
-        default=None,
-        description="calibration file in the same folder; with it, poses are in the robot's frame",
+        default=None, description="calibration file, beside this one; poses are then the robot's"
     )
     name: str | None = Field(default=None, description="the camera's name, in results and poses")
 
