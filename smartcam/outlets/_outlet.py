@@ -27,8 +27,7 @@ class OutletContext:
             not allowed.
         cameras: function that returns the names of the cameras, and whether each is emulated; None
             if that is not known.
-        application_names: function that returns the names of a camera's applications, with their
-            numbers.
+        application_names: function that returns a camera's applications' numbers by their names.
     """
 
     def __init__(

@@ -63,8 +63,7 @@ class Outlets(Server):
             cannot deliver or spool, and with "" when it can again.
         cameras: function that returns the cameras' names, and whether each is emulated; None if
             that is not known.
-        application_names: function that returns the names of a camera's applications, with their
-            numbers.
+        application_names: function that returns a camera's applications' numbers by their names.
 
     Raises:
         ConfigurationError: the section is wrong.

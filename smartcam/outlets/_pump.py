@@ -138,9 +138,7 @@ class Pump:
         try:
             await self._cancel_tasks(self._tasks[:1])
             if self._open:
-                with contextlib.suppress(
-                    Exception
-                ):  # the next start adds a gap entry for unwritten ones
+                with contextlib.suppress(Exception):  # then the next start adds a gap entry
                     async with asyncio.timeout(STOP_TIMEOUT):
                         while self._waiting or self._dropped:
                             await self._store_waiting()
@@ -371,21 +369,16 @@ class Pump:
             )
             await self._remove_delivered(head, index, str(exc) or "refused")
         else:
-            await self._remove_delivered(head)
+            await self._remove_delivered(head, None, "")
         self._batch_size = min(2 * batch_size, self.outlet.max_batch)
         self._report_delivery("")
         return True
 
-    async def _remove_delivered(
-        self, head: SpoolHead, refused_index: int | None = None, refusal: str = ""
-    ) -> None:
-        """Remove the delivered entries, and the refused one after them, so that none is sent twice.
-
-        Retry while the disk is full.
-        """
+    async def _remove_delivered(self, head: SpoolHead, refused: int | None, reason: str) -> None:
+        """Remove delivered entries and the one at ``refused``; retry while the disk is full."""
 
         def work() -> OutletCounts:
-            self.spool.remove_delivered(head, refused_index, refusal)
+            self.spool.remove_delivered(head, refused, reason)
             return self.spool.counts
 
         while True:

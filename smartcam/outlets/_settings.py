@@ -1,7 +1,4 @@
-"""Define the settings of outlets, which deliver results to brokers, databases and PLCs.
-
-They come from a section of a fleet file, or from a file of their own.
-"""
+"""Define the settings of outlets, which deliver results to brokers, databases and PLCs."""
 
 from __future__ import annotations
 

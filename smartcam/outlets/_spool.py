@@ -166,9 +166,7 @@ class Spool:
             "SELECT COALESCE(MAX(place), 0) FROM entries"
         ).fetchall()
         if not last_row_id < _next_row_id(database):
-            raise sqlite3.DatabaseError(
-                f"an entry has row id {last_row_id}, but the file's last one is smaller"
-            )
+            raise sqlite3.DatabaseError(f"row id {last_row_id} is above the recorded last one")
         file_epoch, lock_epoch = counts.get("epoch", 0), self._read_epoch()
         self.epoch = max(file_epoch + 1, lock_epoch + 1, time.time_ns() // 1000)
         with _transaction(database):
@@ -179,9 +177,7 @@ class Spool:
             database.execute("DELETE FROM cameras")
             database.execute("INSERT INTO cameras VALUES ('', ?, 0)", (self.epoch,))
             if lock_epoch > file_epoch:
-                reason = (
-                    "the spool's file was deleted or replaced by an older copy; entries are lost"
-                )
+                reason = "the spool's file was deleted or is an older copy; entries are lost"
                 self._add_common_gap(database, 0, reason)
             _write_counts(database, {"epoch": self.epoch, "running": 1})
         self._counts = {**counts, "epoch": self.epoch, "running": 1}
@@ -307,7 +303,7 @@ class Spool:
         """Drop the oldest entries beyond the bound; return their number and their bytes."""
         if size <= self._max_bytes or self._policy != "drop_oldest":
             return 0, 0
-        freed, row_ids, dropped = 0, list[int](), list[OutletEntry]()
+        freed, ids, dropped = 0, list[int](), list[OutletEntry]()
         for row_id, size_of, *fields in database.execute(
             f"SELECT place, bytes, {_FIELDS} FROM entries WHERE place > ? AND kind != 'gap' "  # noqa: S608
             "ORDER BY place",
@@ -315,15 +311,11 @@ class Spool:
         ):
             if size - freed <= self._max_bytes:
                 break
-            row_ids.append(row_id)
+            ids.append(row_id)
             dropped.append(OutletEntry(*fields))
             freed += size_of
-        database.executemany(
-            "DELETE FROM entries WHERE place = ?", [(row_id,) for row_id in row_ids]
-        )
-        last_row_ids = {
-            entry.camera: row_id for entry, row_id in zip(dropped, row_ids, strict=True)
-        }
+        database.executemany("DELETE FROM entries WHERE place = ?", [(row_id,) for row_id in ids])
+        last_row_ids = {entry.camera: row_id for entry, row_id in zip(dropped, ids, strict=True)}
         for last, count in _last_by_camera(dropped):
             row_id = last_row_ids[last.camera]
             _add_gap(database, last, count, "the spool was full", self._in_flight, row_id)

@@ -204,7 +204,7 @@ class CameraView:
             self._command,
             self,
             picture=self._picture,
-            application_names=lambda: server.context.application_names(name),
+            get_names=lambda: server.context.application_names(name),
             make_job_id=server.new_job_id,
             simulated=dict(server.context.cameras()).get(name),
         )

@@ -84,8 +84,7 @@ class VisionSystem:
         view: view that shows the system to clients.
         picture: function that returns the file of a result's picture.
         make_job_id: function that returns an id for a job.
-        application_names: function that returns the names of the camera's own applications, with
-            their numbers.
+        get_names: function that returns the names of the camera's own applications, with numbers.
         simulated: True for an emulated camera, False for a real one, None if this is not known.
     """
 
@@ -98,7 +97,7 @@ class VisionSystem:
         *,
         picture: Callable[[Mapping[str, Any]], Path | None],
         make_job_id: Callable[[], str],
-        application_names: Callable[[], Mapping[str, int]] = dict,
+        get_names: Callable[[], Mapping[str, int]] = dict,
         simulated: bool | None = None,
     ) -> None:
         self.name, self.settings, self.view = name, settings, view
@@ -106,7 +105,7 @@ class VisionSystem:
         self.application: int | None = None
         self.job: VisionJob | None = None
         self._command, self._picture, self._make_job_id = command, picture, make_job_id
-        self._application_names = application_names
+        self._get_names = get_names
         self._simulated = simulated
         # whether the camera is connected; None: unknown
         self._connected: bool | None = None
@@ -217,9 +216,7 @@ class VisionSystem:
     def recipes(self) -> Mapping[str, int]:
         """Applications by name; names in the settings have priority over the camera's own."""
         named = self.settings.recipes
-        others = {
-            name: number for name, number in self._application_names().items() if name not in named
-        }
+        others = {name: number for name, number in self._get_names().items() if name not in named}
         return {**named, **others}
 
     def application_of(self, external: str, internal: str = "") -> int:
