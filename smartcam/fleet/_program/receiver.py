@@ -88,11 +88,9 @@ class FleetListeners(Listeners):
         self._wanted_since[future] = clock
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
-        offered_at = self.results.offered_at
+        offered = self.results.offered_at
         later_waits = [
-            wait
-            for wait in self._next_results
-            if self._wanted_since.get(wait, -math.inf) > offered_at
+            wait for wait in self._next_results if self._wanted_since.get(wait, -math.inf) > offered
         ]
         taken = super()._take_next_results()
         if later_waits:
