@@ -83,7 +83,7 @@ class TriggerEvidence:
     def on_status(self, status: int) -> None:
         """Record a status."""
 
-    def note_usual_exchange(self) -> bool:
+    def note_exchange(self) -> bool:
         """Record a trigger's usual messages together; return False to record each one singly."""
         return False
 
@@ -155,7 +155,7 @@ class EvidenceByStatus(TriggerEvidence):
             self.doubtful = self.begin_count > 1
         return self.takes_containers
 
-    def note_usual_exchange(self) -> bool:
+    def note_exchange(self) -> bool:
         """Record both Queries' answers and one inspection between them, if none was noted yet."""
         if self._answer_count or self.begin_count:
             return False
@@ -388,7 +388,7 @@ class Correlation:
         if self._last is not None:
             self._last.on_trigger_answer()
 
-    def note_usual_exchange(self, pending: SentTrigger) -> bool:
+    def note_exchange(self, pending: SentTrigger) -> bool:
         """Record two answers and one inspection between them; return False if this is not possible.
 
         It is not possible if the trigger already has a result, if an earlier result is owed, or if
@@ -397,7 +397,7 @@ class Correlation:
         evidence = pending.evidence
         if not self._gets_every_status or self.owed or self._last is not evidence:
             return False
-        if not evidence.note_usual_exchange():
+        if not evidence.note_exchange():
             return False
         self.status_may_be_old = False
         return True

@@ -191,7 +191,7 @@ class Requests:
     def is_free(self, key: type[m.Message] | int) -> bool:
         """Return True if no answer of this kind is pending, and no such request waits in line."""
         waits = self._waits
-        any_pending = waits.pending_answers or waits.trigger_queries_open
+        any_pending = waits.pending_answers or waits.open_queries
         return not ((any_pending and waits.is_pending(key)) or self._locks[key].locked())
 
     async def await_turn(
@@ -246,7 +246,7 @@ class Requests:
 
     def expect_query_answers(self, count: int, sent_at: float, deadline: float) -> None:
         """Record that Queries were sent with a trigger; no task waits for their answers."""
-        self._waits.trigger_queries_open = count
+        self._waits.open_queries = count
         due = sent_at + self.answer_timeout
         # max() takes twenty times as long
         self._due[m.QueryAnswer] = due if due > deadline else deadline  # noqa: FURB136

@@ -207,8 +207,7 @@ class Results:
                 pending,
                 OvertriggeredError(
                     f"{self._name}: it is unknown to which trigger the result belongs: something "
-                    "else has triggered the camera at the same time, or an answer of the camera is "
-                    "missing"
+                    "else has triggered the camera just now, or an answer of the camera is missing"
                 ),
             )
         else:
@@ -359,11 +358,9 @@ class Results:
         reader = self._number_reader
         number = None if reader is None else reader.sequence_number(container, state.endian)
         correlation = self.correlation
-        requested = container.requested
+        is_ours = container.requested
         match = (
-            correlation.judge(number)
-            if requested is None
-            else correlation.judge_requested(requested)
+            correlation.judge(number) if is_ours is None else correlation.judge_requested(is_ours)
         )
         if self._lossy and match.fate == "triggered" and self._is_repeated(container, pending):
             match = Match("nobody", extra=True)
@@ -442,11 +439,7 @@ class Results:
             expected = pending.application
         if expected is not None and expected != container.application:
             return None
-        if (
-            pending.unproven
-            or pending.given_up
-            or not self.correlation.note_usual_exchange(pending)
-        ):
+        if pending.unproven or pending.given_up or not self.correlation.note_exchange(pending):
             return None
         return pending
 

@@ -79,7 +79,7 @@ class Waits:
         end_reason: reason why there is no session, None while there is one.
         pending_answers: futures of answers, by the type of the answer; by id for a message that
             the dialect does not know.
-        trigger_queries_open: number of unanswered Queries that were sent with the last trigger.
+        open_queries: number of unanswered Queries that were sent with the last trigger.
         status_waiters: callers that wait for a status, in order.
     """
 
@@ -90,13 +90,13 @@ class Waits:
         self._asked_at: dict[object, float] = {}
         # number of the last delivery before each request was sent, by the key of its answer
         self._last_delivery_before: dict[object, int] = {}
-        self.trigger_queries_open: int = 0
+        self.open_queries: int = 0
         self.status_waiters: dict[StatusWaiter, None] = {}  # a dict: each is removed in one step
 
     def begin_session(self) -> None:
         """Begin a session, without a pending request."""
         self.end_reason = None
-        self.trigger_queries_open = 0
+        self.open_queries = 0
 
     def fail(self, error: SmartCamError) -> bool:
         """End every wait with an error; waits that begin before the next session raise it, too.
@@ -114,7 +114,7 @@ class Waits:
         self.pending_answers.clear()
         self._asked_at.clear()
         self._last_delivery_before.clear()
-        self.trigger_queries_open = 0
+        self.open_queries = 0
         for waiter in self.status_waiters:
             if not waiter.outcome.done():
                 waiter.outcome.set_result(error)
@@ -157,10 +157,7 @@ class Waits:
         return future
 
     def pending_answer(self, key: type[m.Message] | int) -> PendingAnswer:
-        """Return the future of a pending answer (:meth:`is_pending`).
-
-        It is registered now if only an answer to a trigger's Query is pending.
-        """
+        """Return the future of a pending answer (:meth:`is_pending`); register a Query's now."""
         answer = self.pending_answers.get(key)
         if answer is None:
             loop = asyncio.get_running_loop()
@@ -169,27 +166,21 @@ class Waits:
 
     def is_pending(self, key: type[m.Message] | int) -> bool:
         """Return True if an answer of this kind is pending."""
-        return key in self.pending_answers or (
-            key is m.QueryAnswer and self.trigger_queries_open > 0
-        )
+        return key in self.pending_answers or (key is m.QueryAnswer and self.open_queries > 0)
 
     def expect_query_answers(self, count: int) -> None:
         """Record that Queries went out with a trigger; no task waits for their answers."""
-        self.trigger_queries_open = count
+        self.open_queries = count
 
     def awaits_only_queries(self, count: int) -> bool:
         """Return True if ``count`` Queries of a trigger are open, and no task awaits anything."""
-        return (
-            self.trigger_queries_open == count
-            and not self.pending_answers
-            and not self.status_waiters
-        )
+        return self.open_queries == count and not self.pending_answers and not self.status_waiters
 
     def count_query_answer(self) -> bool:
         """Count an answer to Query for the last trigger; return False if none is expected."""
-        if not self.trigger_queries_open:
+        if not self.open_queries:
             return False
-        self.trigger_queries_open -= 1
+        self.open_queries -= 1
         return True
 
     def on_message(self, message: m.Message, now: float, delivery: int) -> None:

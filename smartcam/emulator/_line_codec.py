@@ -78,7 +78,7 @@ class LineCodec:
         self.table: tuple[MessageRow, ...] = tuple(
             MessageRow(number, kind, row.line, "")
             for number, row in enumerate(rows, start=1)
-            for kind in dict.fromkeys((row.request, row.answer, *row.other_answers))
+            for kind in dict.fromkeys((row.request, row.answer, *row.extras))
             if kind is not None
         )
         self._rows = rows
@@ -135,9 +135,7 @@ class LineCodec:
 
     def has(self, message_type: type[m.Message], /) -> bool:
         """Return True if a row has the message as a request or an answer."""
-        return any(
-            message_type in {row.request, row.answer, *row.other_answers} for row in self._rows
-        )
+        return any(message_type in {row.request, row.answer, *row.extras} for row in self._rows)
 
     def message_id(self, message: m.Message, /) -> int:
         """Return the number of its row."""

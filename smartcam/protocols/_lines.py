@@ -86,7 +86,7 @@ class LineRow(NamedTuple):
         echo: line that comes before the answer.
         until: possible first words of the last line of an answer of several lines. ``read`` gets
             these lines joined by line feeds.
-        other_answers: further message types that ``read`` may return.
+        extras: further message types that ``read`` may return.
         script: function for a request of several lines; it gets the dialect and the message, yields
             lines and receives the answer to each. ``line`` is then the line for error texts.
     """
@@ -98,7 +98,7 @@ class LineRow(NamedTuple):
     answer_word: str | None = None
     echo: str = ""
     until: tuple[str, ...] = ()
-    other_answers: tuple[type[m.Report], ...] = ()
+    extras: tuple[type[m.Report], ...] = ()
     script: Callable[[Any, Any], Script] | None = None
 
 
@@ -196,9 +196,7 @@ class LineDialect(Dialect):
         """Return True if the dialect has a message of this type."""
         if message_type is m.Disconnect:
             return True
-        return any(
-            message_type in {row.request, row.answer, *row.other_answers} for row in self.rows
-        )
+        return any(message_type in {row.request, row.answer, *row.extras} for row in self.rows)
 
     def message_id(self, message: m.Message | type[m.Message]) -> int:
         """Return 0, since lines have no ids; raise UnsupportedError without such a message."""

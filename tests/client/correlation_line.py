@@ -40,9 +40,7 @@ class Line:
         self.at = Correlation(first_number_share=0.5)
         self.at.begin_session(gets_every_status=gets_every_status)
         self.status: Status | None = None
-        self.trigger_queries_open = (
-            0  # Queries that were written with the trigger and are not answered
-        )
+        self.open_queries = 0  # Queries that were written with the trigger and are not answered
         self.numbered = False  # a trigger had a number: a container's is read
         self.cancelled = False  # the trigger's caller, who was not woken yet
         self.doubts = 0  # triggers that ended since nobody can tell which one the camera took
@@ -61,11 +59,11 @@ class Line:
         """Send a trigger; the Queries in front of it and behind it are not answered yet."""
         evidence = TriggerEvidence()
         if self.is_polled:
-            evidence, self.trigger_queries_open = EvidenceByAnswer(), 1
+            evidence, self.open_queries = EvidenceByAnswer(), 1
         elif self.is_complete:
-            evidence, self.trigger_queries_open = EvidenceByStatus(), 2
+            evidence, self.open_queries = EvidenceByStatus(), 2
         elif self.is_by_round_trip:
-            evidence, self.trigger_queries_open = EvidenceByRoundTrip(), 1
+            evidence, self.open_queries = EvidenceByRoundTrip(), 1
         pending = SentTrigger(wanted, number, evidence)
         self.numbered = self.numbered or number is not None
         self.results = []
@@ -115,7 +113,7 @@ class Line:
         self.look()
         if self.pending is not None and not self.pending.ended:
             self.fail("late")
-        self.trigger_queries_open = 0
+        self.open_queries = 0
         self.leave()
         self.at.begin_session(gets_every_status=self.is_complete)
         self.status = None
@@ -124,7 +122,7 @@ class Line:
 
     def answer(self) -> None:
         """A Query that was written with the trigger is answered."""
-        self.trigger_queries_open -= 1
+        self.open_queries -= 1
         self.at.on_trigger_query_answer()
         self.decide()
 

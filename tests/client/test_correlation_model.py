@@ -227,7 +227,7 @@ class CameraAndClient(RuleBasedStateMachine):
     @property
     def owes(self) -> bool:
         """True if an answer to a Query is open."""
-        return self.asked or self.line.trigger_queries_open > 0
+        return self.asked or self.line.open_queries > 0
 
     def say_to_camera(self, *words: Word) -> None:
         self.camera.heard += words
@@ -255,7 +255,7 @@ class CameraAndClient(RuleBasedStateMachine):
         self.number = number
         self.lefts[self.sent] = self.draw_left(data)
         self.line.send(number, data.draw(st.integers(1, min(self.results)), "wanted"))
-        queries = self.line.trigger_queries_open
+        queries = self.line.open_queries
         if queries:
             self.say_to_camera(Word("query", self.sent))
         if number is not None:
@@ -434,7 +434,7 @@ class CameraAndClient(RuleBasedStateMachine):
         match what:
             case Container():
                 line.result(what.number if line.numbered else None, what)
-            case "answer" if line.trigger_queries_open:
+            case "answer" if line.open_queries:
                 line.answer()
             case "answer":
                 self.asked = False

@@ -593,7 +593,7 @@ async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
             for data, expected in itertools.product((None, b"1"), (None, state.active, 99)):
                 state.status, state.bits = Status(said), said
                 correlation.status_may_be_old, correlation.owed = status_may_be_old, owed  # type: ignore[assignment]
-                commands._loads_when_halted, waits.trigger_queries_open = halted, open_
+                commands._loads_when_halted, waits.open_queries = halted, open_
                 request = TriggerRequest(client._default, data, 1, wait=True)
                 if triggers._can_send_now(request, expected):
                     straight += 1
@@ -602,7 +602,7 @@ async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
                         triggers._get_ready(request, expected, link.loop.time() + 1.0).send(None)
                     assert link.machine.counters.frames_sent == written
         state.status, state.bits, correlation.owed = usual
-        correlation.status_may_be_old, commands._loads_when_halted, waits.trigger_queries_open = (
+        correlation.status_may_be_old, commands._loads_when_halted, waits.open_queries = (
             False,
             None,
             0,

@@ -90,9 +90,7 @@ ECHO = LineDialect(
         LineRow(m.Connect, "RM", m.ConnectAnswer, connected),
         LineRow(m.GetStatus, "RS", m.StatusReport, status),
         LineRow(m.Query, "PR", m.QueryAnswer, query),
-        LineRow(
-            m.Trigger, "TA", m.ResultContainer, taken, echo="TA", other_answers=(m.TriggerAnswer,)
-        ),
+        LineRow(m.Trigger, "TA", m.ResultContainer, taken, echo="TA", extras=(m.TriggerAnswer,)),
         LineRow(m.EndTrigger, "TE", None, refuse_line),
     ),
     split=first_word,

@@ -189,12 +189,7 @@ def _make_rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineR
     unasked_rows = (
         LineRow(None, "results", m.ResultContainer, _read_result, answer_word=RESULT_TICKET),
         LineRow(
-            None,
-            "errors",
-            m.Notice,
-            read_error,
-            answer_word=ERROR_TICKET,
-            other_answers=(m.StatusReport,),
+            None, "errors", m.Notice, read_error, answer_word=ERROR_TICKET, extras=(m.StatusReport,)
         ),
         LineRow(
             None,
@@ -237,7 +232,7 @@ def _make_rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineR
 
 
 SYNCHRONOUS_TRIGGER = LineRow(
-    m.Trigger, "T?", m.ResultContainer, _read_trigger_answer, other_answers=(m.TriggerAnswer,)
+    m.Trigger, "T?", m.ResultContainer, _read_trigger_answer, extras=(m.TriggerAnswer,)
 )
 ASYNCHRONOUS_TRIGGER = LineRow(
     m.Trigger, "t", m.TriggerAnswer, lambda text: m.TriggerAnswer(code=_trigger_code(text) or 0)

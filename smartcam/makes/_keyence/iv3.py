@@ -111,9 +111,7 @@ LINES = LineDialect(
     about="lines that end with CR",
     source="docs/keyence.md, derived",
     rows=(
-        LineRow(
-            m.Connect, "RT", m.ConnectAnswer, _read_connect_answer, other_answers=(m.StatusReport,)
-        ),
+        LineRow(m.Connect, "RT", m.ConnectAnswer, _read_connect_answer, extras=(m.StatusReport,)),
         LineRow(m.Query, "PR", m.QueryAnswer, _read_program),
         LineRow(
             m.SwitchApplication,
@@ -128,7 +126,7 @@ LINES = LineDialect(
             m.ResultContainer,
             _read_trigger_answer,
             answer_word="RT",
-            other_answers=(m.TriggerAnswer,),
+            extras=(m.TriggerAnswer,),
         ),
         LineRow(None, "result", m.Notice, _read_unasked, answer_word="RT"),
         LineRow(LineCommand, "{line}", LineReply, _read_reply),

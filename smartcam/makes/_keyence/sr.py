@@ -123,7 +123,7 @@ def _make_rows(bank: int | None) -> tuple[LineRow, ...]:
             m.ResultContainer,
             _read_trigger_answer,
             answer_word="",
-            other_answers=(m.TriggerAnswer,),
+            extras=(m.TriggerAnswer,),
         ),
         LineRow(m.EndTrigger, "LOFF", None, refuse_line),
         LineRow(

@@ -115,10 +115,8 @@ class EmulatedSr(LineCamera):
     def _send_reading(self) -> None:
         call, code = self._reading, self._code
         self._reading = self._code = None
-        self.read_count, self.unread_count = (
-            self.read_count + (code is not None),
-            self.unread_count + (code is None),
-        )
+        self.read_count += code is not None
+        self.unread_count += code is None
         if call is not None:
             text = NOTHING_READ if code is None else code
             self.after(self.answer_time, lambda: call.answer(text))

@@ -255,7 +255,7 @@ class Client:
         yield (
             [*waits.pending_answers],
             waits._last_delivery_before,
-            waits.trigger_queries_open,
+            waits.open_queries,
             len(waits.status_waiters),
         )
         correlation = results.correlation
@@ -527,7 +527,7 @@ def _compare_one(short: Client, judge: Client, chance: Chance, counts: Counter[s
             if not sleeps:
                 client.wake()
             client.awaited = [one for one in client.awaited if not one.done()]
-        stuck = short.waits.trigger_queries_open if short.results._pending is None else 0
+        stuck = short.waits.open_queries if short.results._pending is None else 0
         if stuck and chance.random.random() < 0.8:  # the answers that are missing come, too
             for client in both:
                 client.hear(chance.rest + _answer() * stuck, 0.0)
