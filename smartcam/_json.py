@@ -141,10 +141,7 @@ def _table_text(table: Any) -> str | None:
 
 @functools.lru_cache(maxsize=256)
 def _row_format(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | None:
-    """Return a row's format, the indices of its texts and of its floats.
-
-    None if a column is of another kind than those in ``_FORMATS``.
-    """
+    """Return a row's format, indices of texts and of floats; None for kinds not in ``_FORMATS``."""
     kinds = [dtype.fields[name][0] for name in dtype.names or ()]
     if not kinds or any(
         kind.kind not in _FORMATS or (kind.kind == "f" and kind.itemsize > MAX_FLOAT_BYTES)

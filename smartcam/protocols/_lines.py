@@ -317,9 +317,8 @@ class LineDialect(Dialect):
             return row
         answer = None if equivalent.answer is None else row.answer
         word = None if equivalent.script is not None else equivalent.answer_word
-        return row._replace(
-            answer=answer, answer_word=word, echo=equivalent.echo, until=equivalent.until
-        )
+        echo, until = equivalent.echo, equivalent.until
+        return row._replace(answer=answer, answer_word=word, echo=echo, until=until)
 
     def body(self, answer: m.Message) -> bytes:
         """Return the bytes of the answer to a line of the user's own.

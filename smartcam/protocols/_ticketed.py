@@ -98,9 +98,8 @@ class TicketedDialect(LineDialect):
         data = frame.payload + self.line_end
         if not from_client:
             data = self.frame(content, ticket, with_length=self.digits > 0)
-        return ReadableFrame(
-            None, "frame", {"ticket": ticket, "text": content.decode(ENCODING)}, data
-        )
+        fields = {"ticket": ticket, "text": content.decode(ENCODING)}
+        return ReadableFrame(None, "frame", fields, data)
 
 
 class HeaderReader(LineReader):

@@ -259,9 +259,8 @@ class ThreadedCamera(_HostedInThread):
 
     def run(self, function: Callable[..., T]) -> T:
         """Call ``function`` with the emulated camera, in its thread."""
-        return self._thread.call_function(
-            check_callable(function, "function", "run"), self._emulator
-        )
+        checked = check_callable(function, "function", "run")
+        return self._thread.call_function(checked, self._emulator)
 
     def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0

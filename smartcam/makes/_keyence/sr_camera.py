@@ -124,7 +124,6 @@ class EmulatedSr(LineCamera):
     def tell_all(self) -> None:
         """Read a code and send it to all clients."""
         code = next(self.codes)
-        # messages are numbered by the protocol's rows
         row_number = next(number for number, row in enumerate(LINES.rows, 1) if row.line == "code")
         for client in list(self._clients.values()):
             client.say_bytes(

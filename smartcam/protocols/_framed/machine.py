@@ -744,9 +744,8 @@ class Machine:
         else:
             unfinished.searched = max(framer.buffered - header.size + 1, 0)
             return False
-        self._reject(
-            FrameError(text, offset=other or 0, data=framer.unfinished_bytes[: header.size])
-        )
+        data = framer.unfinished_bytes[: header.size]
+        self._reject(FrameError(text, offset=other or 0, data=data))
         return True
 
     def _receive_datagram(self) -> None:

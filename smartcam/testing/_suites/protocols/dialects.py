@@ -325,12 +325,9 @@ def check_described(dialect: Dialect, sender: m.Sender, frame: Frame) -> Readabl
         AssertionError: the frame cannot be shown.
     """
     readable = dialect.make_readable(sender, frame)
-    assert isinstance(readable, ReadableFrame), (
-        f"make_readable({frame}): expected a ReadableFrame, got {readable!r}"
-    )
-    assert _is_printable_line(readable.message), (
-        f"make_readable({frame}): message {readable.message!r}"
-    )
+    expected = f"make_readable({frame}): expected a ReadableFrame, got {readable!r}"
+    assert isinstance(readable, ReadableFrame), expected
+    assert _is_printable_line(readable.message), f"make_readable({frame}): {readable.message!r}"
     assert isinstance(readable.data, bytes), f"make_readable({frame}): data {readable.data!r}"
     json.dumps(jsonable(readable.fields), allow_nan=False)
     return readable

@@ -277,13 +277,10 @@ class MachineChecks(SuiteBase):
         assert machine.dialect in group, f"dialect: {machine.dialect} was not asked for"
         assert machine.candidates[0] in group, f"candidates: {machine.candidates} was not asked for"
         assert machine.transport is conversation.transport, f"transport: {machine.transport}"
-        assert isinstance(machine.may_reply, bool), (
-            f"may_reply: expected a bool, {machine.may_reply!r}"
-        )
+        assert isinstance(machine.may_reply, bool), f"may_reply: no bool: {machine.may_reply!r}"
         assert isinstance(machine.counters, Counters), f"counters: {machine.counters!r}"
-        assert bytes(machine.unfinished_bytes) == b"", (
-            f"unfinished_bytes: {machine.unfinished_bytes!r} before anything came"
-        )
+        unfinished = bytes(machine.unfinished_bytes)
+        assert unfinished == b"", f"unfinished_bytes: {unfinished!r} before anything came"
         for take in (machine.events, machine.data_to_send):
             name = getattr(take, "__name__", "it")
             items: list[Any] = take()
