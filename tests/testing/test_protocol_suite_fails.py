@@ -166,7 +166,9 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"code": lambda *_: CodeMeaning("no", Verdict.REFUSED)}, "no code says"),
         ({"capabilities": can(result_codes=True)}, "every code says done"),
     ],
-    "test_any_frame_can_be_shown": [({"make_readable": lambda *_: None}, "expected a ReadableFrame")],
+    "test_any_frame_can_be_shown": [
+        ({"make_readable": lambda *_: None}, "expected a ReadableFrame")
+    ],
     "test_any_raw_request_is_taken_or_refused": [
         ({"raw_request": lambda *_: None}, "raw_request(0): None"),
         ({"body": lambda *_: "text"}, "expected bytes, got 'text'"),
