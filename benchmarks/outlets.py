@@ -107,7 +107,9 @@ async def _agent(
     fields: dict[str, Any] = {"cameras": {"cam": {"url": url, "interpret_as": "localizations"}}}
     if outlets is not None:
         fields["outlets"] = outlets
-    server = FleetServer(FleetFile.model_validate(fields), bus=MemoryBus().end(), folder=folder)
+    server = FleetServer(
+        FleetFile.model_validate(fields), bus=MemoryBus().new_connection(), folder=folder
+    )
     async with contextlib.AsyncExitStack() as stack:
         if outlets is not None:
             await stack.enter_async_context(FleetOutlets(server))
@@ -131,7 +133,7 @@ async def _in_turn(servers: Mapping[str, FleetServer], blocks: int) -> dict[str,
 
 async def _block(server: FleetServer, dice: random.Random) -> list[float]:
     """Return the microseconds of a block of triggers."""
-    camera, took = server.hosts["cam"].camera, list[float]()
+    camera, took = server.shared_cameras["cam"].client, list[float]()
     due = time.perf_counter()
     for _ in range(BLOCK):
         due += dice.uniform(0.5, 1.5) * PERIOD

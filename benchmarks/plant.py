@@ -162,7 +162,7 @@ async def _round(size: int, port: int, url: str, controls: list[Control]) -> dic
             assert sum(one.connected for one in known.values()) == size
         asked = statistics.median(took_each)
         results = fleet.results()
-        await fleet.meet()
+        await fleet.find_cameras()
         await asyncio.sleep(SETTLED)
         gc.collect()
         each = RESULTS

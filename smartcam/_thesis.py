@@ -109,7 +109,7 @@ class ThesisCamera(Protocol):
         name: the camera's name.
         address: address of the camera itself.
         application: the id of the active application; None if that is not known.
-        reading: interpretation of its results; None if no layout of results is known.
+        interpretation: interpretation of its results; None if no layout of results is known.
         stopped: whether SmartcameraStop has closed the camera for these services.
     """
 
@@ -129,13 +129,13 @@ class ThesisCamera(Protocol):
     def application(self) -> int | None: ...
 
     @property
-    def reading(self) -> Interpretation | None: ...
+    def interpretation(self) -> Interpretation | None: ...
 
-    def check_reading(self, spec: str) -> None:
-        """Raise ConfigurationError if results cannot be read by ``spec``."""
+    def check_interpretation(self, spec: str) -> None:
+        """Raise ConfigurationError if results cannot be interpreted by ``spec``."""
 
-    def read_as(self, spec: str | None) -> None:
-        """Read results by ``spec`` from now on; None: by the settings."""
+    def interpret_as(self, spec: str | None) -> None:
+        """Interpret results by ``spec`` from now on; None: by the settings."""
 
     def is_calibrated(self, application: int) -> bool:
         """Return True if a calibration transforms an application's localizations."""
@@ -155,8 +155,8 @@ class ThesisCamera(Protocol):
     async def end_publishing(self) -> None:
         """Publish nothing more on the topics that requests have named."""
 
-    async def have_session(self) -> None:
-        """Make sure that there is a session with the camera; else raise an error that says why."""
+    async def require_session(self) -> None:
+        """Raise an error with the reason if there is no session with the camera."""
 
     async def ensure(self, application: int, timeout: float) -> None:
         """Switch to an application if it is not running and ready already."""
@@ -225,13 +225,13 @@ async def _setup(call: ThesisCall) -> dict[str, Any]:
     _check_same_camera(camera, request)
     spec = spec_of_text(request.interpret_as)
     if spec is not None:
-        camera.check_reading(spec)
+        camera.check_interpretation(spec)
     camera.check_status_topic(request.topic_status)
-    await camera.have_session()
+    await camera.require_session()
     if request.application_id:
         await camera.ensure(request.application_id, call.timeout)
     if spec is not None:
-        camera.read_as(spec)
+        camera.interpret_as(spec)
     camera.stopped = False
     return camera.publish_status(request.topic_status)
 
@@ -272,7 +272,7 @@ async def _enable_publishing(call: ThesisCall) -> dict[str, Any]:
 
 async def _stop(call: ThesisCall) -> dict[str, Any]:
     await call.camera.end_publishing()
-    call.camera.read_as(None)
+    call.camera.interpret_as(None)
     call.camera.stopped = True
     return {}
 
@@ -298,7 +298,7 @@ async def _trigger_localizations(call: ThesisCall) -> dict[str, Any]:
     if localizations is None or are_pixels:
         raise InterpretationError(
             f"{camera.name}: expected localizations in metres, got {value!r:.80}; "
-            "a trigger without these services gives what the layout says",
+            "camera.trigger() returns the values that the layout describes",
             expected="localizations",
         )
     return {"localizations": localizations}
@@ -306,19 +306,20 @@ async def _trigger_localizations(call: ThesisCall) -> dict[str, Any]:
 
 def _spec_of_localizations(camera: ThesisCamera, application: int | None) -> Any:
     """Return the specification for localizations: the camera's own, or the thesis' fields."""
-    reading = camera.reading
-    if reading is None:
+    interpretation = camera.interpretation
+    if interpretation is None:
         return "localizations"
-    if not reading.by_application:
-        return _with_poses(reading, None)
-    ids = {*reading.applications, application, camera.application} - {None}
-    return {id_: _with_poses(reading, id_) for id_ in ids}
+    if not interpretation.by_application:
+        return _with_poses(interpretation, None)
+    ids = {*interpretation.applications, application, camera.application} - {None}
+    return {id_: _with_poses(interpretation, id_) for id_ in ids}
 
 
-def _with_poses(reading: Interpretation, application: int | None) -> Any:
+def _with_poses(interpretation: Interpretation, application: int | None) -> Any:
     """Return an application's own interpreter if it makes localizations, else "localizations"."""
-    own = reading.interpreter(application)
-    return "localizations" if own is None or name_if_poseless(own) is not None else own
+    own = interpretation.interpreter(application)
+    has_poses = own is not None and name_if_poseless(own) is None
+    return own if has_poses else "localizations"
 
 
 def _interpreter_of(spec: Any, application: int) -> Any:

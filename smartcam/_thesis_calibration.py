@@ -1,7 +1,7 @@
 """The five calibration services of the thesis: their requests and actions.
 
-Programs call them as they call the six services of :mod:`smartcam._thesis`, which says what the
-thesis is: in JSON on a fleet's bus, in ROS 2 or in ROS 1. Each camera has one
+Programs call them in JSON on a fleet's bus, in ROS 2 or in ROS 1, like the six services in
+:mod:`smartcam._thesis`, which says what the thesis is. Each camera has one
 :class:`~smartcam.calibration.wizards._thesis.ThesisCalibration` object, which does the work for all
 three.
 """
@@ -120,12 +120,12 @@ class TransformRequest(ThesisRequest):
     tf_frame_reference: _Text = ""
 
 
-class CalibrationHost(Protocol):
+class CalibrationOwner(Protocol):
     """The owner of the camera that the five services calibrate.
 
     Attributes:
         name: the camera's name.
-        calibrations: calibrations of the camera; None if no folder for them is set.
+        thesis_calibration: object that calibrates the camera; None if no folder for it is set.
         camera: function that returns the camera for one call, which takes at most ``timeout``
             seconds.
     """
@@ -133,7 +133,7 @@ class CalibrationHost(Protocol):
     name: str
 
     @property
-    def calibrations(self) -> ThesisCalibration | None: ...
+    def thesis_calibration(self) -> ThesisCalibration | None: ...
 
     def camera(self, timeout: float) -> CalibrationCamera: ...
 
@@ -142,29 +142,29 @@ class CalibrationCall(NamedTuple):
     """A running call of a service.
 
     Attributes:
-        host: the owner of the camera.
+        owner: the owner of the camera.
         request: the request, an object of the service's request class.
         timeout: longest duration of the call, seconds.
     """
 
-    host: CalibrationHost
+    owner: CalibrationOwner
     request: Any
     timeout: float
 
     @property
-    def calibrations(self) -> ThesisCalibration:
-        """The calibrations of the camera.
+    def thesis_calibration(self) -> ThesisCalibration:
+        """The object that calibrates the camera.
 
         Raises:
-            ConfigurationError: no folder for them is set.
+            ConfigurationError: no folder for it is set.
         """
-        calibrations = self.host.calibrations
-        if calibrations is None:
+        thesis_calibration = self.owner.thesis_calibration
+        if thesis_calibration is None:
             raise ConfigurationError(
-                f"{self.host.name}: there is no folder for calibrations; expected "
-                "calibrations: FOLDER in the fleet file of its agent, and to be asked there"
+                f"{self.owner.name}: there is no folder for calibrations; expected "
+                "calibrations: FOLDER in the fleet file of its agent, and a request to that agent"
             )
-        return calibrations
+        return thesis_calibration
 
 
 class WizardService(NamedTuple):
@@ -185,7 +185,7 @@ async def _start(call: CalibrationCall) -> dict[str, Any]:
     with from_part("calibration", "the calibration services need"):
         from smartcam.calibration._inside import CalibrationStart
     request = call.request
-    await call.calibrations.start(
+    await call.thesis_calibration.start(
         CalibrationStart(*(getattr(request, name) for name in CalibrationStart._fields))
     )
     return {}
@@ -196,16 +196,16 @@ async def _perform(call: CalibrationCall) -> dict[str, Any]:
         from smartcam.calibration._inside import StepRequest
     request = call.request
     step_request = StepRequest(*(getattr(request, name) for name in StepRequest._fields))
-    return await call.calibrations.perform(step_request, call.host.camera(call.timeout))
+    return await call.thesis_calibration.perform(step_request, call.owner.camera(call.timeout))
 
 
 async def _export(call: CalibrationCall) -> dict[str, Any]:
-    call.calibrations.export(call.request.calibration_name, call.request.target_path)
+    call.thesis_calibration.export(call.request.calibration_name, call.request.target_path)
     return {}
 
 
 async def _load(call: CalibrationCall) -> dict[str, Any]:
-    call.calibrations.load(call.request.calibration_name_or_path)
+    call.thesis_calibration.load(call.request.calibration_name_or_path)
     return {}
 
 
@@ -218,17 +218,20 @@ async def _transform(call: CalibrationCall) -> dict[str, Any]:
         *(request.x, request.y, request.theta),
         *(header.frame_id, request.tf_frame_reference, header.seq, header.utc),
     )
-    return {"pose": await call.calibrations.transform(pixel_pose)}
+    return {"pose": await call.thesis_calibration.transform(pixel_pose)}
 
 
-def localization_spec(reading: Interpretation | None, application: int | None) -> tuple[Any, str]:
+def localization_spec(
+    interpretation: Interpretation | None, application: int | None
+) -> tuple[Any, str]:
     """Return the specification for localizations in the camera's own frame, and their unit.
 
     Args:
-        reading: interpretation of the camera's results; None if no layout of results is known.
+        interpretation: interpretation of the camera's results; None if no layout of results is
+            known.
         application: the active application; None if that is not known.
     """
-    interpreter = None if reading is None else reading.interpreter(application)
+    interpreter = None if interpretation is None else interpretation.interpreter(application)
     if interpreter is None or name_if_poseless(interpreter) is not None:
         return "localizations", "m"
     return interpreter, "px" if has_pixel_positions(interpreter) else "m"

@@ -1,8 +1,8 @@
 """Use a session of Zenoh in an event loop, although Zenoh calls back in threads of its own.
 
 The callbacks put received messages into one queue. A burst of messages wakes the event loop once.
-"Engine" means Zenoh's own code, "end" a program that has a session on the bus. A "patient" callback
-runs only after all callbacks that are not patient.
+A "participant" is a program that has a session on the bus. Callbacks "for later" run only after all
+other callbacks.
 """
 
 from __future__ import annotations
@@ -55,30 +55,30 @@ Python, including the thread that is to call back. The variable ZENOH_RUNTIME ov
 numbers."""
 
 LEASE_TIME = 5.0
-"""Seconds without a sign of life after which an end counts as gone. If its process was killed, it
-counts as gone at once."""
+"""Seconds without a sign of life after which a participant counts as gone. If its process was
+killed, it counts as gone at once."""
 
 MAX_LISTING_TIME = 120.0
-"""Seconds after which the engine treats a list of presences as complete. The engine's own default
+"""Seconds after which Zenoh treats a list of presences as complete. Zenoh's own default
 is 10; to list thousands of presences on a busy machine takes longer."""
 
 PORTS = range(20_000, 32_000)
 """The ports tried for port 0, below the range from which systems give ports to connections.
 
-So no connection of another program takes a port between the test that it is free and the engine's
+So no connection of another program takes a port between the test that it is free and Zenoh's
 use of it.
 """
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 ROOM_TIMEOUT = 0.001
-"""Seconds that the engine waits for room in a queue before it drops a message that may be dropped.
-It waits only once: until it can send something to the same end again, it drops further messages of
-that priority at once."""
+"""Seconds that Zenoh waits for room in a queue before it drops a message that may be dropped. It
+waits only once: until it can send something to the same participant again, it drops further
+messages of that priority at once."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes in each of the queues: for the event loop, for its patient callbacks, and
-for the thread that sends long replies. More is dropped; results are requested again later."""
+"""Largest number of bytes in each of the queues: for the event loop, for its callbacks for later,
+and for the thread that sends long replies. More is dropped; results are requested again later."""
 
 QUERY_BYTES = 256
 """Bytes that a query counts in addition to its payload."""
@@ -92,10 +92,10 @@ MAX_WAITING_QUERIES = 4096
 CALLBACKS_PER_TURN = 64
 """Callbacks that run in one turn of the event loop."""
 
-PATIENT_CALLBACKS_PER_TURN = 8
-"""Patient callbacks that run after the others in one turn of the event loop.
+LATER_CALLBACKS_PER_TURN = 8
+"""Callbacks for later that run after the others in one turn of the event loop.
 
-So a flood of patient callbacks delays other work only by the time that these few take.
+So a flood of them delays other work only by the time that these few take.
 """
 
 CLOSE_TIMEOUT = 5.0
@@ -118,15 +118,15 @@ _CALLBACK_FAILED = "%s ! a message from the bus was not handled: its callback fa
 
 @dataclass(frozen=True)
 class BusLink:
-    """The endpoints by which an end joins the bus.
+    """The endpoints by which a participant joins the bus.
 
     Attributes:
         listen: endpoints to listen on, such as ``tcp/127.0.0.1:7447``.
         connect: endpoints to connect to; of several, one that answers is used.
         certificates: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, for TLS.
-        peer: True if an end that only connects is a peer. A peer, such as a node of rmw_zenoh, also
-            has direct links to the ends that it finds on this host, and keeps working without the
-            routers at ``connect``.
+        peer: True if a participant that only connects is a peer. A peer, such as a node of
+            rmw_zenoh, also has direct links to the participants that it finds on this host, and
+            keeps working without the routers at ``connect``.
     """
 
     listen: tuple[str, ...] = ()
@@ -136,21 +136,21 @@ class BusLink:
 
     @property
     def mode(self) -> str:
-        """The engine's mode: "router" if the end listens, else "peer" or "client"."""
+        """Zenoh's mode: "router" if it listens, else "peer" or "client"."""
         return "router" if self.listen else "peer" if self.peer else "client"
 
     @property
-    def place(self) -> str:
+    def endpoints_text(self) -> str:
         """The endpoints to listen on as a text, or, without them, those to connect to."""
         return ", ".join(self.listen or self.connect)
 
     def settings(self, timeout: float) -> dict[str, Any]:
-        """Return the engine's settings by their paths."""
+        """Return Zenoh's settings by their paths."""
         settings: dict[str, Any] = {
             "mode": self.mode,
             "listen/endpoints": [PEER_ENDPOINT] if self.mode == "peer" else list(self.listen),
             "connect/endpoints": list(self.connect),
-            # 0: one try, then the engine tries again later; a peer does so only with -1, no timeout
+            # 0: one try, then Zenoh tries again later; a peer does so only with -1, no timeout
             "connect/timeout_ms": -1 if self.mode == "peer" else 0,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
             "connect/exit_on_failure": self.mode == "client",
@@ -194,7 +194,7 @@ def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
 
 
 def _free_port(endpoint: str) -> int:
-    """Return a free port; if the host is not this machine, the engine reports it later."""
+    """Return a free port; if the host is not this machine, Zenoh reports it later."""
     host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     ports = random.SystemRandom().sample(PORTS, 100)
@@ -209,8 +209,8 @@ def _free_port(endpoint: str) -> int:
     return ports[0]
 
 
-def _end_lingering(ports: frozenset[int]) -> None:
-    """Make the engine close its connections without waiting for data that is still unsent.
+def _disable_linger(ports: frozenset[int]) -> None:
+    """Make Zenoh close its connections without waiting for data that is still unsent.
 
     Otherwise the thread that serves all connections waits 10 s when it closes a connection that is
     cut off, for the acknowledgement of the last data.
@@ -234,7 +234,7 @@ def _end_lingering(ports: frozenset[int]) -> None:
 
 
 @functools.cache
-def engine() -> Any:
+def load_zenoh() -> Any:
     """Return Zenoh.
 
     Raises:
@@ -244,8 +244,8 @@ def engine() -> Any:
     return load("zenoh")
 
 
-class _EngineUse:
-    """Records whether this process has had a session, since then the engine's threads run in it."""
+class _ZenohUse:
+    """Records whether this process has had a session: then Zenoh's threads run in it."""
 
     def __init__(self) -> None:
         self.has_begun: bool = False
@@ -253,11 +253,11 @@ class _EngineUse:
         notify_of_forks(self)
 
     def on_fork(self) -> None:
-        """Note in a fork that the engine's threads do not run there."""
+        """Note in a fork that Zenoh's threads do not run there."""
         self.is_forked = self.has_begun
 
 
-_use = _EngineUse()
+_use = _ZenohUse()
 
 
 class ZenohSession:
@@ -265,7 +265,7 @@ class ZenohSession:
 
     Args:
         link: endpoints and certificates that the session uses.
-        more: further settings of the engine, by their paths: "transport/link/tx/lease".
+        more: further settings of Zenoh, by their paths: "transport/link/tx/lease".
         bus_name: name of the bus in texts.
     """
 
@@ -276,15 +276,15 @@ class ZenohSession:
         bus_name: str = "the fleet's bus",
     ) -> None:
         self._link, self._extra_settings, self._bus_name = link, dict(more or {}), bus_name
-        self._zenoh = engine()
+        self._zenoh = load_zenoh()
         self._session: Any = None
         self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
-        self._patient = self._waiting.copy()
+        self._waiting_later = self._waiting.copy()
         # bytes of all calls that were queued, counted in any thread; and of those that were handled
-        self._queued_bytes = self._queued_patient_bytes = 0
-        self._handled_bytes = self._handled_patient_bytes = 0
+        self._queued_bytes = self._queued_later_bytes = 0
+        self._handled_bytes = self._handled_later_bytes = 0
         self._wake_pending = False
         self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
@@ -292,7 +292,7 @@ class ZenohSession:
         self._repliers: ThreadPoolExecutor | None = None
         self._reply_count = 0
         self._reopening = False
-        self._linger_timer: asyncio.TimerHandle | None = None  # calls _end_lingering again
+        self._linger_timer: asyncio.TimerHandle | None = None  # disables linger again
 
     # ------------------------------------------------------------------ life
 
@@ -300,21 +300,21 @@ class ZenohSession:
         """Open the session.
 
         Raises:
-            ConnectFailedError: the session cannot listen, or reach another end, within ``timeout``
-                seconds.
-            ConfigurationError: the engine refuses a setting.
+            ConnectFailedError: the session cannot listen, or reach another participant, within
+                ``timeout`` seconds.
+            ConfigurationError: Zenoh refuses a setting.
             LocalProtocolError: this process is a fork of one that had a session before.
         """
         if _use.is_forked:
             raise LocalProtocolError(
-                f"{self._bus_name}: this process is a fork of one in which the engine's threads "
+                f"{self._bus_name}: this process is a fork of one in which Zenoh's threads "
                 "run, and it has none of them: start it by another method, such as "
                 "multiprocessing's 'spawn', or before the first session"
             )
         _use.has_begun = True
         self._loop = asyncio.get_running_loop()
         await self._open(timeout)
-        self._end_lingering()
+        self._keep_linger_disabled()
         self._forget_waiting()
         self._wake_pending = False
         self._bell = _LoopBell.on(self._loop, self._drain)
@@ -327,9 +327,9 @@ class ZenohSession:
                 while self._session is None:
                     begun_at = loop.time()
                     try:
-                        self._session = await self._open_engine_session(timeout)
+                        self._session = await self._open_zenoh_session(timeout)
                     except self._zenoh.ZError as exc:
-                        # the engine gives up a silent end after a lease; then try the others again
+                        # Zenoh gives up a silent one after a lease; then try the others again
                         if loop.time() - begun_at < 0.9 * min(timeout, LEASE_TIME):
                             raise self._connect_error(await self._failure_reason(exc)) from exc
         except TimeoutError as exc:
@@ -338,20 +338,20 @@ class ZenohSession:
             await self._wait_for_router(min(timeout, ROUTER_TIMEOUT))
 
     async def _wait_for_router(self, timeout: float) -> None:
-        """Wait for a router, so that later queries reach all ends; warn if none comes in time."""
+        """Wait for a router, so that later queries reach everybody; warn if none comes in time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 while not self._session.info.routers_zid():  # noqa: ASYNC110 - nothing tells of it
                     await asyncio.sleep(0.02)
                 return
         logger.warning(
-            "%s ! no router at %s yet: ends behind it can be reached once it runs",
+            "%s ! no router at %s yet: programs behind it can be reached once it runs",
             self._bus_name,
-            self._link.place,
+            self._link.endpoints_text,
         )
 
-    async def _open_engine_session(self, timeout: float) -> Any:
-        """Open a session of the engine; close it if it opens only after the caller has given up."""
+    async def _open_zenoh_session(self, timeout: float) -> Any:
+        """Open a Zenoh session; close it if it opens only after the caller has given up."""
         zenoh = self._zenoh
         config = zenoh.Config()
         settings = {**self._link.settings(timeout), **self._extra_settings}
@@ -360,7 +360,7 @@ class ZenohSession:
                 config.insert_json5(path, json.dumps(value))
             except zenoh.ZError as exc:
                 raise ConfigurationError(
-                    f"{self._bus_name}: the engine refuses {path}: {value!r}"
+                    f"{self._bus_name}: Zenoh refuses {path}: {value!r}"
                 ) from exc
         opening = self._loop.run_in_executor(None, zenoh.open, config)
         try:
@@ -372,8 +372,8 @@ class ZenohSession:
     async def reopen(self, timeout: float) -> None:
         """Replace this session by a new one, with all declarations.
 
-        The other ends see this end leave and return; nothing is sent or received in between.
-        Declarations that are requested meanwhile are made with the new session.
+        The other participants see this one leave and return; nothing is sent or received in
+        between. Declarations that are requested meanwhile are made with the new session.
 
         Raises:
             ConnectFailedError: the session cannot listen again within ``timeout`` seconds; there is
@@ -400,15 +400,15 @@ class ZenohSession:
             declared.redeclare()
         self._reopening = False
 
-    def _end_lingering(self) -> None:
-        """Keep the engine's connections from lingering; again and again, for new ones."""
-        self._linger_timer = self._loop.call_later(LEASE_TIME / 2, self._end_lingering)
+    def _keep_linger_disabled(self) -> None:
+        """Keep Zenoh's connections from lingering; again and again, for new ones."""
+        self._linger_timer = self._loop.call_later(LEASE_TIME / 2, self._keep_linger_disabled)
         endpoints = (*self._link.listen, *self._link.connect)
         ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in endpoints)
-        self._loop.run_in_executor(None, _end_lingering, ports)
+        self._loop.run_in_executor(None, _disable_linger, ports)
 
     async def _failure_reason(self, error: Exception) -> str:
-        """Return why no end was reached; the engine does not say that a name does not resolve."""
+        """Return why nobody was reached; Zenoh does not say that a name does not resolve."""
         reason = _reason(error)
         for endpoint in self._link.connect if reason == NOT_ZENOH else ():
             host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
@@ -418,10 +418,10 @@ class ZenohSession:
                 return f"the name {host!r} does not resolve: {exc.strerror}"
         return reason
 
-    def _connect_error(self, why: str) -> ConnectFailedError:
+    def _connect_error(self, reason: str) -> ConnectFailedError:
         verb = "listen on" if self._link.listen else "reach"
-        text = f"{self._bus_name}: cannot {verb} {self._link.place}: {why}"
-        return ConnectFailedError(text, attempts=(why,))
+        text = f"{self._bus_name}: cannot {verb} {self._link.endpoints_text}: {reason}"
+        return ConnectFailedError(text, attempts=(reason,))
 
     async def close(self) -> None:
         """Close the session, and with it all declarations. Idempotent."""
@@ -453,10 +453,10 @@ class ZenohSession:
 
     def _forget_waiting(self) -> None:
         self._waiting.clear()
-        self._patient.clear()
-        self._handled_bytes, self._handled_patient_bytes = (
+        self._waiting_later.clear()
+        self._handled_bytes, self._handled_later_bytes = (
             self._queued_bytes,
-            self._queued_patient_bytes,
+            self._queued_later_bytes,
         )
 
     def call_in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
@@ -469,11 +469,11 @@ class ZenohSession:
             self._wake_pending = True
         self._wake()
 
-    def call_in_loop_patiently(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
-        """Schedule a call like :meth:`call_in_loop`, but after all calls that are not patient."""
+    def call_in_loop_later(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
+        """Schedule a call like :meth:`call_in_loop`, but after all other calls."""
         with self._lock:
-            self._patient.append((call, arguments, size))
-            self._queued_patient_bytes += size
+            self._waiting_later.append((call, arguments, size))
+            self._queued_later_bytes += size
             if self._wake_pending:
                 return
             self._wake_pending = True
@@ -488,7 +488,7 @@ class ZenohSession:
             self._loop.call_soon_threadsafe(self._drain)
 
     def _drain(self) -> None:
-        waiting, patient = self._waiting, self._patient
+        waiting, later = self._waiting, self._waiting_later
         for _ in range(CALLBACKS_PER_TURN):
             if not waiting:
                 break
@@ -500,28 +500,28 @@ class ZenohSession:
                 self._loop.call_soon(self._drain)
                 raise
             except BaseException:
-                logger.exception(_CALLBACK_FAILED, self._link.place)
-        for _ in range(min(PATIENT_CALLBACKS_PER_TURN, len(patient))):
-            if not patient:
+                logger.exception(_CALLBACK_FAILED, self._link.endpoints_text)
+        for _ in range(min(LATER_CALLBACKS_PER_TURN, len(later))):
+            if not later:
                 break
-            call, arguments, size = patient.popleft()
-            self._handled_patient_bytes += size
+            call, arguments, size = later.popleft()
+            self._handled_later_bytes += size
             try:
                 call(*arguments)
             except ENDS_PROGRAM:
                 self._loop.call_soon(self._drain)
                 raise
             except BaseException:
-                logger.exception(_CALLBACK_FAILED, self._link.place)
+                logger.exception(_CALLBACK_FAILED, self._link.endpoints_text)
         with self._lock:
-            self._wake_pending = bool(waiting or patient)
+            self._wake_pending = bool(waiting or later)
         if self._wake_pending:
             self._loop.call_soon(self._drain)
 
-    def full(self, size: int, *, patient: bool = False) -> bool:
+    def full(self, size: int, *, later: bool = False) -> bool:
         """Return True if too many bytes wait for the loop, so that a message has to be dropped."""
-        if patient:
-            waiting = self._queued_patient_bytes - self._handled_patient_bytes
+        if later:
+            waiting = self._queued_later_bytes - self._handled_later_bytes
         else:
             waiting = self._queued_bytes - self._handled_bytes
         if waiting + size <= MAX_WAITING_BYTES:
@@ -530,29 +530,29 @@ class ZenohSession:
             self._reported_dropped = True
             logger.warning(
                 "%s ! this program does not read: %d bytes wait; more is dropped",
-                self._link.place,
+                self._link.endpoints_text,
                 waiting,
             )
         return True
 
-    def reply(self, query: Any, replies: list[tuple[str, bytes]], **how: Any) -> None:
+    def reply(self, query: Any, replies: list[tuple[str, bytes]], **options: Any) -> None:
         """Answer a query, and end it; never waits.
 
-        A thread sends the replies, since the engine may wait for the program that asked.
+        A thread sends the replies, since Zenoh may wait for the program that asked.
 
         Args:
-            query: query of the engine.
+            query: query of Zenoh.
             replies: keys and their payloads.
-            **how: the engine's options of a reply.
+            **options: Zenoh's options of a reply.
         """
         if replies:
-            self._run_in_replier(query, _reply, query, replies, how)
+            self._run_in_replier(query, _reply, query, replies, options)
         else:
             quietly(query.drop)
 
-    def refuse(self, query: Any, why: str) -> None:
+    def refuse(self, query: Any, reason: str) -> None:
         """Answer a query with an error, and end it; never waits."""
-        self._run_in_replier(query, _refuse, query, why)
+        self._run_in_replier(query, _refuse, query, reason)
 
     def _run_in_replier(self, query: Any, call: Callable[..., None], *arguments: Any) -> None:
         if self._session is None or self._reply_count >= MAX_WAITING_QUERIES:
@@ -568,17 +568,17 @@ class ZenohSession:
         with self._lock:
             self._reply_count -= 1
 
-    def declare(self, declared: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
-        """Make a declaration at the engine, and remember it; it is closed with this session.
+    def declare(self, declared: ZenohDeclared, make: Callable[[Any], Any]) -> Any:
+        """Make a declaration at Zenoh, and remember it; it is closed with this session.
 
         Args:
             declared: the owner of the declaration.
-            how: function that gets the engine's session, and returns the engine's declaration.
+            make: function that gets Zenoh's session, and returns Zenoh's declaration.
 
         Returns:
-            The engine's declaration; None while the session is reopened, which makes it later.
+            Zenoh's declaration; None while the session is reopened, which makes it later.
         """
-        declaration = None if self._reopening else how(self.session)
+        declaration = None if self._reopening else make(self.session)
         self._declared[declared] = None
         return declaration
 
@@ -588,7 +588,7 @@ class ZenohSession:
 
     @property
     def session(self) -> Any:
-        """The engine's session.
+        """Zenoh's session.
 
         Raises:
             ConfigurationError: the session is not open.
@@ -603,7 +603,7 @@ class ZenohSession:
         return self._session is not None
 
     @property
-    def engine(self) -> Any:
+    def zenoh(self) -> Any:
         """Zenoh's module."""
         return self._zenoh
 
@@ -654,28 +654,28 @@ class _LoopBell:
 
 
 class ZenohDeclared:
-    """A declaration at the engine, until this object or its session is closed.
+    """A declaration at Zenoh, until this object or its session is closed.
 
     Args:
-        end: the session for the declaration.
-        by_dropping: True if the engine's declaration ends by dropping its only reference, which is
+        owner: the session for the declaration.
+        by_dropping: True if Zenoh's declaration ends by dropping its only reference, which is
             this object's. To undeclare an advanced publisher or subscriber, the binding holds
             Python's lock while it waits for a thread that may wait for that lock; to drop it, the
             binding releases the lock.
     """
 
-    def __init__(self, end: ZenohSession, *, by_dropping: bool = False) -> None:
+    def __init__(self, owner: ZenohSession, *, by_dropping: bool = False) -> None:
         self._by_dropping = by_dropping
-        self._end = end
+        self._owner = owner
         self._closed = False
         self._declaration: Any = None
-        self._how: Callable[[Any], Any] = _declare_nothing
+        self._make: Callable[[Any], Any] = _declare_nothing
         self._on_lost: Callable[[], None] | None = None
 
-    def declare(self, how: Callable[[Any], Any]) -> Self:
-        """Make the declaration: ``how`` gets the engine's session, and returns the declaration."""
-        self._how = how
-        self._declaration = self._end.declare(self, how)
+    def declare(self, make: Callable[[Any], Any]) -> Self:
+        """Make the declaration: ``make`` gets Zenoh's session, and returns the declaration."""
+        self._make = make
+        self._declaration = self._owner.declare(self, make)
         return self
 
     def when_lost(self, call: Callable[[], None]) -> Self:
@@ -687,13 +687,13 @@ class ZenohDeclared:
         """Prepare for the end of the session; return the declaration to keep until that end."""
         declaration, self._declaration = self._declaration, None
         if self._on_lost is not None:
-            self._end.call_in_loop_uncounted(self.call, self._on_lost)
+            self._owner.call_in_loop_uncounted(self.call, self._on_lost)
         return None if self._by_dropping else declaration
 
     def redeclare(self) -> None:
         """Make the declaration again with the new session."""
         if not self._closed and self._declaration is None:
-            self._declaration = self._how(self._end.session)
+            self._declaration = self._make(self._owner.session)
 
     def call(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call a function, unless the declaration was closed meanwhile."""
@@ -704,14 +704,14 @@ class ZenohDeclared:
         """End the declaration. Idempotent."""
         if not self._closed:
             self._closed = True
-            self._end.forget(self)
+            self._owner.forget(self)
             declaration, self._declaration = self._declaration, None
             if not self._by_dropping and declaration is not None:
                 quietly(declaration.undeclare)
 
 
-def _end_and_release(session: Any, declarations: list[Any], router: bool) -> None:
-    _end_session(session, [], router)
+def _end_and_release(session: Any, declarations: list[Any], is_kept: bool) -> None:
+    _end_session(session, [], is_kept)
     declarations.clear()  # this is slow while the session is open
 
 
@@ -719,96 +719,96 @@ def _declare_nothing(_: Any) -> None:
     pass
 
 
-def _reply(query: Any, replies: list[tuple[str, bytes]], how: dict[str, Any]) -> None:
+def _reply(query: Any, replies: list[tuple[str, bytes]], options: dict[str, Any]) -> None:
     for key, payload in replies:
-        quietly(query.reply, key, payload, express=True, **how)
+        quietly(query.reply, key, payload, express=True, **options)
     quietly(query.drop)
 
 
-def _refuse(query: Any, why: str) -> None:
-    quietly(query.reply_err, why.encode())
+def _refuse(query: Any, reason: str) -> None:
+    quietly(query.reply_err, reason.encode())
     quietly(query.drop)
 
 
-def _end_session(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
+def _end_session(session: Any, threads: list[ThreadPoolExecutor], is_kept: bool) -> None:
     """Wait for the threads that still send, then end the session.
 
-    The session of a router is never freed, which costs 16 KiB. Dropping its last reference would
-    wait for a thread of the engine and hold the interpreter lock meanwhile, and that thread may
-    wait for the lock to call another session of this process.
+    With ``is_kept``, as for routers and peers, the session is never freed, which costs 16 KiB.
+    Dropping its last reference would wait for a thread of Zenoh and hold the interpreter lock
+    meanwhile, and that thread may wait for the lock to call another session of this process.
     """
     for pool in threads:
         pool.shutdown()
-    if router:
+    if is_kept:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     session.close()
 
 
-class _EngineThread(threading.local):
-    """A thread of the engine that calls back into Python."""
+class _ZenohThread(threading.local):
+    """A thread of Zenoh that calls back into Python."""
 
     is_kept: bool = False
 
 
-_engine_thread = _EngineThread()
+_zenoh_thread = _ZenohThread()
 
 
 def keep_thread() -> None:
-    """Keep Python's state of this thread of the engine; call this first in a callback.
+    """Keep Python's state of this thread of Zenoh; call this first in a callback.
 
     For each callback the binding would make and free Python's state of the thread, which takes a
     third of the time of a message. This function enters Python once without leaving it, so the
-    thread keeps its state until it ends. The engine has few threads, which end with the process.
+    thread keeps its state until it ends. Zenoh has few threads, which end with the process.
     """
-    if not _engine_thread.is_kept:
-        _engine_thread.is_kept = True
+    if not _zenoh_thread.is_kept:
+        _zenoh_thread.is_kept = True
         ctypes.pythonapi.PyGILState_Ensure()
 
 
 def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
-    """Return a handler that runs ``call`` in the engine's own thread, not in a new one.
+    """Return a handler that runs ``call`` in Zenoh's own thread, not in a new one.
 
     ``ended`` is called when no more calls will come.
     """
 
     def callback(received: Any) -> None:
-        if not _engine_thread.is_kept:
+        if not _zenoh_thread.is_kept:
             keep_thread()
         call(received)
 
-    return engine().handlers.Callback(callback, ended, indirect=False)
+    return load_zenoh().handlers.Callback(callback, ended, indirect=False)
 
 
 def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
-    """Call the engine; log an error that only means that the session has ended meanwhile.
+    """Call Zenoh; log an error that only means that the session has ended meanwhile.
 
     An object that another thread is using cannot be released now; that thread releases it later.
     """
     try:
         call(*arguments, **named)
-    except engine().ZError as exc:
-        logger.debug("the engine: %s", exc)
+    except load_zenoh().ZError as exc:
+        logger.debug("Zenoh: %s", exc)
     except RuntimeError as exc:
         if "borrowed" not in str(exc):
             raise
-        logger.debug("the engine: %s, in another thread", exc)
+        logger.debug("Zenoh: %s, in another thread", exc)
 
 
-def _close_late(router: bool, opening: asyncio.Future[Any]) -> None:
+def _close_late(is_kept: bool, opening: asyncio.Future[Any]) -> None:
     """Close a session that was opened after the caller had given up.
 
     The thread that closes it is no daemon, so that the interpreter waits for it at its exit.
-    Otherwise the thread could not return from the engine to Python, and the engine would abort the
+    Otherwise the thread could not return from Zenoh to Python, and Zenoh would abort the
     process.
     """
     if not opening.cancelled() and opening.exception() is None:
         threading.Thread(
-            target=_end_session, args=(opening.result(), [], router), daemon=False
+            target=_end_session, args=(opening.result(), [], is_kept), daemon=False
         ).start()
 
 
 def _reason(error: Exception) -> str:
-    """Return an error's text: the system's own text in it, or else all but the engine's line."""
+    """Return an error's text: the system's part of it, or else all but the line of Zenoh's code."""
     text = str(error).partition(" at /")[0].strip(" .")
     system = re.search(r": ([^:]+) \(os error \d+\)", text)
     if system is not None:

@@ -224,21 +224,21 @@ FleetCamera.frame_source  encoding: choice, quality: integer or None
 Fleet.agents  pattern: pattern
 Fleet.cameras  pattern: pattern
 Fleet.events  max_queue: count, overflow: choice
-Fleet.meet  pattern: pattern
+Fleet.find_cameras  pattern: pattern
 Fleet.names  pattern: pattern
 Fleet.reload  agent: choice or None, timeout: seconds
 Fleet.results  pattern: pattern, min_interval: seconds, max_queue_bytes: count, max_queue: count,
     overflow: choice
 Fleet.status  pattern: pattern, timeout: seconds
 Fleet.outlets  timeout: seconds
-Fleet.stored_results  pattern: pattern, since: function or None, failed: flag, most: integer,
-    timeout: seconds
+Fleet.stored_results  pattern: pattern, since: function or None, only_failed: flag,
+    max_rows: integer, timeout: seconds
 Fleet.trigger  pattern: url, timeout: seconds
 Outlets.__init__  section: mapping, folder: text, columns: function, command: function or None,
     cameras: function, application_names: function, on_trouble: function
 Outlets.stored  query: object
 Fleet.url_of  name: text
-fleet.open  place: url, connect_timeout: seconds
+fleet.open  address_or_file: url, connect_timeout: seconds
 FrameSource.__init__  driver: not judged, camera_info: not judged, timeout: seconds or None,
     stall: seconds or None, linger: seconds
 FrameSource.reader  timeout: seconds or None
@@ -387,7 +387,7 @@ NOT_HERE: dict[str, str] = {
         FrameTrigger AwaitedTrigger FrameFeatures.__init__ FrameFeature.__init__ FoundSource
         Frame FrameSet PixelFormat ReaderStatistics SourceStatistics FrameAddress Finding
         FoundPort H264Encoder H264Decoder Camera.__init__ SmartCamera.__init__
-        Recording.__init__ FleetCamera.__init__ FleetCamera.agent_left FleetCamera.follow
+        Recording.__init__ FleetCamera.__init__ FleetCamera.agent_left FleetCamera.connect_to_agent
         Fleet.__init__ FrameReader.__init__ SyncCameraBase.__init__
         SyncSubscription.__init__ SyncFrameReaderBase SyncFrameReader CameraLog.__init__
         ThreadedCamera.in_thread Backoff.delays WireCamera.__init__ Device.__init__

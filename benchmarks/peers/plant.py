@@ -61,7 +61,7 @@ async def agent(count: int, port: int, name: str, place: str, how: str) -> None:
     before = resident()
     async with smartcam.fleet.serve(file) as server:
         async with asyncio.timeout(PATIENCE):
-            while not all(one.connected for one in server.hosts.values()):  # noqa: ASYNC110
+            while not all(one.connected for one in server.shared_cameras.values()):  # noqa: ASYNC110
                 await asyncio.sleep(0.1)
         gc.collect()
         await serve_control([server.address.port], before)

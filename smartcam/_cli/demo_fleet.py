@@ -41,9 +41,9 @@ async def demo(options: Options) -> None:
     """Start agents, share a camera, reserve it, trigger all, end agents."""
     from smartcam._zenoh import BusLink, with_ports
     from smartcam.fleet import open
-    from smartcam.fleet._inside import ZenohEnd
+    from smartcam.fleet._inside import ZenohConnection
 
-    ZenohEnd(BusLink())  # raises if the engine is missing
+    ZenohConnection(BusLink())  # raises if the engine is missing
     steps = Steps(options)
     (endpoint,) = with_ports(["tcp/127.0.0.1:0"])
     url = f"fleet://{endpoint.partition('/')[2]}"

@@ -86,9 +86,9 @@ async def certificates(
 
 def _certificate_row(certificate: MadeCertificate) -> tuple[str, ...]:
     end_text = (
-        f"{certificate.ends:%Y-%m-%d}"
-        if certificate.ends - datetime.now(UTC) > timedelta(days=2)
-        else (f"{certificate.ends:%Y-%m-%d %H:%M} UTC")
+        f"{certificate.expires_at:%Y-%m-%d}"
+        if certificate.expires_at - datetime.now(UTC) > timedelta(days=2)
+        else (f"{certificate.expires_at:%Y-%m-%d %H:%M} UTC")
     )
     return (
         certificate.name,

@@ -72,8 +72,8 @@ async def _show_fleet_stores(
         stores = await fleet.stored_results(
             camera,
             since=since,
-            failed=failed,
-            most=min(max_count, 1000),
+            only_failed=failed,
+            max_rows=min(max_count, 1000),
             timeout=options.step_timeout(30.0),
         )
     if not stores:

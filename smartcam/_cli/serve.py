@@ -83,7 +83,7 @@ def _json_logs(server: FleetServer | None, options: Options) -> Iterator[None]:
     with json_log(
         level,
         lambda: "" if server is None else server.name or server.file.agent or "",
-        lambda: () if server is None else server.hosts,
+        lambda: () if server is None else server.shared_cameras,
     ):
         try:
             yield
@@ -180,7 +180,7 @@ class AgentRunner:
             url = server.address.url
             router: dict[str, Any] = {"url": url, "router": True}
             self._print("", router, f"{url}  a router, without cameras", connected=True)
-        for name in [*server.hosts]:
+        for name in [*server.shared_cameras]:
             value = _camera_data(server, name)
             reason = "" if value["connected"] else f"  not connected: {value['reason']}"
             self._print(name, value, f"{value['url']}{reason}", connected=value["connected"])
@@ -189,13 +189,13 @@ class AgentRunner:
     async def _operations_page(self) -> AsyncIterator[None]:
         """Serve health and metrics while the block runs, if the file asks for them."""
         section = self._server.file.operations
-        if section is None or section.place is None:
+        if section is None or section.endpoint is None:
             yield
             return
         from smartcam.web import OperationsSite
 
         async with OperationsSite(self._server) as site:
-            logger.info("health and numbers are at port %d of %s", site.port, section.place[0])
+            logger.info("health and numbers are at port %d of %s", site.port, section.endpoint[0])
             yield
 
     def _print(self, camera: str, value: dict[str, Any], text: str, *, connected: bool) -> None:
@@ -207,7 +207,7 @@ class AgentRunner:
 
     def _log_event(self, event: CameraEvent) -> None:
         extra = {"camera": event.camera}
-        if event.camera not in self._server.hosts:
+        if event.camera not in self._server.shared_cameras:
             return  # the camera was removed from the file
         if isinstance(event, Disconnected):
             logger.warning("not connected: %s", event.reason, extra=extra)
@@ -243,9 +243,9 @@ class AgentRunner:
 
     def _status(self) -> str:
         server = self._server
-        hosts = server.hosts.values()
-        text = f"{sum(host.connected for host in hosts)} of {len(hosts)} cameras connected"
-        if server.agent is not None and not server.reached:
+        cameras = server.shared_cameras.values()
+        text = f"{sum(camera.connected for camera in cameras)} of {len(cameras)} cameras connected"
+        if server.agent is not None and not server.is_connected:
             text = f"not on the bus; {text}"
         last = server.reloads.last
         return f"{text}; not reloaded: {last}" if isinstance(last, Exception) else text
@@ -312,7 +312,7 @@ async def share(server: FleetServer, options: Options) -> None:
     """Print the URLs of a started agent's cameras, and then each event, until cancelled."""
     await server.wait_first_attempts()
     events = server.events()
-    for name in server.hosts:
+    for name in server.shared_cameras:
         value = _camera_data(server, name)
         reason = "" if value["connected"] else f"  not connected: {value['reason']}"
         options.show(value, f"{value['url']}{reason}")
@@ -322,22 +322,22 @@ async def share(server: FleetServer, options: Options) -> None:
 
 def _camera_data(server: FleetServer, name: str) -> dict[str, Any]:
     """Return the state of one of the agent's cameras as values for JSON."""
-    host = server.hosts[name]
-    connected = host.connected
-    failure = host.failure or "it is tried for the first time"
+    camera = server.shared_cameras[name]
+    connected = camera.connected
+    failure = camera.failure or "it is tried for the first time"
     return {
         "url": server.address.of(name).url,
         "name": name,
-        "camera": host.camera.url,
+        "camera": camera.client.url,
         "connected": connected,
-        "application": host.camera.active_application if connected else None,
+        "application": camera.client.active_application if connected else None,
         "reason": None if connected else str(failure).removeprefix(f"{name}: "),
     }
 
 
 def report_event(server: FleetServer, event: CameraEvent, options: Options) -> None:
     """Report that a camera was connected, or lost."""
-    is_shared = event.camera in server.hosts
+    is_shared = event.camera in server.shared_cameras
     if not (is_shared and isinstance(event, (Connected, Disconnected, Reconnected))):
         return
     value = _camera_data(server, event.camera)

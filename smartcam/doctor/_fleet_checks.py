@@ -19,7 +19,7 @@ from smartcam.exceptions import (
 from smartcam.fleet._inside import (
     FleetAddress,
     Keys,
-    ZenohEnd,
+    ZenohConnection,
     expiry_warning,
     may_command,
     read_identity,
@@ -89,7 +89,7 @@ async def reach_bus(exam: Examination) -> None:
     writer.transport.abort()
     if not await _check_certificates(exam, address):
         return
-    bus = ZenohEnd(address.link)
+    bus = ZenohConnection(address.link)
     begin = asyncio.get_running_loop().time()
     try:
         await bus.open(limit)
@@ -134,7 +134,9 @@ async def _check_certificates(exam: Examination, address: FleetAddress) -> bool:
             "to name the host of the URL: smartcam fleet certificates --host.",
         )
         return False
-    warning = own_identity.warning or expiry_warning("the agent's certificate", peer_identity.ends)
+    warning = own_identity.warning or expiry_warning(
+        "the agent's certificate", peer_identity.expires_at
+    )
     exam.report(
         "hint" if warning else "ok",
         f"this program is {own_identity}: it may look"
@@ -143,8 +145,8 @@ async def _check_certificates(exam: Examination, address: FleetAddress) -> bool:
         check="certificates",
         role=own_identity.role,
         certificate=own_identity.name,
-        ends=own_identity.ends,
-        agent_ends=peer_identity.ends,
+        ends=own_identity.expires_at,
+        agent_ends=peer_identity.expires_at,
     )
     return True
 
@@ -212,7 +214,9 @@ async def _list_cameras(exam: Examination, address: FleetAddress) -> list[tuple[
     pattern = Keys(address.fleet or "*").camera("*", "**")
     while True:
         cameras: list[tuple[str, str, str]] = []
-        for key in await bus.present(pattern, max(AGENT_SEARCH_INTERVAL, deadline - loop.time())):
+        for key in await bus.present_keys(
+            pattern, max(AGENT_SEARCH_INTERVAL, deadline - loop.time())
+        ):
             _, fleet, _, _, agent, *chunks = key.split("/")
             cameras.append((fleet, agent, "/".join(chunks)))
         if loop.time() > deadline or any(name == address.camera for *_, name in cameras):

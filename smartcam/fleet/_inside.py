@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.address import FleetAddress
     from smartcam.fleet._bus.bus import Bus
     from smartcam.fleet._bus.keys import Keys, patterns_overlap
-    from smartcam.fleet._bus.zenoh import ZenohEnd
+    from smartcam.fleet._bus.zenoh import ZenohConnection
     from smartcam.fleet._file.fleet_file import fleet_schema
     from smartcam.fleet._file.operations import OperationsSection
     from smartcam.fleet._file.recording import RecordSection
     from smartcam.fleet._file.ros import RosSection
     from smartcam.fleet._opening import fleet_camera
     from smartcam.fleet._operations.metric_families import exposition, require_prometheus
-    from smartcam.fleet._operations.metrics import read_numbers
+    from smartcam.fleet._operations.metrics import read_counts
     from smartcam.fleet._outlets import FleetOutlets
     from smartcam.fleet._program.fleet import FleetResults
     from smartcam.fleet._ros import RosFleet, ros_of
@@ -48,7 +48,7 @@ __all__ = [
     "ReportedStore",
     "RosFleet",
     "RosSection",
-    "ZenohEnd",
+    "ZenohConnection",
     "expiry_warning",
     "exposition",
     "fleet_camera",
@@ -57,8 +57,8 @@ __all__ = [
     "may_command",
     "patterns_overlap",
     "raise_descriptor_limit",
+    "read_counts",
     "read_identity",
-    "read_numbers",
     "require_prometheus",
     "ros_of",
     "shake_hands",
@@ -76,13 +76,13 @@ if not TYPE_CHECKING:
             "_bus.address": "FleetAddress",
             "_bus.bus": "Bus",
             "_bus.keys": "Keys patterns_overlap",
-            "_bus.zenoh": "ZenohEnd",
+            "_bus.zenoh": "ZenohConnection",
             "_file.operations": "OperationsSection",
             "_file.recording": "RecordSection",
             "_file.ros": "RosSection",
             "_opening": "fleet_camera",
             "_operations.metric_families": "exposition require_prometheus",
-            "_operations.metrics": "read_numbers",
+            "_operations.metrics": "read_counts",
             "_outlets": "FleetOutlets",
             "_ros": "RosFleet ros_of",
             "_security.authority": "MadeCertificate make_certificates",

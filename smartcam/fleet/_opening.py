@@ -11,7 +11,7 @@ from smartcam.exceptions import ConfigurationError, UnsupportedError
 from smartcam.fleet._agent.server import FleetServer
 from smartcam.fleet._bus.address import FleetAddress, missing_certificates
 from smartcam.fleet._bus.bus import MemoryBus
-from smartcam.fleet._bus.zenoh import ZenohEnd
+from smartcam.fleet._bus.zenoh import ZenohConnection
 from smartcam.fleet._file.fleet_file import FleetFile
 from smartcam.fleet._program.camera import FleetCamera
 from smartcam.fleet._program.fleet import Fleet
@@ -52,14 +52,14 @@ def serve(file: str | Path | FleetFile) -> FleetServer:
         file: path of a fleet file, or its contents.
 
     Raises:
-        ConfigurationError: the file is wrong; the text names the place.
+        ConfigurationError: the file is wrong; the text names the field.
         MissingExtraError: the extra ``fleet`` is not installed.
     """
     return FleetServer(file)
 
 
 def open(
-    place: str | Path | FleetFile,
+    address_or_file: str | Path | FleetFile,
     *,
     connect_timeout: float = 10.0,
     **options: Unpack[FleetOptions],
@@ -67,8 +67,8 @@ def open(
     """Return a fleet, which ``async with`` opens.
 
     Args:
-        place: the fleet's URL, ``fleet://HOST[:PORT]``; or a fleet file, whose agent and cameras
-            then are in this process, without an engine, and only for this program.
+        address_or_file: the fleet's URL, ``fleet://HOST[:PORT]``; or a fleet file, whose agent and
+            cameras then are in this process, without Zenoh, and only for this program.
         connect_timeout: seconds for connecting to the fleet and finding its cameras.
         **options: ``interpret_as``, ``calibration``, ``y_down``, ``lenient``, ``switch_timeout``,
             ``request_timeout``, ``reconnect``, as for :func:`smartcam.connect`.
@@ -85,18 +85,18 @@ def open(
                 f"{did_you_mean(name, known)}"
             )
     connect_timeout = check_seconds(connect_timeout, "connect_timeout", "open")
-    if not isinstance(place, (Path, FleetFile)):
-        place = check_text(place, "fleet", least=1)
-    if isinstance(place, str) and "://" in place:
-        address = FleetAddress.parse(place)
+    if not isinstance(address_or_file, (Path, FleetFile)):
+        address_or_file = check_text(address_or_file, "fleet", least=1)
+    if isinstance(address_or_file, str) and "://" in address_or_file:
+        address = FleetAddress.parse(address_or_file)
         if address.camera:
             raise ConfigurationError(
-                f"fleet address {place!r} is a camera's; smartcam.connect() takes it"
+                f"fleet address {address_or_file!r} is a camera's; smartcam.connect() takes it"
             )
-        return Fleet(_end(address), address, address.fleet, None, connect_timeout, options)
+        return Fleet(_connection(address), address, address.fleet, None, connect_timeout, options)
     bus = MemoryBus()
-    server = FleetServer(place, bus=bus.end())
-    return Fleet(bus.end(), None, server.file.fleet, server, connect_timeout, options)
+    server = FleetServer(address_or_file, bus=bus.new_connection())
+    return Fleet(bus.new_connection(), None, server.file.fleet, server, connect_timeout, options)
 
 
 SESSION_OPTIONS = frozenset(
@@ -128,12 +128,14 @@ def fleet_camera(
             f"{url}: {', '.join(refused)}: these are options of the camera's session, which its "
             "agent has: set them in fleet.yaml"
         )
-    program = Program(_end(address), address.fleet, address.camera, display_name=address.program)
+    program = Program(
+        _connection(address), address.fleet, address.camera, display_name=address.program
+    )
     return FleetCamera(settings, address.camera, program, observers=observers)
 
 
-def _end(address: FleetAddress) -> ZenohEnd:
+def _connection(address: FleetAddress) -> ZenohConnection:
     folder = address.certificates
     if folder is not None and (missing := missing_certificates(Path(folder))):
         raise ConfigurationError(f"fleet address {address.url!r}: certificates: {missing}")
-    return ZenohEnd(address.link)
+    return ZenohConnection(address.link)

@@ -64,7 +64,7 @@ class FleetOutlets(Server):
             columns=self._columns,
             command=self._command,
             on_trouble=report,
-            cameras=self._cameras,
+            cameras=self._emulated_cameras,
             application_names=self._names,
         )
         self._observer = _OutletObserver(self)
@@ -80,7 +80,7 @@ class FleetOutlets(Server):
 
         Cancellation: the outlets are stopped.
         """
-        if self._server.hosts:
+        if self._server.shared_cameras:
             raise ConfigurationError("outlets: start them before the server")
         await self.outlets.start()
         if self._observer not in self._server.observers:
@@ -106,7 +106,8 @@ class FleetOutlets(Server):
         Cancellation: the thread that reads finishes its work.
         """
         since = None if request.since is None else datetime.fromisoformat(request.since)
-        question = self._question_class(since, request.failed, request.camera, request.most)
+        pattern, max_rows = request.camera, request.max_rows
+        question = self._question_class(since, request.only_failed, pattern, max_rows)
         answers = await asyncio.to_thread(self.outlets.stored, question)
         return {name: {"rows": answer.rows, **answer.summary} for name, answer in answers.items()}
 
@@ -117,14 +118,14 @@ class FleetOutlets(Server):
             return None
         entry = planned.entry
         is_software = entry.software is not None and entry.interpret_as is None
-        host = self._server.hosts.get(camera) if is_software else None
-        source: object = entry if host is None else host.settings
+        shared = self._server.shared_cameras.get(camera) if is_software else None
+        source: object = entry if shared is None else shared.settings
         known = self._interpretations.get(camera)
         if known is None or known[0] is not source:
             spec: Any = "raw" if entry.interpret_as is None else entry.interpret_as
-            if host is not None:
-                spec = host.settings.interpret_as
-            elif is_software:  # entries of an earlier run may need it before the camera is started
+            if shared is not None:
+                spec = shared.settings.interpret_as
+            elif is_software:  # spooled results may need it before the camera starts
                 device = software_camera(camera, entry.software or {}, self._server.folder)
                 spec = {number: program.interpret_as for number, program in device.programs.items()}
             interpretation = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
@@ -133,17 +134,18 @@ class FleetOutlets(Server):
 
     def endian(self, camera: str) -> int:
         """Return the byte order in a camera's last status."""
-        host = self._server.hosts.get(camera)
-        return 0 if host is None else host.camera.endian
+        shared = self._server.shared_cameras.get(camera)
+        return 0 if shared is None else shared.client.endian
 
-    def _cameras(self) -> dict[str, bool | None]:
+    def _emulated_cameras(self) -> dict[str, bool | None]:
+        """Return the names of the cameras, and whether each is emulated."""
         plan = self._server.reloads.current.plan
         return {name: planned.entry.emulated is not None for name, planned in plan.items()}
 
     def _names(self, camera: str) -> Mapping[str, int]:
-        host = self._server.hosts.get(camera)
-        if host is not None:
-            return host.settings.application_names
+        shared = self._server.shared_cameras.get(camera)
+        if shared is not None:
+            return shared.settings.application_names
         planned = self._server.reloads.current.plan.get(camera)
         return {} if planned is None else planned.entry.application_names
 
@@ -155,7 +157,7 @@ class FleetOutlets(Server):
 
     async def _command(self, name: str, verb: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Carry out a command for an outlet, as a program of the fleet."""
-        if name not in self._server.hosts:
+        if name not in self._server.shared_cameras:
             raise ConfigurationError(f"there is no camera {name!r:.120} here")
         async with self._opening_lock:
             camera = self._command_cameras.get(name)
@@ -200,12 +202,12 @@ class _OutletObserver(Observer):
             self._offer(result, interpretation, endian)
 
     def _offer(self, result: Result, interpretation: Interpretation | None, endian: int) -> None:
-        cells = result.value.cells
+        cells_json = result.value.cells
 
         def read_value() -> tuple[Any, int | None]:
             if interpretation is None:
                 return None, None
-            content: dict[str, Any] = json.loads(cells) if cells else {}
+            content: dict[str, Any] = json.loads(cells_json) if cells_json else {}
             texts = content.get("cells")
             container = ResultContainer(
                 application=result.application,

@@ -11,7 +11,7 @@ from smartcam._finishing import close_all
 from smartcam._ros_names import as_name
 from smartcam._server import Server
 from smartcam.exceptions import SmartCamError
-from smartcam.fleet._bus.zenoh import ZenohEnd
+from smartcam.fleet._bus.zenoh import ZenohConnection
 from smartcam.fleet._file.ros import RosCamera, RosSection, node_names
 from smartcam.fleet._program.camera import FleetCamera
 from smartcam.fleet._program.fleet import CameraJoined, Fleet
@@ -34,14 +34,15 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 CONNECT_TIMEOUT = 10.0
 """Seconds for connecting to the fleet."""
 
-MEET_TIMEOUT = 2.0
-"""Seconds to wait for a camera's agent before its node is created."""
+FIRST_ANSWER_TIMEOUT = 2.0
+"""Seconds to wait for the first answer of a camera's agent before the camera's node is created."""
 
 
 class _NodeCamera(FleetCamera[Any]):
     """A camera that expects no application, since ROS gets the results of all applications.
 
-    Its calibration applies only to applications whose results are localizations.
+    Its calibration applies only to applications whose results are localizations, so it drops
+    ``of_camera``, which would require localizations of each.
     """
 
     def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
@@ -59,7 +60,7 @@ class _NodeFleet(Fleet):
 
     def __init__(self, *arguments: Any, calibrations: Mapping[str, Calibration]) -> None:
         self._calibrations = calibrations
-        super().__init__(*arguments, guest=True)
+        super().__init__(*arguments, bus_is_shared=True)
 
     def _make_camera(self, name: str) -> FleetCamera[Any]:
         calibration = self._calibrations.get(name)
@@ -72,7 +73,7 @@ class RosFleet(Server):
     """Runs a node for each camera of a fleet.
 
     Args:
-        bus: open end of the fleet's bus; its session carries ROS, too.
+        bus: opened connection to the fleet's bus; its session carries ROS, too.
         fleet: the fleet's name; None for the only one on the bus.
         address: address of the fleet.
         section: settings of all cameras' nodes.
@@ -86,7 +87,7 @@ class RosFleet(Server):
         hand_eyes: hand-eye calibrations of the cameras, by name.
         wanted: function of an agent's name and a camera's name that returns whether the camera
             gets a node.
-        calibrations_by_camera: calibrations made by the agent; None if there is no folder for them.
+        calibrations_by_camera: calibrations of the agent's cameras, by name; None without a folder.
 
     Raises:
         ConfigurationError: the domain is not valid, or rclpy is wanted and not installed.
@@ -95,7 +96,7 @@ class RosFleet(Server):
 
     def __init__(
         self,
-        bus: ZenohEnd,
+        bus: ZenohConnection,
         fleet: str | None,
         address: FleetAddress,
         section: RosSection,
@@ -111,7 +112,7 @@ class RosFleet(Server):
     ) -> None:
         self._calibrations_by_camera = calibrations_by_camera
         self._section, self._camera_options, self._wanted = section, dict(cameras or {}), wanted
-        self._settings, self._frames = settings or {}, frames or {}  # the server adds entries later
+        self._settings, self._frames = settings or {}, frames or {}  # the agent adds entries later
         self._hand_eyes, self._controls = hand_eyes or {}, controls or {}
         self.context: RosContext | NativeContext = _context(bus, section)
         self._fleet = _NodeFleet(
@@ -149,7 +150,7 @@ class RosFleet(Server):
         agents = self._fleet.agents(name)
         if not any(self._wanted(agent, name) for agent in agents):
             return
-        await self._wait_met(camera)
+        await self._wait_for_agent(camera)
         old = self.nodes.pop(name, None)
         if old is not None:
             await old.stop()
@@ -163,11 +164,11 @@ class RosFleet(Server):
         self._node_cameras[name], self.nodes[name] = camera, camera_node
 
     @staticmethod
-    async def _wait_met(camera: FleetCamera[Any]) -> None:
+    async def _wait_for_agent(camera: FleetCamera[Any]) -> None:
         """Wait briefly for the agent's answer, which says whether the camera has frames."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(MEET_TIMEOUT):
-                while not camera.met:  # noqa: ASYNC110 - there is no event for it
+            async with asyncio.timeout(FIRST_ANSWER_TIMEOUT):
+                while not camera.has_agent:  # noqa: ASYNC110 - there is no event for it
                     await asyncio.sleep(0.01)
 
     def _node(self, name: str) -> Node | NativeNode:
@@ -183,6 +184,7 @@ class RosFleet(Server):
 
     def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
         options = self._camera_options.get(name, RosCamera.model_validate({}))
+        calibrations = self._calibrations_by_camera
         return CameraNodeOptions(
             frame_id=options.frame_id or as_name(name).replace("/", "_"),
             parent_frame=options.parent_frame or "",
@@ -191,12 +193,10 @@ class RosFleet(Server):
             calibrated_at=options.robot_pose(),
             autostart=self._section.autostart,
             settings=self._settings.get(name),
-            is_agent_alive=lambda: camera.met,
+            is_agent_alive=lambda: camera.has_agent,
             frames=self._frames.get(name, {}),
             controls=self._controls.get(name),
-            calibrations=None
-            if self._calibrations_by_camera is None
-            else self._calibrations_by_camera.of(name),
+            calibrations=None if calibrations is None else calibrations.of(name),
         )
 
     @property
@@ -216,7 +216,7 @@ class RosFleet(Server):
         await self._fleet.close()
 
 
-def _context(bus: ZenohEnd, section: RosSection) -> RosContext | NativeContext:
+def _context(bus: ZenohConnection, section: RosSection) -> RosContext | NativeContext:
     """Return the context of the nodes: the bus' own session, or a context of rclpy."""
     if section.through == "zenoh":
         return RosContext(bus, domain=section.domain, distribution=section.distribution)
@@ -231,7 +231,7 @@ async def ros_of(address: FleetAddress, section: RosSection) -> AsyncIterator[Ro
     Raises:
         ConnectFailedError: no bus, or no agent with a camera, answers in time.
     """
-    bus = ZenohEnd(address.link, SETTINGS)
+    bus = ZenohConnection(address.link, SETTINGS)
     await bus.open(CONNECT_TIMEOUT)
     try:
         async with RosFleet(bus, address.fleet, address, section) as ros:

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Any
 
-from smartcam.fleet._inside import RosFleet, ZenohEnd
+from smartcam.fleet._inside import RosFleet, ZenohConnection
 from smartcam.ros1._link import checked_url
 from smartcam.ros1._rosbridge import RosbridgeNode
 
@@ -81,7 +81,7 @@ async def run_bridged_nodes(
         ConnectFailedError: no bus, or no agent with a camera, was found in time.
     """
     checked_url(bridge)
-    bus = ZenohEnd(address.link)
+    bus = ZenohConnection(address.link)
     await bus.open(TIMEOUT)
     try:
         args = (bus, address.fleet, address, section)

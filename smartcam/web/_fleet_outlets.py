@@ -73,7 +73,7 @@ class OutletsView:
         async with self._store_questions:
             try:
                 return await self._fleet.stored_results(
-                    query.camera, since=since, failed=query.failed, most=query.limit
+                    query.camera, since=since, only_failed=query.failed, max_rows=query.limit
                 )
             except ConfigurationError as exc:
                 raise RefusedError(422, str(exc)[:300], expected="a pattern of cameras") from exc

@@ -15,7 +15,7 @@ from smartcam._accepting import is_loopback
 from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._inside import OperationsSection, exposition, read_numbers, require_prometheus
+from smartcam.fleet._inside import OperationsSection, exposition, read_counts, require_prometheus
 from smartcam.settings import validated
 from smartcam.web._connections import connection_of
 from smartcam.web._errors import RefusedError
@@ -62,9 +62,9 @@ class OperationsSite(Server):
             section = validated(
                 OperationsSection, {**section.model_dump(), "listen": listen}, "operations"
             )
-        if section.place is None:
+        if section.endpoint is None:
             raise ConfigurationError("operations.listen: null: there is nowhere to listen")
-        self._host, self._port = section.place
+        self._host, self._port = section.endpoint
         self._names = {socket.gethostname().lower(), *(name.lower() for name in section.names)}
         self._per_camera = section.latency == "camera"
         self._all_tried = False
@@ -136,26 +136,26 @@ class OperationsSite(Server):
         camera that is lost, or added by a reload, does not change this.
         """
         server = self._agent_server
-        hosts = server.hosts.values()
+        cameras = server.shared_cameras.values()
         started = server.agent is not None
-        tried = sum(host.was_tried for host in hosts)
-        self._all_tried = started and (self._all_tried or tried == len(hosts))
-        missing = [host.name for host in hosts if not host.connected]
+        tried = sum(camera.was_tried for camera in cameras)
+        self._all_tried = started and (self._all_tried or tried == len(cameras))
+        missing = [camera.name for camera in cameras if not camera.connected]
         reason = None
-        if not server.reached:
+        if not server.is_connected:
             reason = "the agent is not on the bus"
             if started:
                 reason += f": nobody answers at {', '.join(server.file.endpoints[1])}"
         elif server.agent is not None and server.agent.retired_by is not None:
             reason = str(server.agent.retired_by)
         elif not self._all_tried:
-            reason = f"{tried} of {len(hosts)} cameras were tried"
+            reason = f"{tried} of {len(cameras)} cameras were tried"
         return {
             "ready": reason is None,
             "reason": reason,
             "agent": server.name or None,
-            "cameras": len(hosts),
-            "connected": len(hosts) - len(missing),
+            "cameras": len(cameras),
+            "connected": len(cameras) - len(missing),
             "not_connected": missing[:MAX_CAMERAS_LISTED],
         }
 
@@ -169,7 +169,7 @@ class OperationsSite(Server):
         return web.Response(body=body, headers={"Content-Type": kind})
 
     async def _make_metrics(self) -> tuple[bytes, str]:
-        numbers = await read_numbers(self._agent_server)
+        numbers = await read_counts(self._agent_server)
         return await exposition(numbers, per_camera=self._per_camera)
 
 

@@ -195,7 +195,7 @@ async def page() -> AsyncIterator[Stage]:
 @asynccontextmanager
 async def operations() -> AsyncIterator[Stage]:
     async with EmulatedCamera() as camera:
-        server = FleetServer(file({"c": camera.url}), bus=MemoryBus().end())
+        server = FleetServer(file({"c": camera.url}), bus=MemoryBus().new_connection())
         async with OperationsSite(server) as site, server:
             opened = site._open_port
             assert opened is not None

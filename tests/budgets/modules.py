@@ -29,7 +29,7 @@ PARSERS_OF: dict[str, str] = {
     "fleet._agent.bundle": "fleet: bundles",
     "fleet._agent.claims": "fleet: requests in JSON",
     "fleet._frames.wire": "fleet: messages",
-    "fleet._json.plain": "fleet: requests in JSON",
+    "fleet._json.json_services": "fleet: requests in JSON",
     "fleet._program.reading": "fleet: results",
     "fleet._agent.outlet_service": "fleet: requests in JSON",
     "fleet._agent.reload_service": "fleet: requests in JSON",

@@ -344,7 +344,7 @@ def test_serve_port_in_use_exits_3(tmp_path: Path) -> None:
 def test_without_the_extra_everything_reports_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_zenoh, "engine", _zenoh.engine.__wrapped__)
+    monkeypatch.setattr(_zenoh, "load_zenoh", _zenoh.load_zenoh.__wrapped__)
     monkeypatch.setitem(sys.modules, "zenoh", None)
     path = tmp_path / "one.yaml"
     path.write_text("cameras: {a: {emulated: {}, application: 21}}\n", encoding="utf-8")

@@ -18,9 +18,9 @@ from tests.fleet.inside import wire as _wire
 
 def _message(payload: bytes) -> None:
     """Read what may come as a call, its answer, a state, or frames."""
-    if _wire.decode_order(payload, "a call") is None:
+    if _wire.decode_trigger(payload, "a call") is None:
         _wire.decode(payload, "a call")
-    if _wire.decode_outcome(payload, "an answer") is None:
+    if _wire.decode_trigger_reply(payload, "an answer") is None:
         _, blobs = _wire.decode(payload, "an answer")
         for blob in blobs:
             with contextlib.suppress(ValueError):
@@ -45,7 +45,9 @@ def _blobs(unit: int) -> Make:
 
 
 def _told(size: int) -> bytes:
-    return _wire.encode_outcome(1, 1, 0.0, 1, [b"{}"] * (size // 6), _wire.encode_runs(1, 1, []))
+    return _wire.encode_trigger_reply(
+        1, 1, 0.0, 1, [b"{}"] * (size // 6), _wire.encode_groups(1, 1, [])
+    )
 
 
 _MESSAGES: dict[str, Make] = {
@@ -58,13 +60,13 @@ _MESSAGES: dict[str, Make] = {
 
 
 def _run(count: int, length: int) -> bytes:
-    return _wire.ResultRun(1, 1, 0, 0, 0, 0, 0.0, 1.0, 1.0, 1.0, [bytes(length)] * count).encode()
+    return _wire.ResultGroup(1, 1, 0, 0, 0, 0, 0.0, 1.0, 1.0, 1.0, [bytes(length)] * count).encode()
 
 
 _RUNS: dict[str, Make] = {
-    "runs": grown(lambda count: _wire.encode_runs(1, 1, [_run(1, 1)] * count), 85),
-    "a run of many": grown(lambda count: _wire.encode_runs(1, 1, [_run(count, 1)]), 5),
-    "a run of one": lambda size: _wire.encode_runs(1, 1, [_run(1, size)]),
+    "runs": grown(lambda count: _wire.encode_groups(1, 1, [_run(1, 1)] * count), 85),
+    "a run of many": grown(lambda count: _wire.encode_groups(1, 1, [_run(count, 1)]), 5),
+    "a run of one": lambda size: _wire.encode_groups(1, 1, [_run(1, size)]),
     "runs that are not there": lambda size: (
         struct.pack("<4sQQI", b"scr1", 1, 1, 1 << 31) + bytes(size)
     ),
@@ -125,7 +127,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("fleet: messages", _message, _MESSAGES, MAX_WAITING_BYTES, "_zenoh.MAX_WAITING_BYTES"),
     Parser(
         "fleet: results",
-        lambda data: _wire.decode_runs(data, "results"),
+        lambda data: _wire.decode_groups(data, "results"),
         _RUNS,
         MAX_WAITING_BYTES,
         "_zenoh.MAX_WAITING_BYTES",
@@ -158,7 +160,7 @@ PARSERS: tuple[Parser, ...] = (
         lambda text: request_fields(text.encode()),
         JSON,
         256 << 10,
-        "fleet._json.plain.MAX_REQUEST_BYTES",
+        "fleet._json.json_services.MAX_REQUEST_BYTES",
     ),
     Parser(
         "certificates",

@@ -12,10 +12,10 @@ from smartcam._client._inside import TriggerRequest
 from smartcam._zenoh import BusLink
 from smartcam.emulator import Application, EmulatedCamera, Run
 from smartcam.fleet import FleetCamera, MemoryBus
-from smartcam.fleet._inside import Bus, Keys, ZenohEnd
+from smartcam.fleet._inside import Bus, Keys, ZenohConnection
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
-from tests.fleet.inside import Agent, AgentInterpretation, FrameSupply, MemoryEnd, Program
+from tests.fleet.inside import Agent, AgentInterpretation, FrameSupply, MemoryConnection, Program
 from tests.processes import free_place
 
 FLEET = "plant"
@@ -119,9 +119,9 @@ class Plant:
     async def start_agent(self, name: str = "agent") -> None:
         """Start an agent: the first one, or the next after one that is gone."""
         if self.places:
-            self.end = ZenohEnd(BusLink(listen=self.places), self._engine)
+            self.end = ZenohConnection(BusLink(listen=self.places), self._engine)
         else:
-            self.end = self.bus.end()
+            self.end = self.bus.new_connection()
         settings = CameraSettings.make(self.box.url, None, self.session)
         frames = {} if self._frames is None else {NAME: FrameSupply(self._frames, "scripted")}
         self.agent = Agent(
@@ -137,7 +137,7 @@ class Plant:
 
     def cut_off_agent(self) -> None:
         """Have it gone from the bus without a word."""
-        assert isinstance(self.end, MemoryEnd)
+        assert isinstance(self.end, MemoryConnection)
         self.end.detach()
 
     async def stop_agent(self) -> None:
@@ -148,7 +148,11 @@ class Plant:
         """Return a camera of a program of its own, to be opened; ``end`` of it is its bus'."""
         options.setdefault("interpret_as", LAYOUT)
         options.setdefault("reconnect", FAST)
-        end = ZenohEnd(BusLink(connect=self.places)) if self.places else self.bus.end()
+        end = (
+            ZenohConnection(BusLink(connect=self.places))
+            if self.places
+            else self.bus.new_connection()
+        )
         settings = CameraSettings.of(self.address, {"name": NAME, **options})
         return FleetCamera(settings, NAME, Program(end, FLEET, NAME))
 
@@ -170,10 +174,10 @@ def trigger_request() -> TriggerRequest:
     return TriggerRequest(AgentInterpretation(), None, 1, True)
 
 
-def end_of(camera: FleetCamera[Any]) -> MemoryEnd:
+def end_of(camera: FleetCamera[Any]) -> MemoryConnection:
     """Return the end of the bus of a camera's program."""
     end = camera._program.bus
-    assert isinstance(end, MemoryEnd)
+    assert isinstance(end, MemoryConnection)
     return end
 
 

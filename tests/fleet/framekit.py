@@ -46,7 +46,7 @@ class FramePlant(Plant):
     @property
     def shared(self) -> SharedFrames:
         """The frames at the agent."""
-        return self.agent.hosts[NAME].frames
+        return self.agent.shared_cameras[NAME].frames
 
     @contextlib.asynccontextmanager
     async def streaming(self, every: float = 0.02, **other: Any) -> AsyncIterator[None]:

@@ -8,7 +8,7 @@ from typing import Any
 from smartcam import Camera, SmartCamera
 from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetCamera, MemoryBus
-from smartcam.fleet._inside import Bus, Keys, ZenohEnd
+from smartcam.fleet._inside import Bus, Keys, ZenohConnection
 from smartcam.observers import Observer
 from smartcam.settings import Address, CameraSettings
 from tests.fleet.inside import Agent, Program
@@ -53,9 +53,9 @@ class OwnAgentCamera(FleetCamera[Any]):
             observers=observers,
         )
 
-    async def follow(self, timeout: float, *, session: bool = True) -> None:
+    async def connect_to_agent(self, timeout: float, *, wait_for_session: bool = True) -> None:
         await self.agent.open(timeout)
-        await super().follow(timeout, session=session)
+        await super().connect_to_agent(timeout, wait_for_session=wait_for_session)
 
     async def close(self) -> None:
         try:
@@ -73,7 +73,7 @@ def connect(
         return SmartCamera(CameraSettings.make(url, model, options), observers=observers)
     if kind == "in_process":
         bus = MemoryBus()
-        return OwnAgentCamera(url, (bus.end(), bus.end()), options, observers)
+        return OwnAgentCamera(url, (bus.new_connection(), bus.new_connection()), options, observers)
     place = free_place()
-    ends = ZenohEnd(BusLink(listen=(place,))), ZenohEnd(BusLink(connect=(place,)))
+    ends = ZenohConnection(BusLink(listen=(place,))), ZenohConnection(BusLink(connect=(place,)))
     return OwnAgentCamera(url, ends, options, observers)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 
 from smartcam.fleet import MemoryBus
-from tests.fleet.inside import Data, MemoryEnd
+from tests.fleet.inside import Data, MemoryConnection
 
 Fate = Callable[[str, bytes], Sequence[float]]
 """Tells after how many seconds each copy of something said arrives; none: it is lost."""
@@ -36,11 +36,11 @@ class LossyBus(MemoryBus):
         self.doubled = 0
         self.late = 0
 
-    def end(self) -> MemoryEnd:
+    def new_connection(self) -> MemoryConnection:
         return _LossyEnd(self)
 
 
-class _LossyEnd(MemoryEnd):
+class _LossyEnd(MemoryConnection):
     def __init__(self, bus: LossyBus) -> None:
         super().__init__(bus)
         self._lossy, self.local = bus, bus.local

@@ -19,7 +19,7 @@ from typing import Any
 import smartcam
 from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._inside import Keys, ZenohEnd
+from smartcam.fleet._inside import Keys, ZenohConnection
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FAST, FLEET, NAME, PATIENCE
 from tests.fleet.inside import Agent, Standby
@@ -60,7 +60,7 @@ async def partner(*arguments: str, within: tuple[str, ...] = ()) -> AsyncIterato
 
 async def _agent(place: str, url: str) -> None:
     settings = CameraSettings.make(url, None, {"reconnect": FAST, "name": NAME})
-    agent = Agent("agent", Keys(FLEET), ZenohEnd(BusLink(listen=(place,))), {NAME: settings})
+    agent = Agent("agent", Keys(FLEET), ZenohConnection(BusLink(listen=(place,))), {NAME: settings})
     await agent.open(PATIENCE)
     await agent.wait_first_attempts()
     await _ready()
@@ -68,7 +68,7 @@ async def _agent(place: str, url: str) -> None:
 
 async def _standby(place: str, url: str, name: str) -> None:
     settings = CameraSettings.make(url, None, {"reconnect": FAST, "name": NAME})
-    end = ZenohEnd(BusLink(connect=(place,)))
+    end = ZenohConnection(BusLink(connect=(place,)))
     agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=Standby.model_validate({}))
     await agent.open(PATIENCE)
     await agent.wait_first_attempts()

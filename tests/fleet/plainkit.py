@@ -146,7 +146,7 @@ class OverZenoh(Client):
 
     def _publishers(self, pattern: str) -> list[Publisher]:
         """Return what the server says things with that a pattern means."""
-        own = self._server.hosts[NAME].topics
+        own = self._server.shared_cameras[NAME].topics
         if pattern.startswith("topic/"):
             return [
                 one
@@ -189,7 +189,7 @@ class Plant(NamedTuple):
     @property
     def active(self) -> int | None:
         """The application that the camera has told of."""
-        return self.server.hosts[NAME].camera.active_application
+        return self.server.shared_cameras[NAME].client.active_application
 
     @contextlib.asynccontextmanager
     async def fleet(self) -> AsyncIterator[smartcam.fleet.Fleet]:
@@ -197,7 +197,9 @@ class Plant(NamedTuple):
         if self.memory is None:
             made = smartcam.fleet.open(self.server.address.url)
         else:
-            made = smartcam.fleet.Fleet(self.memory.end(), None, "plant", None, PATIENCE, {})
+            made = smartcam.fleet.Fleet(
+                self.memory.new_connection(), None, "plant", None, PATIENCE, {}
+            )
         async with made as fleet:
             yield fleet
 
@@ -237,11 +239,11 @@ async def plant(**more: Any) -> AsyncIterator[Plant]:
         camera = await stack.enter_async_context(made)
         memory = MemoryBus() if is_virtual() else None
         file = fleet_file(camera.url, **more)
-        made_server = FleetServer(file, bus=None if memory is None else memory.end())
+        made_server = FleetServer(file, bus=None if memory is None else memory.new_connection())
         server = await stack.enter_async_context(made_server)
         await server.wait_first_attempts()
         if memory is not None:
-            end = await memory.end().open(PATIENCE)
+            end = await memory.new_connection().open(PATIENCE)
             stack.push_async_callback(end.close)
             client: Client = InProcess(end)
         else:

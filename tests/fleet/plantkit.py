@@ -11,7 +11,7 @@ from typing import Any
 
 from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetFile
-from smartcam.fleet._inside import ZenohEnd, make_certificates
+from smartcam.fleet._inside import ZenohConnection, make_certificates
 from tests.fleet.fleetkit import PATIENCE
 from tests.fleet.inside import ConnectionFilter, access_control
 from tests.processes import free_port
@@ -40,11 +40,13 @@ async def short_lived(folder: Path, role: str, name: str, seconds: float) -> Non
 
 
 @contextlib.asynccontextmanager
-async def guarded(plant: Path, domain: int | None = None) -> AsyncIterator[tuple[ZenohEnd, str]]:
+async def guarded(
+    plant: Path, domain: int | None = None
+) -> AsyncIterator[tuple[ZenohConnection, str]]:
     """Give an end that listens and guards by roles, and where."""
     place = f"tls/127.0.0.1:{free_port()}"
     link = BusLink((place,), (), str(plant / WHO["agent"]))
-    end = ZenohEnd(link, {"access_control": access_control(domain)})
+    end = ZenohConnection(link, {"access_control": access_control(domain)})
     await end.open(PATIENCE)
     try:
         yield end, place
@@ -53,9 +55,9 @@ async def guarded(plant: Path, domain: int | None = None) -> AsyncIterator[tuple
 
 
 @contextlib.asynccontextmanager
-async def joined(place: str, certificates: Path) -> AsyncIterator[ZenohEnd]:
+async def joined(place: str, certificates: Path) -> AsyncIterator[ZenohConnection]:
     """Give an end that has connected, with a certificate."""
-    end = ZenohEnd(BusLink((), (place,), str(certificates)))
+    end = ZenohConnection(BusLink((), (place,), str(certificates)))
     await end.open(PATIENCE)
     try:
         yield end
@@ -84,7 +86,7 @@ def url_of(port: int, certificates: Path, camera: str = CAMERA, host: str = "loc
 @contextlib.asynccontextmanager
 async def router_end(place: str, certificates: str) -> AsyncIterator[None]:
     """Be the router at a place, with a door."""
-    end = ZenohEnd(BusLink((place,), (), certificates), {"access_control": access_control()})
+    end = ZenohConnection(BusLink((place,), (), certificates), {"access_control": access_control()})
     await end.open(PATIENCE)
     door = ConnectionFilter(frozenset({int(place.rpartition(":")[2])}), end.connected_addresses)
     door.open()

@@ -13,7 +13,7 @@ import pytest
 
 from smartcam.fleet._agent.calls import ACTIONS
 from smartcam.fleet._bus.keys import COMMANDS
-from smartcam.fleet._inside import Keys, ZenohEnd, may_command, patterns_overlap
+from smartcam.fleet._inside import Keys, ZenohConnection, may_command, patterns_overlap
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.inside import RIGHTS, ROLES, SERVICES, THESIS, ros_rights
 from tests.fleet.plantkit import WHO, certified, guarded, joined
@@ -48,7 +48,7 @@ def allowed(role: str, does: str, key: str) -> bool:
         return True
     return any(
         role in right.roles
-        and right.does == does
+        and right.use == does
         and any(patterns_overlap(one, key) for one in right.keys)
         for right in TABLE
     )
@@ -64,7 +64,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(params=[*ROLES[:3], pytest.param("router", marks=pytest.mark.long)])
 async def ends(
     request: pytest.FixtureRequest, plant: Path
-) -> AsyncIterator[tuple[str, ZenohEnd, ZenohEnd]]:
+) -> AsyncIterator[tuple[str, ZenohConnection, ZenohConnection]]:
     """Give a role, an end with it, and the one that guards."""
     async with (
         guarded(plant, DOMAIN) as (guard, place),
@@ -73,7 +73,7 @@ async def ends(
         yield request.param, end, guard
 
 
-Ends = tuple[str, ZenohEnd, ZenohEnd]
+Ends = tuple[str, ZenohConnection, ZenohConnection]
 
 
 class Seen:
@@ -95,11 +95,11 @@ def expected(role: str, does: str) -> set[str]:
     return {key for key in keys_of(does) if allowed(role, does, key)}
 
 
-async def known(end: ZenohEnd, guard: ZenohEnd, role: str) -> None:
+async def known(end: ZenohConnection, guard: ZenohConnection, role: str) -> None:
     """Wait until all that an end has declared is known: in order, its presence at last."""
     seen = Seen()
     watch = guard.watch(KEYS.program("*"), seen)
-    end.be_present(KEYS.program(f"{role}-{MARK}"))
+    end.announce(KEYS.program(f"{role}-{MARK}"))
     await seen.mark(KEYS.program(f"{role}-{MARK}"))
     watch.close()
 
@@ -185,8 +185,8 @@ async def test_appear(ends: Ends) -> None:
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.watch(pattern, seen)
     for key in keys_of("present"):
-        end.be_present(key)
-    end.be_present(KEYS.program(f"{role}-{MARK}"))
+        end.announce(key)
+    end.announce(KEYS.program(f"{role}-{MARK}"))
     assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "present")
 
 
@@ -194,7 +194,7 @@ async def test_watch(ends: Ends) -> None:
     role, end, guard = ends
     mark = KEYS.agent(MARK)
     for key in [*keys_of("watch"), mark]:
-        guard.be_present(key)
+        guard.announce(key)
     seen = Seen()
     for key in [*keys_of("watch"), mark]:
         end.watch(key, seen)
@@ -205,10 +205,12 @@ async def test_look_who_is_there(ends: Ends) -> None:
     role, end, guard = ends
     mark = KEYS.agent(MARK)
     for key in [*keys_of("watch"), mark]:
-        guard.be_present(key)
-    asking = {key: asyncio.ensure_future(end.present(key, PATIENCE)) for key in keys_of("watch")}
+        guard.announce(key)
+    asking = {
+        key: asyncio.ensure_future(end.present_keys(key, PATIENCE)) for key in keys_of("watch")
+    }
     await asyncio.sleep(0)  # they ask
-    assert await end.present(mark, PATIENCE) == [mark]
+    assert await end.present_keys(mark, PATIENCE) == [mark]
     for key, one in asking.items():
         if allowed(role, "watch", key):
             assert await one == [key]
@@ -222,16 +224,16 @@ async def test_look_who_is_there(ends: Ends) -> None:
 QUESTIONS = {
     *(
         "hello",
-        "find",
+        "find_first_result",
         "reserved",
         "results",
         "states",
-        "refresh",
+        "refresh_status",
         "about_frames",
         "frame",
         "next_frame",
     ),
-    *("leave_frames", "lens", "query_application", "query_status", "wait_connected", "wait_ready"),
+    *("end_stream", "lens", "query_application", "query_status", "wait_connected", "wait_ready"),
     *("read_image", "get_clock", "features"),
 }
 """Calls that were looked at, and change nothing: a new one has to be, too."""
@@ -277,14 +279,14 @@ async def test_certificate_without_a_role_may_nothing(plant: Path, tmp_path: Pat
         joined(place, folder / "somebody") as end,
         joined(place, plant / "dashboard") as viewer,
     ):
-        guard.be_present(KEYS.agent("line1"))
+        guard.announce(KEYS.agent("line1"))
         seen, heard = Seen(), Seen()
         guard.subscribe("**", heard)
         end.watch("**", seen)
         for key in keys_of("put"):
             end.put(key, b"")
-        asked = asyncio.ensure_future(end.present(KEYS.agent("*"), PATIENCE))
-        assert await viewer.present(KEYS.agent("*"), PATIENCE) == [KEYS.agent("line1")]
+        asked = asyncio.ensure_future(end.present_keys(KEYS.agent("*"), PATIENCE))
+        assert await viewer.present_keys(KEYS.agent("*"), PATIENCE) == [KEYS.agent("line1")]
         mark = KEYS.ask("viewer", "a", MARK)
         viewer.put(mark, b"")
         assert await heard.mark(mark) == set()
@@ -328,7 +330,7 @@ def covered(role: str, does: str, pattern: str) -> bool:
     return any(
         expression(one).includes(expression(pattern))
         for right in TABLE
-        if role in right.roles and right.does == does
+        if role in right.roles and right.use == does
         for one in right.keys
     )
 
@@ -352,7 +354,7 @@ async def test_wide_pattern_does_nothing_at_keys_that_the_role_may_not_use(ends:
         end.session.delete(pattern)
         end.answer(pattern, lambda question: question.reply(question.key, b"forged"))
         with contextlib.suppress(Exception):  # some are no keys to be present under
-            end.be_present(pattern)
+            end.announce(pattern)
     asking = [asyncio.ensure_future(end.ask(one, b"", PATIENCE)) for one in WIDE]
     await asyncio.sleep(0)
     await known(end, guard, role)
@@ -385,8 +387,8 @@ async def test_wide_pattern_brings_no_operator_what_is_for_agents(ends: Ends, pa
     await known(end, guard, role)
     for key in (KEYS.command("line1", "cam3"), KEYS.ask("operator", "line1", "cam3")):
         guard.put(key, b"")
-    guard.be_present(KEYS.program(MINE))
-    guard.be_present(KEYS.agent(MARK))
+    guard.announce(KEYS.program(MINE))
+    guard.announce(KEYS.agent(MARK))
     guard.put(KEYS.states(MARK), b"")
     assert not any(
         "/command/" in one or "/ask/" in one for one in await heard.mark(KEYS.states(MARK))

@@ -9,7 +9,7 @@ import pytest
 
 import smartcam.fleet
 from smartcam._zenoh import BusLink
-from smartcam.fleet._inside import ZenohEnd, read_identity
+from smartcam.fleet._inside import ZenohConnection, read_identity
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.inside import renewal as _renewal
 from tests.fleet.plantkit import certified, plant_file
@@ -38,7 +38,7 @@ async def test_roles_and_renewal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     async with smartcam.fleet.serve(file) as server:
         place = f"tls/localhost:{server.address.port}"
         ends = {
-            name: ZenohEnd(BusLink((), (place,), str(folder / name)), SETTINGS)
+            name: ZenohConnection(BusLink((), (place,), str(folder / name)), SETTINGS)
             for name in ("robot", "dashboard")
         }
         for end in ends.values():

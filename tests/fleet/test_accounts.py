@@ -62,7 +62,7 @@ class Sender:
 
     @property
     def sent(self) -> int:
-        return self.plant.agent.hosts[NAME].results.following - 1
+        return self.plant.agent.shared_cameras[NAME].results.next_number - 1
 
     async def stop(self) -> None:
         """Have it send no more, and everybody hear of what it sent."""
@@ -225,20 +225,20 @@ async def test_who_does_not_read_harms_nobody() -> None:
             cameras[2].results(max_queue_bytes=200),
             cameras[2].results(max_queue=7, overflow="error"),
         ]
-        host = sender.plant.agent.hosts[NAME]
+        host = sender.plant.agent.shared_cameras[NAME]
         sender.plant.box.device.start()
         most = [0, 0]
         for _ in range(30):
             await asyncio.sleep(0.1)
             most = [
-                max(most[0], host.results.following - host.results.first),
+                max(most[0], host.results.next_number - host.results.first),
                 max(most[1], len(host.results._entries)),
             ]
         await sender.stop()
         assert sender.sent > 0.8 * RATE * 3
         assert most[0] <= history[0] + 10
         assert most[1] <= history[0] + 10
-        assert not host._unsent_runs
+        assert not host._unsent_groups
         for reader in readers:
             assert check(reader.stream, sender.sent).missed == 0
             assert reader.numbers == [*range(1, sender.sent + 1)]
@@ -252,7 +252,7 @@ async def test_results_of_many_come_to_a_fleet_in_the_same_way() -> None:
     """Streams of all cameras of a fleet have an account for each camera."""
     bus = LossyBus()
     async with sending(bus) as sender:
-        fleet = Fleet(bus.end(), None, "plant", None, 10.0, {"interpret_as": "raw"})
+        fleet = Fleet(bus.new_connection(), None, "plant", None, 10.0, {"interpret_as": "raw"})
         async with fleet, fleet.results("line1/*") as results:
             await asyncio.sleep(0.1)
             sender.plant.box.device.start()
@@ -272,7 +272,7 @@ async def test_session_is_seen_though_the_word_of_it_is_lost() -> None:
         await until(lambda: not camera.connected)
         bus.fate = lambda key, _: () if "/states/" in key else (0.0,)
         await plant.box.start()
-        await until(lambda: plant.agent.hosts[NAME].connected)
+        await until(lambda: plant.agent.shared_cameras[NAME].connected)
         await asyncio.sleep(0.1)  # of the loop's time: every word of the session is lost
         assert bus.lost
         bus.fate = as_said

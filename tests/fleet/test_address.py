@@ -9,7 +9,7 @@ import pytest
 
 import smartcam
 import smartcam.fleet
-from smartcam._zenoh import engine
+from smartcam._zenoh import load_zenoh
 from smartcam.exceptions import ConfigurationError, MissingExtraError, UnsupportedError
 from smartcam.fleet._inside import FleetAddress
 from smartcam.settings import parse_address
@@ -153,11 +153,11 @@ def test_camera_is_called_by_its_name() -> None:
 
 def test_without_zenoh_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zenoh", None)
-    engine.cache_clear()
+    load_zenoh.cache_clear()
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\[fleet\]"') as caught:
         smartcam.connect("fleet://localhost/line1/cam3")
     assert caught.value.extra == "fleet"
-    engine.cache_clear()
+    load_zenoh.cache_clear()
 
 
 def test_engine_is_imported_for_fleet_urls_only() -> None:

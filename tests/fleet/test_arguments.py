@@ -29,9 +29,9 @@ TRIGGER: dict[str, Any] = {"results": 1, "wait": True}
 
 CALLS: dict[str, dict[str, tuple[dict[str, Any], set[str]]]] = {
     "switch_application": {"application": ({}, set())},
-    "ensure": {"application": ({}, set())},
-    "enter": {"application": ({}, set())},
-    "leave": {"entered": ({}, {"2**64", "10**400"})},
+    "ensure_application": {"application": ({}, set())},
+    "enter_application": {"application": ({}, set())},
+    "leave_application": {"entered": ({}, {"2**64", "10**400"})},
     "set_clock": {"when": ({}, set())},
     "set_sequence_number": {"number": ({}, set())},
     "request": {
@@ -53,7 +53,7 @@ CALLS: dict[str, dict[str, tuple[dict[str, Any], set[str]]]] = {
         "fresh": ({}, {"True", "None"}),
     },
     "results": {"first": ({}, {"2**64", "10**400"})},
-    "find": {"since": ({}, {"1.5", "-1", "2**64"})},
+    "find_first_result": {"since": ({}, {"1.5", "-1", "2**64"})},
     "release": {"reservation": ({}, {"2**64", "10**400"})},
 }
 """Of each call its arguments; of each what is said beside it, and which odd values it takes."""

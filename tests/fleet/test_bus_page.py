@@ -29,7 +29,7 @@ from tests.fleet.inside import (
     Change,
     Data,
     Handle,
-    MemoryEnd,
+    MemoryConnection,
     Publisher,
     never,
 )
@@ -88,11 +88,11 @@ class NotingBus(MemoryBus):
     def note(self, what: str, key: str) -> None:
         self.noted.setdefault(key, set()).add(what)
 
-    def end(self) -> MemoryEnd:
+    def new_connection(self) -> MemoryConnection:
         return NotingEnd(self)
 
 
-class NotingEnd(MemoryEnd):
+class NotingEnd(MemoryConnection):
     """An end of it."""
 
     def __init__(self, bus: NotingBus) -> None:
@@ -108,10 +108,10 @@ class NotingEnd(MemoryEnd):
         super().put_part(key, head, data)
 
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, hear: Callable[[str, bytes], None], *, low_priority: bool = False
     ) -> Handle:
         self._note("hear", pattern)
-        return super().subscribe(pattern, hear, patient=patient)
+        return super().subscribe(pattern, hear, low_priority=low_priority)
 
     def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
         self._note("hear", pattern)
@@ -132,10 +132,10 @@ class NotingEnd(MemoryEnd):
         pattern: str,
         answer: Callable[[BusQuestion], None],
         *,
-        patient: Callable[[str], bool] = never,
+        low_priority: Callable[[str], bool] = never,
     ) -> Handle:
         self._note("answer", pattern)
-        return super().answer(pattern, answer, patient=patient)
+        return super().answer(pattern, answer, low_priority=low_priority)
 
     async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
         self._note("ask", pattern)
@@ -144,17 +144,17 @@ class NotingEnd(MemoryEnd):
             self._note("reply", key)
         return answers
 
-    def be_present(self, key: str) -> Handle:
+    def announce(self, key: str) -> Handle:
         self._note("appear", key)
-        return super().be_present(key)
+        return super().announce(key)
 
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         self._note("watch", pattern)
         return super().watch(pattern, see)
 
-    async def present(self, pattern: str, timeout: float) -> list[str]:
+    async def present_keys(self, pattern: str, timeout: float) -> list[str]:
         self._note("watch", pattern)
-        return await super().present(pattern, timeout)
+        return await super().present_keys(pattern, timeout)
 
 
 @contextlib.asynccontextmanager
@@ -164,9 +164,11 @@ async def everything(bus: MemoryBus, monkeypatch: pytest.MonkeyPatch) -> AsyncIt
         enter = stack.enter_async_context
         box = await enter(EmulatedCamera(applications=applications(), active=COUNTER, running=True))
         frames = {"url": "synthetic://?size=256x16&fps=50"}
-        server = await enter(FleetServer(fleet_file(box.url, frames=frames), bus=bus.end()))
+        server = await enter(
+            FleetServer(fleet_file(box.url, frames=frames), bus=bus.new_connection())
+        )
         await server.wait_first_attempts()
-        plain = InProcess(await bus.end().open(PATIENCE))
+        plain = InProcess(await bus.new_connection().open(PATIENCE))
         for kind in ("results", "status", "events"):
             await plain.topic(f"topic/{kind}/{NAME}")
         await plain.ask("cameras/**")
@@ -174,7 +176,9 @@ async def everything(bus: MemoryBus, monkeypatch: pytest.MonkeyPatch) -> AsyncIt
         await plain.thesis("EnablePublishing", topic_for_outputs="line1/outputs")
         await plain.topic("thesis/topic/line1/outputs")
         await plain.thesis("Trigger50ByteString")
-        fleet = await enter(smartcam.fleet.Fleet(bus.end(), None, "plant", None, PATIENCE, {}))
+        fleet = await enter(
+            smartcam.fleet.Fleet(bus.new_connection(), None, "plant", None, PATIENCE, {})
+        )
         camera, results = fleet[NAME], fleet.results()
         await camera.wait_connected(PATIENCE)
         async with camera.reserve():

@@ -132,7 +132,7 @@ async def check_camera(
     plant: Plant, camera: FleetCamera[Any], homes: frozenset[int] = frozenset({1})
 ) -> None:
     """See that a camera does what it did before, and that nobody holds anything."""
-    host = plant.agent.hosts[NAME]
+    host = plant.agent.shared_cameras[NAME]
     await camera.wait_connected()
     result = await camera.trigger(1, timeout=30.0)
     assert result.value.run == plant.box.runs
@@ -141,7 +141,7 @@ async def check_camera(
     await until(lambda: not plant.agent._programs[camera._program.name].tasks)
     gate = host.gate
     assert (gate.holder, len(gate._queue), len(gate._running_commands)) == (None, 0, 0)
-    assert plant.agent._programs[camera._program.name].entered == {}
+    assert plant.agent._programs[camera._program.name].switches == {}
     await until(lambda: not camera._caller._resending_tasks)
     assert camera._program._pending_calls == {}
     assert camera._change_queues == set()
@@ -157,7 +157,7 @@ async def call_cancelled(name: str, steps: int) -> bool:
             switched = name == "switch_application"
             await check_camera(plant, camera, frozenset({1, 2} if switched else {1}))
         await until(lambda: not plant.agent._programs)
-    assert plant.bus.ends == []
+    assert plant.bus.connections == []
     await until(lambda: asyncio.all_tasks() == tasks)
     return over
 
@@ -168,12 +168,12 @@ async def open_cancelled(steps: int) -> bool:
         camera = plant.camera()
         over = await cancelled_after(steps, camera.open())
         if steps and not over:
-            assert len(plant.bus.ends) == 1  # it has closed itself
+            assert len(plant.bus.connections) == 1  # it has closed itself
         await camera.close()
         await until(lambda: not plant.agent._programs)
         async with plant.camera() as other:
             await check_camera(plant, other)
-    assert plant.bus.ends == []
+    assert plant.bus.connections == []
     await until(lambda: asyncio.all_tasks() == tasks)
     return over
 
@@ -185,9 +185,9 @@ async def close_cancelled(steps: int) -> bool:
         await camera.open()
         over = await cancelled_after(steps, camera.close())
         await camera.close()
-        assert len(plant.bus.ends) == 1
+        assert len(plant.bus.connections) == 1
         await until(lambda: not plant.agent._programs)
-    assert plant.bus.ends == []
+    assert plant.bus.connections == []
     await until(lambda: asyncio.all_tasks() == tasks)
     return over
 
@@ -222,14 +222,14 @@ async def fleet_trigger_cancelled(steps: int) -> bool:
 async def server_start_cancelled(steps: int) -> bool:
     tasks = asyncio.all_tasks()
     bus = MemoryBus()
-    server = FleetServer(FILE, bus=bus.end())
+    server = FleetServer(FILE, bus=bus.new_connection())
     over = await cancelled_after(steps, server.start())
     if not over and steps:
-        assert bus.ends == []
+        assert bus.connections == []
     await server.start()  # it can be started again
-    assert len(server.hosts) == 2
+    assert len(server.shared_cameras) == 2
     await server.stop()
-    assert bus.ends == []
+    assert bus.connections == []
     await until(lambda: asyncio.all_tasks() == tasks)
     return over
 

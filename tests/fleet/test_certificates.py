@@ -16,7 +16,12 @@ from smartcam._accepting import is_loopback
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, FleetServer, load_fleet
-from smartcam.fleet._inside import MadeCertificate, ZenohEnd, make_certificates, read_identity
+from smartcam.fleet._inside import (
+    MadeCertificate,
+    ZenohConnection,
+    make_certificates,
+    read_identity,
+)
 from tests.fleet.inside import CERTIFICATE_FILES, MAX_BYTES, tls_context
 
 YEAR = timedelta(days=365)
@@ -84,7 +89,7 @@ def test_another_host_is_added(tmp_path: Path) -> None:
 def test_none_outlives_its_authority(tmp_path: Path) -> None:
     make_certificates(tmp_path, {"viewer": ["a"]}, lifetime=100 * YEAR)
     found = read_identity(tmp_path / "a")
-    assert found.ends == found.authority_ends
+    assert found.expires_at == found.authority_expires_at
 
 
 @pytest.mark.parametrize(
@@ -168,7 +173,7 @@ async def test_configuration_of_a_router(tmp_path: Path) -> None:
     (made,) = make_certificates(tmp_path, {"router": ["hub"]})
     text = (tmp_path / "hub" / "router.json5").read_text()
     assert f"zenohd --config {made.folder}" in made.use
-    zenoh = ZenohEnd(BusLink()).engine
+    zenoh = ZenohConnection(BusLink()).zenoh
     config = zenoh.Config.from_json5(text)
     assert json.loads(config.get_json("access_control/default_permission")) == "deny"
     assert json.loads(config.get_json("mode")) == "router"

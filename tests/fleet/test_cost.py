@@ -41,13 +41,13 @@ class Plant:
         self.said: collections.Counter[str] = collections.Counter()
         self._stack = stack
         file = {"cameras": {NAME: {"url": url}}}
-        self.server = FleetServer(FleetFile.model_validate(file), bus=self.bus.end())
+        self.server = FleetServer(FleetFile.model_validate(file), bus=self.bus.new_connection())
 
     async def start(self) -> None:
         """Have the camera connected."""
         await self._stack.enter_async_context(self.server)
         await self.server.wait_first_attempts()
-        ear = await self.bus.end().open(1.0)
+        ear = await self.bus.new_connection().open(1.0)
         self._stack.push_async_callback(ear.close)
         for kind in ("command", "ask", "reply", "states"):
             ear.subscribe(f"smartcam/plant/{kind}/**", lambda key, _: self._count(key))
@@ -58,7 +58,7 @@ class Plant:
     async def camera(self) -> FleetCamera[object]:
         """Return it as one more program has it."""
         settings = CameraSettings.of(FleetAddress.parse("fleet://here").of(NAME), {})
-        camera = FleetCamera[object](settings, NAME, Program(self.bus.end(), "plant"))
+        camera = FleetCamera[object](settings, NAME, Program(self.bus.new_connection(), "plant"))
         return await self._stack.enter_async_context(camera)
 
 
@@ -116,14 +116,14 @@ async def test_statuses_that_the_only_program_has_with_a_reply_are_not_said_agai
 
 async def test_the_status_after_a_call_is_that_of_its_end(plant: Plant) -> None:
     camera = await plant.camera()
-    host = plant.server.hosts[NAME]
+    host = plant.server.shared_cameras[NAME]
     for _ in range(TRIGGERS):
         await camera.trigger()
-        assert camera.status == host.camera.status
+        assert camera.status == host.client.status
     await camera.stop()
-    assert camera.status == host.camera.status
+    assert camera.status == host.client.status
     await camera.start()
-    assert camera.status == host.camera.status
+    assert camera.status == host.client.status
 
 
 async def test_others_hear_of_every_status_in_order_a_moment_later(plant: Plant) -> None:
@@ -141,11 +141,11 @@ async def test_others_hear_of_every_status_in_order_a_moment_later(plant: Plant)
 
 async def test_two_programs_that_trigger_in_turn_both_know_the_status(plant: Plant) -> None:
     cameras = [await plant.camera(), await plant.camera()]
-    host = plant.server.hosts[NAME]
+    host = plant.server.shared_cameras[NAME]
     for number in range(TRIGGERS):
         camera = cameras[number % 2]
         await camera.trigger()
-        assert camera.status == host.camera.status
+        assert camera.status == host.client.status
     assert plant.said["ask"] == 2  # the hello of each: nothing was missing
 
 
@@ -155,7 +155,7 @@ async def test_a_lost_camera_is_told_at_once(plant: Plant) -> None:
     gone = camera.events()
     await camera.trigger()
     begin = loop.time()
-    await plant.server.hosts[NAME].camera.close()
+    await plant.server.shared_cameras[NAME].client.close()
     async for event in gone:
         if type(event).__name__ == "Disconnected":
             break

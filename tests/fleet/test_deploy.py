@@ -40,7 +40,7 @@ def test_the_fleet_file_of_the_composition_is_one() -> None:
     assert [one.name for one in file.plan()] == ["demo/cam1", "demo/cam2"]
     assert file.operations is not None
     (target,) = read("prometheus.yml")["scrape_configs"][0]["static_configs"][0]["targets"]
-    assert target == f"agent:{(file.operations.place or ('', 0))[1]}"
+    assert target == f"agent:{(file.operations.endpoint or ('', 0))[1]}"
 
 
 def test_commands_in_unit_and_containers_are_ours() -> None:

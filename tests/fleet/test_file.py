@@ -141,7 +141,7 @@ URL = "url: bvs://192.168.0.10\n    "
         ("- 1\n", ": expected fields such as"),
         (
             "connect: tcp/h:1\ncameras: {}\n",
-            ", line 2: cameras: an agent without cameras is a router",
+            ", line 2: cameras: an agent without cameras is only a router",
         ),
         ("fleet: plant\n", ", line 1: cameras: Field required"),
         (f"flet: plant\n{CAMERAS}", ", line 1: flet: Extra inputs .*; did you mean 'fleet'"),
@@ -165,7 +165,10 @@ URL = "url: bvs://192.168.0.10\n    "
         ("cameras:\n  line1/*: {emulated: {}}\n", ", line 2: cameras.line1/.*: .*ends in /"),
         ("cameras:\n  '**': {emulated: {}}\n", ", line 2: cameras.*: .*ends in /"),
         ("cameras:\n  a/**: {url: 'bvs://h'}\n", ", line 2: cameras.a/.*: only emulated"),
-        (camera("emulated: {count: 3}"), r", line 3: .*3 cameras want a name such as .*cam3/\*\*"),
+        (
+            camera("emulated: {count: 3}"),
+            r", line 3: .*an entry for 3 cameras needs a name such as .*cam3/\*\*",
+        ),
         ("cameras:\n  a: {emulated: {}}\n  a: {emulated: {}}\n", ", line 3: 'a' stands there twi"),
         (
             "cameras:\n  a/cam1: {emulated: {}}\n  a/**: {emulated: {}}\n",
@@ -173,7 +176,7 @@ URL = "url: bvs://192.168.0.10\n    "
         ),
         (
             "cameras:\n  a: {url: 'bvs://h'}\n  b: {url: 'bvs+udp://h:36701'}\n",
-            ", line 3: cameras.b.url: this is the camera a, and a camera takes one client",
+            ", line 3: cameras.b.url: a has this address already, and a camera takes one client",
         ),
         (
             camera("application: 7"),
@@ -223,8 +226,14 @@ URL = "url: bvs://192.168.0.10\n    "
         (f"listen: tcp/::1:7447\n{CAMERAS}", ", line 1: listen: expected tcp/HOST:PORT"),
         (f"connect: [tcp/h:7447, 7]\n{CAMERAS}", ", line 1: connect: .*got 7"),
         (f"connect: tcp/h:0\n{CAMERAS}", ", line 1: connect: expected tcp/HOST:PORT"),
-        (f"{CAMERAS}listen: tls/h:7447\n", ", line 2: listen: tls/h:7447 wants certificates"),
-        (f"{CAMERAS}connect: tls/h:7447\n", ", line 2: connect: tls/h:7447 wants certificates"),
+        (
+            f"{CAMERAS}listen: tls/h:7447\n",
+            ", line 2: listen: tls/h:7447 needs the key certificates",
+        ),
+        (
+            f"{CAMERAS}connect: tls/h:7447\n",
+            ", line 2: connect: tls/h:7447 needs the key certificates",
+        ),
         (f"certificates: none\n{CAMERAS}", ", line 1: certificates: .*none has no ca.pem, no cert"),
         ("cameras: [\n", ", line "),
         ("cameras: &a {x: *a}\n", ", line 1: an alias of a value that contains this alias"),

@@ -41,7 +41,7 @@ from smartcam.fleet import (
 )
 from smartcam.makes import EmulatedIfm
 from tests.client.clientkit import cancelled
-from tests.fleet.inside import Handle, MemoryEnd, in_words
+from tests.fleet.inside import Handle, MemoryConnection, in_words
 from tests.handmade import until
 
 LOOK = {"application": 21, "interpret_as": "text: string[20]"}
@@ -64,12 +64,12 @@ PLANT = file(
 
 def agent(bus: MemoryBus, name: str, *cameras: str) -> FleetServer:
     """An agent with emulated cameras."""
-    return FleetServer(file(dict.fromkeys(cameras, HELLO), agent=name), bus=bus.end())
+    return FleetServer(file(dict.fromkeys(cameras, HELLO), agent=name), bus=bus.new_connection())
 
 
 def fleet_on(bus: MemoryBus, **options: Any) -> Fleet:
     """A program with the fleet of a bus."""
-    return Fleet(bus.end(), None, "plant", None, 2.0, options)
+    return Fleet(bus.new_connection(), None, "plant", None, 2.0, options)
 
 
 def texts(results: Any) -> list[str]:
@@ -266,7 +266,7 @@ async def test_what_one_camera_cannot_do_costs_the_others_nothing() -> None:
 async def test_agent_that_dies_during_a_trigger_is_named_at_once() -> None:
     bus = MemoryBus()
     async with agent(bus, "one", "a"), fleet_on(bus) as fleet:
-        end = bus.end()
+        end = bus.new_connection()
         slow = {"b": {**HELLO, "emulated": {}, "application": 21}}
         async with FleetServer(file(slow, agent="two"), bus=end):
             await until(lambda: len(fleet) == 2 and fleet["b"].connected)
@@ -528,7 +528,7 @@ async def test_camera_can_be_waited_for_as_soon_as_it_has_joined() -> None:
 
 async def test_agent_that_is_cut_off_has_left_and_comes_back() -> None:
     bus = MemoryBus()
-    end = bus.end()
+    end = bus.new_connection()
     one = FleetServer(file({"a": HELLO}, agent="one"), bus=end)
     async with one, fleet_on(bus) as fleet:
         events = fleet.events()
@@ -543,7 +543,7 @@ async def test_agent_that_is_cut_off_has_left_and_comes_back() -> None:
     assert kinds == [AgentJoined, CameraJoined, CameraLeft, AgentLeft, AgentJoined, CameraJoined]
 
 
-class _LatePresenceOfOne(MemoryEnd):
+class _LatePresenceOfOne(MemoryConnection):
     """An end at which who watches one camera is told later than who watches all."""
 
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
@@ -622,7 +622,7 @@ async def test_remarks_of_a_camera_reach_the_programs_of_a_fleet() -> None:
     slow = [{"id": 1, "processing_time": 5.0}]
     async with EmulatedIfm(applications=slow) as emulator:
         bus = MemoryBus()
-        server = FleetServer(file({"left": {"url": emulator.url}}), bus=bus.end())
+        server = FleetServer(file({"left": {"url": emulator.url}}), bus=bus.new_connection())
         async with server, fleet_on(bus) as fleet:
             events = fleet["left"].events()
             await fleet["left"].wait_connected(timeout=10.0)

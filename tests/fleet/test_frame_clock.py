@@ -61,7 +61,7 @@ async def test_bounds_hold_the_truth(
         await asyncio.sleep(held)
         spoke = agent(loop.time())
         await asyncio.sleep(back)
-        one.bound_clock(came, said)
+        one.narrow_clock_lead(came, said)
         one.sample_clock(spoke)
         await asyncio.sleep(pause)
     await asyncio.sleep(since)

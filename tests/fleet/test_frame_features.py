@@ -52,7 +52,7 @@ async def test_features_are_those_of_the_device() -> None:
         assert await source.features["BlackLevel"].set(1.23) == 1.2
         black = await source.features["BlackLevel"].describe()
         assert (black.kind, black.unit, black.value, black.maximum) == ("float", "DN", 1.2, 25.5)
-        there = await plant.agent.hosts[NAME].frames.source()
+        there = await plant.agent.shared_cameras[NAME].frames.source()
         assert await source.features.names() == await there.features.names()
         assert await source.features.describe() == await there.features.describe()
         await source.features.save("UserSet1")

@@ -33,7 +33,7 @@ from tests.fleet.inside import (
     FrameCollector,
     FramePart,
     IncomingFrame,
-    MemoryEnd,
+    MemoryConnection,
     decode_part,
     encode_part,
 )
@@ -57,7 +57,7 @@ def large(number: int) -> dict[str, Any]:
 # ---------------------------------------------------------------------- the sender
 
 
-class Wire(MemoryEnd):
+class Wire(MemoryConnection):
     """An end that keeps the parts that are said, by program."""
 
     local = False

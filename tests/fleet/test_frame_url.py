@@ -61,8 +61,8 @@ async def test_camera_of_a_fleet_is_a_source_of_frames() -> None:
     ("query", "says"),
     [
         ("encoding=bmp", "encoding: expected raw, jpeg, png, jpegxl, h264, got 'bmp'"),
-        ("encoding=png&bitrate=1e6", "bitrate: 'png' cannot hold one; jpeg can, and h264"),
-        ("encoding=h264&latency=0.1", "latency: 'h264' cannot hold one; jpeg can"),
+        ("encoding=png&bitrate=1e6", "bitrate: 'png' cannot keep to one; jpeg can, and h264"),
+        ("encoding=h264&latency=0.1", "latency: 'h264' cannot keep to one; jpeg can"),
         ("encoding=h264&quality=7", "quality: h264 has none"),
         ("encoding=jpeg&latency=0.1&quality=7", "quality: expected none beside a bit rate"),
         ("encoding=jpeg&latency=0", "latency: expected a number from 0.001 to 60"),

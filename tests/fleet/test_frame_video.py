@@ -177,7 +177,7 @@ async def test_one_frame_is_no_video() -> None:
             assert isinstance(error, ConfigurationError)
             assert "its frames depend on each other" in str(error)
         # and not at the agent either, whoever asks
-        error = await gone(camera.frame_caller._caller.call("frame", 60.0, {"encoding": "h264"}))
+        error = await gone(camera.frame_client._caller.call("frame", 60.0, {"encoding": "h264"}))
         assert isinstance(error, ConfigurationError)
 
 

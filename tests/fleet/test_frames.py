@@ -211,18 +211,18 @@ async def test_program_that_is_gone_has_nothing_stream() -> None:
 
 async def test_program_that_asks_no_more_has_nothing_stream() -> None:
     async with looking() as (plant, camera), plant.streaming():
-        stream = camera.frame_caller.next_stream()
+        stream = camera.frame_client.next_stream()
         loop = asyncio.get_running_loop()
         arguments = {"stream": stream, "encoding": "raw", "quality": None}
         counts = _frame_caller.StreamCounts()
-        await camera.frame_caller.request_frame("next_frame", loop.time() + 1, arguments, counts)
+        await camera.frame_client.request_frame("next_frame", loop.time() + 1, arguments, counts)
         await asyncio.sleep(_frame_stream.IDLE_TIMEOUT - 0.1)
         assert plant.driver.sink is not None
         await asyncio.sleep(0.2)
         assert plant.driver.sink is None
         assert not plant.shared._streams
         # and goes on as if it had been away
-        answer, got = await camera.frame_caller.request_frame(
+        answer, got = await camera.frame_client.request_frame(
             "next_frame", loop.time() + 1, arguments, counts
         )
         assert got is not None
@@ -428,18 +428,18 @@ async def test_what_fails_in_a_stream_ends_it(
             with pytest.raises(FrameSourceError, match="ZeroDivisionError"):
                 async for _ in frames:
                     pass
-        assert "its frames end" in caplog.text
+        assert "its stream of frames failed" in caplog.text
         caplog.clear()
 
 
 async def test_one_stream_asks_once_at_a_time() -> None:
     async with looking() as (_, camera):
-        ask, loop = camera.frame_caller.request_frame, asyncio.get_running_loop()
+        ask, loop = camera.frame_client.request_frame, asyncio.get_running_loop()
         arguments = {"stream": 1, "encoding": "raw", "quality": None}
         counts = _frame_caller.StreamCounts()
         asked = [ask("next_frame", loop.time() + 1, arguments, counts) for _ in range(2)]
         first, second = await asyncio.gather(*asked, return_exceptions=True)
-        assert first == ({"came": pytest.approx(loop.time(), abs=2)}, None)
+        assert first == ({"asked_at": pytest.approx(loop.time(), abs=2)}, None)
         assert "two requests" in str(second)
 
 

@@ -51,7 +51,7 @@ def test_fleet_and_agent_that_nobody_has_say_that_they_were_not_closed(plan: Pat
 @pytest.mark.real_time
 def test_agent_that_nobody_has_says_that_it_was_not_stopped(plan: Path) -> None:
     async def start() -> None:
-        await FleetServer(str(plan), bus=MemoryBus().end()).start()
+        await FleetServer(str(plan), bus=MemoryBus().new_connection()).start()
 
     assert any("of fleet plant was not stopped" in one for one in said_of(start))
 

@@ -22,7 +22,7 @@ async def leave_in_doubt(plant: Plant, camera: FleetCamera) -> None:
     plant.box.inject(faults.NoResult())
     with pytest.raises(TriggerTimeoutError):
         await camera.trigger(input=token(7), timeout=0.1)
-    client = plant.agent.hosts[NAME].camera
+    client = plant.agent.shared_cameras[NAME].client
     await until(lambda: client._results.input_in_doubt)
 
 
@@ -37,7 +37,7 @@ async def test_no_program_is_kept_out_by_anothers_trigger_with_input() -> None:
         )
         assert [result.value.token for result in outcomes] == [8, 9, 10]
         assert Status.RUNNING in other.status
-        assert plant.agent.hosts[NAME].camera._state.wanted.application is None
+        assert plant.agent.shared_cameras[NAME].client._state.wanted.application is None
 
 
 async def test_trigger_cancelled_with_its_input_keeps_nobody_out() -> None:

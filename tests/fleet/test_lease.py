@@ -15,7 +15,7 @@ from smartcam.fleet import FleetCamera, MemoryBus, ReservationLost
 from smartcam.protocols import messages as m
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, PATIENCE, Plant, end_of, until
-from tests.fleet.inside import ProgramName, decode, decode_order, encode, in_words
+from tests.fleet.inside import ProgramName, decode, decode_trigger, encode, in_words
 from tests.fleet.lossy_bus import LossyBus, only
 from tests.fleet.test_standby import Pair
 
@@ -58,7 +58,7 @@ async def cut_off(scene: Scene) -> None:
 async def add_anew(scene: Scene) -> None:
     """As a reload does without the camera, and one with it again."""
     agent = scene.plant.agent
-    settings = agent.hosts[NAME].settings
+    settings = agent.shared_cameras[NAME].settings
     await agent.remove_camera(NAME, "a test")
     await asyncio.sleep(0.1)
     await agent.add_camera(NAME, settings)
@@ -73,7 +73,7 @@ async def split(scene: Scene) -> None:
     """Agents that cannot see each other both have the camera, which serves the newcomer; the robot
     sees only the one that has lost it."""
     north, south = scene.plant.agents["north"], scene.plant.agents["south"]
-    south.share(NAME, north.hosts[NAME].settings)
+    south.share(NAME, north.shared_cameras[NAME].settings)
     await until(lambda: "south" in scene.plant.having())
 
 
@@ -196,7 +196,7 @@ async def test_agent_without_the_camera_reserves_nothing_where_another_may_have_
         async with pair.program() as robot:
             await pair.box.stop()
             await until(lambda: not pair.having())
-            host = pair.agents["north"].hosts[NAME]
+            host = pair.agents["north"].shared_cameras[NAME]
             error = await gone(host.reserve(robot._program.name, "it", 5.0))
             assert isinstance(error, ConnectionLostError)
             assert host.gate.holder is None
@@ -228,7 +228,7 @@ async def test_tasks_that_reserve_at_the_same_time_lose_nothing() -> None:
                     await robot.trigger(timeout=5.0)
 
         await asyncio.gather(work(1), work(5), work(3))
-        assert plant.agent.hosts[NAME].gate.holder is None
+        assert plant.agent.shared_cameras[NAME].gate.holder is None
 
 
 @pytest.mark.parametrize("do", ["trigger", "start"])
@@ -244,17 +244,17 @@ async def test_every_command_of_a_block_says_whose_it_is(do: str) -> None:
     bus = LossyBus(fate)
     async with Plant(bus=bus) as plant, plant.cameras(1) as (robot,):
         plain = await robot.trigger(timeout=5.0)
-        order = decode_order(said[-1], "it")
+        order = decode_trigger(said[-1], "it")
         assert order is not None
         assert order[1].reservation is None
 
         async def block() -> None:
             async with robot.reserve(timeout=5.0):
                 reservation = decode(said[-1], "it").fields["call"]
-                plant.agent.hosts[NAME].lose_reservation()
+                plant.agent.shared_cameras[NAME].lose_reservation()
                 call = robot.trigger(timeout=5.0) if do == "trigger" else robot.start(timeout=5.0)
                 assert isinstance(await gone(call), ReservationLostError)
-                if order := decode_order(said[-1], "it"):
+                if order := decode_trigger(said[-1], "it"):
                     assert order[1].reservation == reservation
                 else:
                     assert decode(said[-1], "it").fields["reservation"] == reservation
@@ -294,14 +294,14 @@ async def test_question_at_the_end_is_asked_again_where_it_is_lost() -> None:
     async with Plant(bus=bus) as plant, plant.cameras(1) as (robot,):
         async with robot.reserve(timeout=5.0):
             bus.fate = only("ask", lambda *_: next(fates, (0.0,)))
-        await until(lambda: plant.agent.hosts[NAME].gate.holder is None)
+        await until(lambda: plant.agent.shared_cameras[NAME].gate.holder is None)
 
 
 async def test_reservation_that_is_cancelled_as_it_is_made_is_given_back() -> None:
     """Whenever that is: the reply may be there already."""
     bus = LossyBus()
     async with Plant(bus=bus) as plant, plant.cameras(1) as (robot,):
-        host = plant.agent.hosts[NAME]
+        host = plant.agent.shared_cameras[NAME]
         bus.fate = only("states", lambda *_: ())  # what the reply speaks of is waited for
         host._publish_state({"kind": "Tried"})
         reservation = robot.reserve(timeout=5.0)
@@ -355,7 +355,7 @@ async def test_loss_is_an_event_of_the_camera(way: Callable[[Scene], Awaitable[N
             await robot.trigger(timeout=5.0)
         await asyncio.sleep(1.0)
         hearing.cancel()
-        assert [(one.camera, one.by) for one in told] == [(robot.name, name)]
+        assert [(one.camera, one.program) for one in told] == [(robot.name, name)]
 
 
 async def test_loss_of_another_s_reservation_is_an_event_too() -> None:
@@ -366,9 +366,9 @@ async def test_loss_of_another_s_reservation_is_an_event_too() -> None:
 
         async def block() -> None:
             async with robot.reserve(timeout=5.0):
-                plant.agent.hosts[NAME].lose_reservation()
-                assert [one.by async for one in only_lost(seen)] == [name]  # at once
-                assert [one.by async for one in only_lost(own)] == [name]
+                plant.agent.shared_cameras[NAME].lose_reservation()
+                assert [one.program async for one in only_lost(seen)] == [name]  # at once
+                assert [one.program async for one in only_lost(own)] == [name]
 
         assert isinstance(await gone(block()), ReservationLostError)
         assert other.connected

@@ -47,7 +47,7 @@ def kept(log: AgentLog, first: int = 1, most_bytes: int = 1 << 20) -> list[int]:
 
 
 def add(log: AgentLog, count: int, clock: float = 0.0) -> None:
-    log.add(count, clock, Things(1, log.following, log.following + count).data)
+    log.add(count, clock, Things(1, log.next_number, log.next_number + count).data)
 
 
 @given(
@@ -61,19 +61,19 @@ def test_log_keeps_the_last_without_a_gap_and_within_its_bounds(
     log = AgentLog(most, most_bytes)
     sizes: list[tuple[int, int]] = []  # things and bytes of each entry
     for count in counts:
-        before = log.following
+        before = log.next_number
         add(log, count)
         sizes.append((count, len(Things(1, before, before + count).data)))
         numbers = kept(log)
-        assert numbers == [*range(log.first, log.following)]
+        assert numbers == [*range(log.first, log.next_number)]
         entries = len(log._entries)
         things, size = (sum(column) for column in zip(*sizes[-entries:], strict=True))
         assert log._bytes == size
         # what goes beyond the bounds is part of an entry, or one alone
         assert entries == 1 or (size <= most_bytes and things - sizes[-entries][0] < most)
         if size <= most_bytes:  # and nothing goes that has room
-            assert len(numbers) >= min(most, log.following - 1) or entries < len(sizes)
-    assert log.following == 1 + sum(counts)
+            assert len(numbers) >= min(most, log.next_number - 1) or entries < len(sizes)
+    assert log.next_number == 1 + sum(counts)
 
 
 def test_log_of_as_many_results_as_it_may_has_them_all() -> None:
@@ -90,11 +90,11 @@ def test_part_begins_where_it_is_asked_to_or_says_where(counts: list[int], first
         add(log, count)
     part = log.read_part(first, 1 << 20)
     numbers = kept(log, first)
-    assert part.following == log.following
+    assert part.next_number == log.next_number
     assert part.first == max(first, log.first)
-    if first < log.following:
+    if first < log.next_number:
         assert numbers[0] <= part.first  # an entry comes whole
-        assert numbers == [*range(numbers[0], log.following)]
+        assert numbers == [*range(numbers[0], log.next_number)]
     else:
         assert numbers == []
 
@@ -107,7 +107,7 @@ def test_part_is_as_much_as_fits_and_one_at_least(most_bytes: int, first: int) -
     data = log.read_part(first, most_bytes).data
     assert len(data) == 1 or sum(map(len, data)) <= most_bytes
     asked, got = first, [*range(1, first)]
-    while asked < log.following:  # in steps, everything comes
+    while asked < log.next_number:  # in steps, everything comes
         more = kept(log, asked, most_bytes)
         got += more
         asked = more[-1] + 1
@@ -295,14 +295,14 @@ class Hearing(RuleBasedStateMachine):
     def speak(self, counts: list[int]) -> None:
         fresh: list[Things] = []
         for count in counts:
-            first = self.log.following
+            first = self.log.next_number
             fresh.append(Things(self.epoch, first, first + count))
             self.log.add(count, 0.0, fresh[-1].data)
-        self.way.append((self.epoch, self.log.following, fresh))
+        self.way.append((self.epoch, self.log.next_number, fresh))
 
     @rule()
     def remind(self) -> None:
-        self.way.append((self.epoch, self.log.following, []))
+        self.way.append((self.epoch, self.log.next_number, []))
 
     @precondition(lambda self: self.way)
     @rule(data=st.data())
@@ -319,7 +319,7 @@ class Hearing(RuleBasedStateMachine):
         if feed.has_gap and feed.expected and feed.epoch == self.epoch:
             part = self.log.read_part(feed.expected, 25)
             things = [Things.read(one) for one in part.data]
-            self.answers.append((self.epoch, part.first, part.following, things))
+            self.answers.append((self.epoch, part.first, part.next_number, things))
 
     @precondition(lambda self: self.answers)
     @rule(lost=st.booleans())
@@ -342,7 +342,7 @@ class Hearing(RuleBasedStateMachine):
     def settle_epoch(self) -> None:
         feed = self.ear.feed
         if feed.epoch != self.epoch:
-            feed.begin(self.epoch, 1, self.log.following)
+            feed.begin(self.epoch, 1, self.log.next_number)
 
     @invariant()
     def each_once_and_in_order(self) -> None:
@@ -362,13 +362,13 @@ class Hearing(RuleBasedStateMachine):
     def teardown(self) -> None:
         feed = self.ear.feed
         self.settle_epoch()
-        feed.receive(self.epoch, self.log.following, [])
+        feed.receive(self.epoch, self.log.next_number, [])
         for _ in range(1000):
             if not feed.has_gap:
                 break
             part = self.log.read_part(feed.expected, 25)
-            feed.fill(self.epoch, part.first, part.following, [*map(Things.read, part.data)])
-        assert (feed.has_gap, feed.expected) == (False, self.log.following)
+            feed.fill(self.epoch, part.first, part.next_number, [*map(Things.read, part.data)])
+        assert (feed.has_gap, feed.expected) == (False, self.log.next_number)
         self.nothing_is_lost_unseen()
         self.each_once_and_in_order()
 

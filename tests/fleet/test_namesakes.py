@@ -14,7 +14,7 @@ from smartcam.fleet import FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._inside import Keys
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FLEET, NAME, PATIENCE, NumberedCamera, until
-from tests.fleet.inside import Agent, MemoryEnd, Standby
+from tests.fleet.inside import Agent, MemoryConnection, Standby
 
 QUICK = Backoff(initial=0.05, maximum=0.2, jitter=0.0)
 STANDS_BY = Standby.model_validate({})
@@ -25,7 +25,7 @@ class Namesakes:
 
     def __init__(self, box: NumberedCamera, standby: Standby | None) -> None:
         self.bus = MemoryBus()
-        self.ends: list[MemoryEnd] = [self.bus.end() for _ in range(2)]
+        self.ends: list[MemoryConnection] = [self.bus.new_connection() for _ in range(2)]
         self.told: list[ConfigurationError] = []
         settings = CameraSettings.make(box.url, None, {"reconnect": QUICK, "name": NAME})
         self.agents = [
@@ -42,12 +42,12 @@ class Namesakes:
 
     def having(self) -> list[int]:
         """Return which of them have a session with the camera."""
-        found = [agent.hosts.get(NAME) for agent in self.agents]
+        found = [agent.shared_cameras.get(NAME) for agent in self.agents]
         return [number for number, host in enumerate(found) if host and host.connected]
 
     def sharing(self) -> list[int]:
         """Return which of them say that they have the camera."""
-        return [number for number, agent in enumerate(self.agents) if agent.hosts]
+        return [number for number, agent in enumerate(self.agents) if agent.shared_cameras]
 
 
 @contextlib.asynccontextmanager
@@ -78,7 +78,7 @@ async def test_of_two_that_meet_after_a_split_the_earlier_start_stays(
         assert ["started before this one" in str(one) for one in made.told] == [True]
         assert made.agents[0].retired_by is None
         with pytest.raises(ConfigurationError, match="an agent named south"):
-            await made.agents[1].add_camera("other", made.agents[0].hosts[NAME].settings)
+            await made.agents[1].add_camera("other", made.agents[0].shared_cameras[NAME].settings)
 
 
 @pytest.mark.parametrize("standby", [None, STANDS_BY], ids=["alone", "standby"])
@@ -102,11 +102,11 @@ async def test_name_is_free_again_once_both_are_gone() -> None:
         await until(lambda: made.told)
         for agent in made.agents:
             await agent.close()
-        bus = MemoryBus.end(made.bus)
+        bus = MemoryBus.new_connection(made.bus)
         settings = made.agents[0]._cameras
         third = Agent("south", Keys(FLEET), bus, settings)
         await third.open(PATIENCE)
-        await until(lambda: third.hosts[NAME].connected)
+        await until(lambda: third.shared_cameras[NAME].connected)
         await third.close()
 
 
@@ -116,8 +116,8 @@ async def test_server_whose_name_another_one_has_says_so_to_who_follows_it() -> 
             MemoryBus(),
             FleetFile.model_validate({"agent": "south", "cameras": {NAME: {"url": box.url}}}),
         )
-        earlier = Agent("south", Keys("plant"), bus.end(), {})
-        end = bus.end()
+        earlier = Agent("south", Keys("plant"), bus.new_connection(), {})
+        end = bus.new_connection()
         async with FleetServer(file, bus=end) as server:
             end.detach()
             await earlier.open(PATIENCE)
@@ -129,6 +129,6 @@ async def test_server_whose_name_another_one_has_says_so_to_who_follows_it() -> 
                         pass
                 with pytest.raises(ConfigurationError, match="an agent named south"):
                     await anext(server.events())
-                assert server.hosts == {}
+                assert server.shared_cameras == {}
             finally:
                 await earlier.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import smartcam
 from smartcam import exceptions
-from tests.fleet.inside import _SUMS as SUM_NAMES
+from tests.fleet.inside import _SUM_TEXTS as SUM_NAMES
 from tests.fleet.inside import OUTCOMES, outcome_of
 from tests.web.test_operations import ask, parser, watched, words_of
 
@@ -19,7 +19,7 @@ async def test_page_lists_every_number_and_no_other() -> None:
         await fleet["one"].trigger()
         families = [*parser.text_string_to_metric_families((await ask(site, "/metrics"))[1])]
     there = {f"{one.name}_total" if one.type == "counter" else one.name for one in families}
-    frames = {"smartcam_frames_total", "smartcam_frames_lost_total", "smartcam_frame_viewers"}
+    frames = {"smartcam_frames_total", "smartcam_frames_lost_total", "smartcam_frame_streams"}
     outlets = {one for one in said if one == "outlet" or one.startswith("smartcam_outlet_")}
     assert said <= there | frames | outlets  # this agent has none of both
     # those that the page has together as "and others"

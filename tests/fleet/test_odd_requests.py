@@ -14,7 +14,7 @@ from tests.argument_table import (
     JSON_SERVICES,
     JSON_THESIS,
 )
-from tests.fleet.inside import SERVICES, THESIS, PlainRequest
+from tests.fleet.inside import SERVICES, THESIS, JsonRequest
 from tests.fleet.plainkit import NAME, PREFIX, Plant, plant
 
 BASE: dict[str, dict[str, Any]] = {
@@ -47,7 +47,7 @@ def test_every_field_of_every_service_is_in_the_table() -> None:
     for services, table in ((SERVICES, JSON_SERVICES), (THESIS, JSON_THESIS)):
         fields = {name: {*one.request.model_fields} for name, one in services.items()}
         assert fields == {name: {*JSON_FIELDS, *own} for name, own in table.items()}
-    assert {*PlainRequest.model_fields} == {*JSON_FIELDS}
+    assert {*JsonRequest.model_fields} == {*JSON_FIELDS}
 
 
 async def judge(place: Plant, key: str, payload: str, kinds: set[str]) -> str:
@@ -97,7 +97,7 @@ async def test_odd_fields_are_refused_and_nothing_is_sent(service: str) -> None:
                 if wrong:
                     found.append(f"{field}={odd}: {wrong}")
         assert found == []
-        assert place.server.hosts[NAME].results.following == 1
+        assert place.server.shared_cameras[NAME].results.next_number == 1
         assert (await place.client.call("trigger"))["error"] == ""
 
 
@@ -112,4 +112,4 @@ async def test_odd_requests_are_refused(service: str) -> None:
             if (wrong := await judge(place, f"service/{NAME}/{service}", text, REFUSALS))
         }
         assert found == {}
-        assert place.server.hosts[NAME].results.following == 1
+        assert place.server.shared_cameras[NAME].results.next_number == 1

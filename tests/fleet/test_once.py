@@ -21,7 +21,7 @@ from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, NumberedCamera, Plant, end_of, until
-from tests.fleet.inside import AgentLog, decode, decode_order, decode_outcome
+from tests.fleet.inside import AgentLog, decode, decode_trigger, decode_trigger_reply
 from tests.fleet.lossy_bus import LossyBus, as_said, only
 
 
@@ -57,7 +57,7 @@ class Recorded:
 
 def _what(payload: bytes) -> str | None:
     """Return what a call wants done; None for a cancellation."""
-    if decode_order(payload, "it") is not None:
+    if decode_trigger(payload, "it") is not None:
         return "trigger"
     return decode(payload, "it").fields.get("do")
 
@@ -89,7 +89,7 @@ async def test_lost_reply_is_a_timeout_that_does_not_guess() -> None:
 
 async def test_statuses_of_a_lost_reply_come_all_the_same() -> None:
     def no_outcome(key: str, payload: bytes) -> Sequence[float]:
-        return (0.0,) if decode_outcome(payload, "it") is None else ()
+        return (0.0,) if decode_trigger_reply(payload, "it") is None else ()
 
     bus = LossyBus()
     async with Plant(bus=bus) as plant, plant.camera() as camera:
@@ -179,7 +179,7 @@ async def test_double_of_a_program_that_is_gone_is_not_done_and_nothing_of_it_is
             await camera.trigger(timeout=60.0)
         await asyncio.sleep(0.1)
         assert plant.agent._programs == {}
-        other = plant.bus.end()
+        other = plant.bus.new_connection()
         await other.open(1.0)
         for key, payload in [*record.said]:
             other.put(key, payload)
@@ -228,7 +228,7 @@ async def test_status_is_right_after_an_agent_was_restarted() -> None:
         plant.box.device.stop()
         await plant.start_agent()
         await camera.wait_connected()
-        assert camera.status == plant.agent.hosts[NAME].camera.status != before
+        assert camera.status == plant.agent.shared_cameras[NAME].client.status != before
 
 
 def as_started_anew(plant: Plant) -> None:
@@ -237,7 +237,7 @@ def as_started_anew(plant: Plant) -> None:
     It was cut off, say, and another start of it was there before its lease was over: presence is
     told by name, so nobody sees a change.
     """
-    agent, host = plant.agent, plant.agent.hosts[NAME]
+    agent, host = plant.agent, plant.agent.shared_cameras[NAME]
     agent.epoch += 1
     host.epoch += 1
     host.results, host.states = AgentLog(100, 1 << 20), AgentLog(100, 1 << 20)

@@ -36,10 +36,10 @@ async def plant(folder: Path, text: str = FLEET) -> AsyncIterator[tuple[FleetSer
     path = folder / "fleet.yaml"
     path.write_text(text)
     bus = MemoryBus()
-    server = FleetServer(path, bus=bus.end())
+    server = FleetServer(path, bus=bus.new_connection())
     async with FleetOutlets(server), server:
         await server.wait_first_attempts()
-        fleet = Fleet(bus.end(), None, None, None, 20.0, {})
+        fleet = Fleet(bus.new_connection(), None, None, None, 20.0, {})
         async with fleet:
             yield server, fleet
 
@@ -67,13 +67,13 @@ async def test_stores_are_asked_for_what_failed_and_for_a_cameras_results(tmp_pa
         await triggered(fleet, 2)
         (everything,) = await fleet.stored_results()
         assert (everything.agent, everything.outlet, everything.total) == ("a1", "shifts", 2)
-        (some,) = await fleet.stored_results("line1/cam1", most=1)
+        (some,) = await fleet.stored_results("line1/cam1", max_rows=1)
         assert [row["id"][-2:] for row in some.rows] == ["/2"]
         (none,) = await fleet.stored_results("line2/**")
         assert (none.total, none.rows) == (0, [])
         (late,) = await fleet.stored_results(since=datetime.now(UTC) + timedelta(hours=1))
         assert late.total == 0
-        (failed,) = await fleet.stored_results(failed=True)
+        (failed,) = await fleet.stored_results(only_failed=True)
         assert (failed.failed, failed.rows) == (0, [])
 
 
@@ -86,7 +86,7 @@ async def test_a_question_that_cannot_be_read_is_answered_with_an_error(tmp_path
             assert said["error"], payload
             assert said["kind"] == "ConfigurationError"
         ((_, answer),) = await bus.ask(Keys("plant").outlets("a1", "nothing"), b"", 10.0)
-        assert "expected accounts or results" in json.loads(answer)["error"]
+        assert "expected counts or results" in json.loads(answer)["error"]
 
 
 async def test_a_store_that_cannot_be_read_is_told(tmp_path: Path) -> None:
@@ -102,7 +102,10 @@ async def test_an_agent_without_outlets_says_so(tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     path.write_text(text)
     bus = MemoryBus()
-    async with FleetServer(path, bus=bus.end()), Fleet(bus.end(), None, None, None, 20, {}) as one:
+    async with (
+        FleetServer(path, bus=bus.new_connection()),
+        Fleet(bus.new_connection(), None, None, None, 20, {}) as one,
+    ):
         assert await one.outlets() == []
         assert await one.stored_results() == []
 
@@ -111,8 +114,8 @@ async def test_arguments_are_checked(tmp_path: Path) -> None:
     async with plant(tmp_path) as (_, fleet):
         with pytest.raises(ConfigurationError, match="time zone"):
             await fleet.stored_results(since=datetime(2030, 1, 1))  # noqa: DTZ001 - it lacks one
-        with pytest.raises(ConfigurationError, match="most"):
-            await fleet.stored_results(most=-1)
+        with pytest.raises(ConfigurationError, match="max_rows"):
+            await fleet.stored_results(max_rows=-1)
 
 
 async def test_a_large_answer_leaves_out_the_oldest_rows(

@@ -46,11 +46,11 @@ async def test_list_has_every_camera_under_its_key() -> None:
             "status_names": ["RUNNING", "WAITING_FOR_TRIGGER"],
             "application": COUNTER,
             "reserved_by": None,
-            "url": place.server.hosts[NAME].camera.url,
+            "url": place.server.shared_cameras[NAME].client.url,
             "protocol": "bvs",
             "dialect": "handbook",
             "protocol_version": 1,
-            "capabilities": place.server.hosts[NAME].camera.capabilities.names,
+            "capabilities": place.server.shared_cameras[NAME].client.capabilities.names,
             "interpret_as": {str(COUNTER): LAYOUT, str(TEXTS): "strings50"},
             "y_down": False,
             "lenient": False,
@@ -82,9 +82,9 @@ async def test_list_says_why_there_is_no_session() -> None:
     memory = MemoryBus()
     with refusing(socket.SOCK_STREAM) as port:
         file = fleet_file(f"bvs://127.0.0.1:{port}", reconnect=False)
-        async with smartcam.fleet.FleetServer(file, bus=memory.end()) as server:
+        async with smartcam.fleet.FleetServer(file, bus=memory.new_connection()) as server:
             await server.wait_first_attempts()
-            end = await memory.end().open(PATIENCE)
+            end = await memory.new_connection().open(PATIENCE)
             ((_, said),) = await InProcess(end).ask("cameras/**")
             assert (said["connected"], said["status"], said["status_names"]) == (False, None, [])
             assert "nothing listens at" in said["failure"]
@@ -95,9 +95,9 @@ async def test_list_says_why_there_is_no_session() -> None:
 async def test_list_never_has_a_password() -> None:
     memory = MemoryBus()
     file = fleet_file("insight://admin:secret@127.0.0.1:9", reconnect=False)
-    async with smartcam.fleet.FleetServer(file, bus=memory.end()) as server:
+    async with smartcam.fleet.FleetServer(file, bus=memory.new_connection()) as server:
         await server.wait_first_attempts()
-        end = await memory.end().open(PATIENCE)
+        end = await memory.new_connection().open(PATIENCE)
         ((_, said),) = await InProcess(end).ask("cameras/**")
         assert said["url"] == "insight://admin@127.0.0.1:9"
         assert "secret" not in str(said)
@@ -170,7 +170,7 @@ async def test_nothing_is_made_as_long_as_nobody_subscribes(
 ) -> None:
     made: list[str] = []
     async with plant() as place:
-        topics = place.server.hosts[NAME].topics
+        topics = place.server.shared_cameras[NAME].topics
         result = topics.result
 
         def counted(run: Any) -> dict[str, Any]:
@@ -258,12 +258,12 @@ async def test_topics_tell_a_reservation_and_its_loss() -> None:
         await statuses.until(lambda said: said["reserved_by"] is None)
         with pytest.raises(ReservationLostError):
             async with camera.reserve(timeout=PATIENCE):
-                place.server.hosts[NAME].lose_reservation()
+                place.server.shared_cameras[NAME].lose_reservation()
         came = await events.until(lambda said: said["event"] == "ReservationLost")
         told = [said for said in came if said["event"].startswith(("Re", "Lost"))]
         kinds = ["Reserved", "Released", "Reserved", "ReservationLost"]
         assert [said["event"] for said in told] == kinds
-        assert {(said["by"], said["camera"], said["agent"]) for said in told} == {
+        assert {(said["program"], said["camera"], said["agent"]) for said in told} == {
             (holder, NAME, "one")
         }
         numbers = [said["number"] for said in came]
@@ -283,7 +283,7 @@ async def two_agents(memory: MemoryBus, *urls: str) -> list[Any]:
                     "cameras": {f"line/{agent}": fleet_file(url).cameras[NAME]},
                 }
             ),
-            bus=memory.end(),
+            bus=memory.new_connection(),
         )
         for agent, url in zip(("a", "b"), urls, strict=True)
     ]
@@ -295,7 +295,7 @@ async def test_each_agent_answers_for_its_own_cameras_and_one_for_those_that_nob
         first, second = await two_agents(memory, left.url, right.url)
         async with first, second:
             await asyncio.gather(first.wait_first_attempts(), second.wait_first_attempts())
-            end = await memory.end().open(PATIENCE)
+            end = await memory.new_connection().open(PATIENCE)
             client = InProcess(end)
             listed = {key: said["agent"] for key, said in await client.ask("cameras/**")}
             assert listed == {"cameras/line/a": "a", "cameras/line/b": "b"}

@@ -16,7 +16,7 @@ from smartcam.fleet import Fleet, FleetServer, MemoryBus
 from smartcam.fleet._inside import Keys
 from smartcam.fleet._program.exchange import Exchange
 from tests.fleet.fleetkit import PATIENCE, until
-from tests.fleet.inside import AgentBundle, MemoryEnd, decode_bundle, in_words
+from tests.fleet.inside import AgentBundle, MemoryConnection, decode_bundle, in_words
 from tests.fleet.inside import fleet as _fleet
 from tests.fleet.test_fleet import HELLO, file
 from tests.processes import free_place
@@ -27,15 +27,17 @@ CAMERAS = ("a", "b", "c", "d", "e")
 @contextlib.asynccontextmanager
 async def plant(monkeypatch: pytest.MonkeyPatch, *, met: int = 3) -> AsyncIterator[Fleet]:
     """Give a program with a fleet that is large to it: two agents, five cameras."""
-    monkeypatch.setattr(_fleet, "MAX_CAMERAS_MET", met)
+    monkeypatch.setattr(_fleet, "MAX_CAMERAS_ASKED_AT_OPEN", met)
     monkeypatch.setattr(_fleet, "MAX_CAMERAS_SUBSCRIBED", 2)
     bus = MemoryBus()
     async with contextlib.AsyncExitStack() as stack:
         for name, cameras in (("north", CAMERAS[:3]), ("south", CAMERAS[3:])):
             said = file(dict.fromkeys(cameras, HELLO), agent=name)
-            server = await stack.enter_async_context(FleetServer(said, bus=bus.end()))
+            server = await stack.enter_async_context(FleetServer(said, bus=bus.new_connection()))
             await server.wait_first_attempts()
-        yield await stack.enter_async_context(Fleet(bus.end(), None, "plant", None, 2.0, {}))
+        yield await stack.enter_async_context(
+            Fleet(bus.new_connection(), None, "plant", None, 2.0, {})
+        )
 
 
 # ---------------------------------------------------------------------- status
@@ -44,13 +46,13 @@ async def plant(monkeypatch: pytest.MonkeyPatch, *, met: int = 3) -> AsyncIterat
 async def test_status_of_all_is_one_question_to_each_agent(monkeypatch: Any) -> None:
     async with plant(monkeypatch) as fleet:
         asked: list[str] = []
-        ask = MemoryEnd.ask
+        ask = MemoryConnection.ask
 
-        async def counted(self: MemoryEnd, pattern: str, *rest: Any) -> Any:
+        async def counted(self: MemoryConnection, pattern: str, *rest: Any) -> Any:
             asked.append(pattern)
             return await ask(self, pattern, *rest)
 
-        monkeypatch.setattr(MemoryEnd, "ask", counted)
+        monkeypatch.setattr(MemoryConnection, "ask", counted)
         known = await fleet.status()
         assert asked == ["smartcam/plant/summary/*"]
         assert {name: one.agent for name, one in known.items()} == {
@@ -67,8 +69,8 @@ async def test_status_says_why_there_is_no_session_and_who_has_it_reserved() -> 
     bus = MemoryBus()
     said = file({"here": HELLO, "gone": {"url": "bvs://127.0.0.1:1"}})
     async with (
-        FleetServer(said, bus=bus.end()) as server,
-        Fleet(bus.end(), None, "plant", None, 2.0, {}) as fleet,
+        FleetServer(said, bus=bus.new_connection()) as server,
+        Fleet(bus.new_connection(), None, "plant", None, 2.0, {}) as fleet,
     ):
         await server.wait_first_attempts()
         async with fleet["here"].reserve():
@@ -92,17 +94,17 @@ async def test_large_fleet_is_seen_at_once_and_met_as_it_is_used(monkeypatch: An
         result = await fleet["d"].trigger(timeout=5.0)  # its commands wait for the agent
         assert result.camera == "d"
         assert [*fleet._cameras] == ["d"]
-        met = await fleet.meet("*")
+        met = await fleet.find_cameras("*")
         assert [one.name for one in met if one.connected] == [*CAMERAS]
         assert isinstance((await fleet.trigger())["a"], Result)
 
 
 async def test_camera_of_a_large_fleet_that_goes_is_lost(monkeypatch: Any) -> None:
     async with plant(monkeypatch) as fleet:
-        (camera,) = await fleet.meet("a")
+        (camera,) = await fleet.find_cameras("a")
         assert camera.connected
         bus = fleet._exchange._bus
-        assert isinstance(bus, MemoryEnd)
+        assert isinstance(bus, MemoryConnection)
         bus.detach()
         await until(lambda: not camera.connected)
         assert fleet.names() == []
@@ -139,7 +141,7 @@ async def test_results_of_all_come_once_and_those_of_a_lost_bundle_too(
     monkeypatch.setattr(Exchange, "_on_bundle", lossy)
     async with plant(monkeypatch) as fleet:
         results = fleet.results()
-        await fleet.meet()
+        await fleet.find_cameras()
         await asyncio.sleep(0.5)
         come.clear()
         numbers = await triggered(fleet, 4)
@@ -158,7 +160,7 @@ async def test_results_of_all_come_once_and_those_of_a_lost_bundle_too(
 async def test_who_hears_a_few_hears_no_bundles(monkeypatch: Any) -> None:
     async with plant(monkeypatch) as fleet:
         results = fleet.results("a")
-        await fleet.meet("a")
+        await fleet.find_cameras("a")
         await asyncio.sleep(0.1)
         assert "results" not in fleet._exchange._common_handles
         result = await fleet["a"].trigger(timeout=5.0)
@@ -168,7 +170,7 @@ async def test_who_hears_a_few_hears_no_bundles(monkeypatch: Any) -> None:
 async def test_nobody_who_hears_is_no_bundle(monkeypatch: Any) -> None:
     async with plant(monkeypatch) as fleet:
         results = fleet.results()
-        await fleet.meet()
+        await fleet.find_cameras()
         results.close()
         await until(lambda: "results" in fleet._exchange._common_handles)
         said: list[str] = []
@@ -194,23 +196,26 @@ def test_broken_bundle_is_told(payload: bytes) -> None:
 async def test_thousands_of_presences_come_through_a_router() -> None:
     """With less room for declarations the router waited for itself, and ended the connection."""
     pytest.importorskip("zenoh")
-    from smartcam.fleet._inside import ZenohEnd
+    from smartcam.fleet._inside import ZenohConnection
 
     places = (free_place(),)
     keys, count = Keys("plant"), 6000
-    router, agent = ZenohEnd(BusLink(listen=places)), ZenohEnd(BusLink(connect=places))
-    program = ZenohEnd(BusLink(connect=places))
+    router, agent = (
+        ZenohConnection(BusLink(listen=places)),
+        ZenohConnection(BusLink(connect=places)),
+    )
+    program = ZenohConnection(BusLink(connect=places))
     async with asyncio.timeout(PATIENCE):
         try:
             await router.open(PATIENCE)
             await agent.open(PATIENCE)
             for number in range(count):
-                agent.be_present(keys.camera("agent", f"line1/cam{number}"))
+                agent.announce(keys.camera("agent", f"line1/cam{number}"))
             everything = keys.camera("*", "**")
-            while len(await router.present(everything, PATIENCE)) < count:  # noqa: ASYNC110
+            while len(await router.present_keys(everything, PATIENCE)) < count:  # noqa: ASYNC110
                 await asyncio.sleep(0.1)
             await program.open(PATIENCE)
-            assert len(await program.present(everything, PATIENCE)) == count
+            assert len(await program.present_keys(everything, PATIENCE)) == count
         finally:
             for end in (program, agent, router):
                 await end.close()

@@ -70,21 +70,21 @@ async def test_command_that_waited_longer_than_its_timeout_is_not_done(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async with plant() as place:
-        pulse = place.server._agent._plain._pulse  # type: ignore[union-attr]
+        pulse = place.server._agent._json_services._pulse  # type: ignore[union-attr]
         monkeypatch.setattr(pulse, "max_wait", lambda: STOPPED)
         for answer in (
             await place.client.call("trigger", timeout=0.5),
             await place.client.call("stop", timeout=STOPPED),
         ):
             assert answer["kind"].endswith("TimeoutError")
-            assert "was stopped for 3.0 s" in answer["error"]
+            assert "hung for 3.0 s" in answer["error"]
             assert "was not done" in answer["error"]
         late = await place.client.thesis("TriggerLocalization", timeout=0.5)
         assert "was not done" in late["error"]
         assert (await place.client.ask("cameras/**"))[0][1]["next_result"] == 1
         # there is time left
         assert (await place.client.call("trigger", timeout=PATIENCE))["error"] == ""
-        assert place.server.hosts[PLAIN_NAME].results.following == 2
+        assert place.server.shared_cameras[PLAIN_NAME].results.next_number == 2
 
 
 @pytest.mark.real_time

@@ -25,7 +25,7 @@ def test_nothing_said_is_enough(tmp_path: Path) -> None:
     section = load(tmp_path, "{}")
     assert (section.size, section.age, section.keep) == (1e8, 3600, 1e10)
     assert section.path(tmp_path) == tmp_path / "recordings"
-    assert section.frames
+    assert section.messages
     assert section.chooses("line1/cam3")
 
 

@@ -55,15 +55,17 @@ async def line(folder: Path, *names: str, time: float = 0.001) -> AsyncIterator[
         path = folder / "fleet.yaml"
         write(path, {name: boxes[name].url for name in names or ("one", "two")})
         bus = MemoryBus()
-        server = await stack.enter_async_context(FleetServer(path, bus=bus.end()))
+        server = await stack.enter_async_context(FleetServer(path, bus=bus.new_connection()))
         await server.wait_first_attempts()
-        fleet = Fleet(bus.end(), None, "plant", None, PATIENCE, {})
+        fleet = Fleet(bus.new_connection(), None, "plant", None, PATIENCE, {})
         await stack.enter_async_context(fleet)
         yield Line(boxes, path, server, fleet)
 
 
 def sessions(one: Line) -> dict[str, int]:
-    return {name: host.camera.statistics().sessions for name, host in one.server.hosts.items()}
+    return {
+        name: host.client.statistics().sessions for name, host in one.server.shared_cameras.items()
+    }
 
 
 def life(box: NumberedCamera) -> tuple[int, int]:
@@ -77,7 +79,7 @@ async def test_what_did_not_change_goes_on_and_the_rest_is_as_the_file_says(
     tmp_path: Path,
 ) -> None:
     async with line(tmp_path, time=5.0) as one:
-        kept, box = one.server.hosts["one"], one.boxes["one"]
+        kept, box = one.server.shared_cameras["one"], one.boxes["one"]
         under_way = asyncio.create_task(one.fleet["one"].trigger(timeout=PATIENCE))
         await box.wait_received(m.Trigger)
         one.write("one", "three")
@@ -86,7 +88,7 @@ async def test_what_did_not_change_goes_on_and_the_rest_is_as_the_file_says(
         assert str(changes) == "1 added (three), 1 removed (two), 1 kept"
         assert not under_way.done()  # nobody waited for it
         assert (await under_way).camera == "one"
-        assert one.server.hosts["one"] is kept
+        assert one.server.shared_cameras["one"] is kept
         await one.server.wait_first_attempts()
         assert sessions(one) == {"one": 1, "three": 1}
         assert (life(box), life(one.boxes["two"])) == ((1, 0), (1, 1))
@@ -106,13 +108,13 @@ async def test_a_camera_that_changed_is_opened_again_and_its_results_are_numbere
         assert (await one.server.reload()).changed == ("one",)
         await one.server.wait_first_attempts()
         assert life(one.boxes["one"]) == (2, 1)
-        assert one.server.hosts["one"].settings.request_timeout == 4.0
+        assert one.server.shared_cameras["one"].settings.request_timeout == 4.0
         assert life(one.boxes["two"]) == (1, 0)
         await one.fleet["one"].trigger()
         numbers = [(await anext(stream)).value for _ in range(2)]
         assert len(numbers) == 2
         assert stream.statistics().missed == 0
-        assert one.server.hosts["one"].results.following == 3
+        assert one.server.shared_cameras["one"].results.next_number == 3
 
 
 async def test_cameras_may_change_names(tmp_path: Path) -> None:
@@ -122,7 +124,7 @@ async def test_cameras_may_change_names(tmp_path: Path) -> None:
         assert (await one.server.reload()).changed == ("one", "two")
         await one.server.wait_first_attempts()
         for name in urls:
-            assert one.server.hosts[name].connected
+            assert one.server.shared_cameras[name].connected
             assert [one.boxes[name].sessions != []] == [True]
         await one.fleet["one"].trigger()
         assert (one.boxes["one"].runs, one.boxes["two"].runs) == (0, 1)
@@ -137,17 +139,17 @@ async def test_an_emulated_camera_stays_where_others_are_added(tmp_path: Path) -
         path.write_text(yaml.safe_dump(file), "utf-8")
 
     put(2)
-    async with FleetServer(path, bus=MemoryBus().end()) as server:
+    async with FleetServer(path, bus=MemoryBus().new_connection()) as server:
         await server.wait_first_attempts()
         put(3)
         assert await server.reload() == FleetChanges("a1", ("e/cam3",), (), (), 2)
         await server.wait_first_attempts()
-        urls = {name: host.camera.url for name, host in server.hosts.items()}
+        urls = {name: host.client.url for name, host in server.shared_cameras.items()}
         put(1, seed=2)
         changes = await server.reload()
         assert changes == FleetChanges("a1", (), ("e/cam2", "e/cam3"), ("e/cam1",), 0)
         await server.wait_first_attempts()
-        assert server.hosts["e/cam1"].camera.url != urls["e/cam1"]
+        assert server.shared_cameras["e/cam1"].client.url != urls["e/cam1"]
         for name in ("e/cam2", "e/cam3"):
             place = parse_address(urls[name])
             with pytest.raises(ConnectionRefusedError):
@@ -201,13 +203,13 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 async def test_a_wrong_file_leaves_all_as_it_was(tmp_path: Path, case: str) -> None:
     async with line(tmp_path) as one:
-        hosts, file = dict(one.server.hosts), one.server.file
+        hosts, file = dict(one.server.shared_cameras), one.server.file
         text, expected = WRONG[case]
         one.path.write_text(text, "utf-8")
         with pytest.raises(ConfigurationError, match=expected) as caught:
             await one.server.reload()
         assert one.server.reloads.last is caught.value
-        assert one.server.hosts == hosts
+        assert one.server.shared_cameras == hosts
         assert one.server.file is file
         assert [life(box) for box in one.boxes.values()] == [(1, 0), (1, 0), (0, 0)]
         one.path.unlink()
@@ -235,7 +237,7 @@ async def test_an_emulated_camera_that_cannot_start_leaves_all_as_it_was(tmp_pat
         one.path.write_text(yaml.safe_dump({"agent": "a1", "cameras": cameras}), "utf-8")
         with pytest.raises(ConfigurationError, match="no port is left"):
             await one.server.reload()
-        assert [*one.server.hosts] == ["one", "two"]
+        assert [*one.server.shared_cameras] == ["one", "two"]
         assert [*one.server.reloads.sources] == ["one", "two"]
 
 
@@ -254,7 +256,7 @@ async def test_what_nobody_foresaw_is_a_typed_error_and_the_next_one_works(
                     await one.server.reload()
                 outcome = (await one.fleet.reload())["a1"]
                 assert expected in str(outcome)
-        assert [*one.server.hosts] == ["one", "two"]
+        assert [*one.server.shared_cameras] == ["one", "two"]
         assert (await one.server.reload()).removed == ("two",)
 
 
@@ -297,12 +299,12 @@ async def test_a_camera_that_is_being_connected_can_be_removed(tmp_path: Path) -
         await one.server.reload()
         trigger = asyncio.create_task(one.fleet["silent"].trigger(timeout=PATIENCE))
         await asyncio.sleep(0.1)
-        assert not one.server.hosts["silent"].connected
+        assert not one.server.shared_cameras["silent"].connected
         one.write("one")
         assert (await one.server.reload()).removed == ("silent",)
         with pytest.raises(SmartCamError):
             await trigger
-        assert [*one.server.hosts] == ["one"]
+        assert [*one.server.shared_cameras] == ["one"]
         silent.close()
 
 
@@ -331,7 +333,7 @@ async def test_cancelled_anywhere_it_is_done_or_not_and_the_next_one_works(
             one.path.write_text("cameras: [", "utf-8")
             with pytest.raises(ConfigurationError):  # which waits for the one before
                 await one.server.reload()
-            assert tuple(one.server.hosts) == named
+            assert tuple(one.server.shared_cameras) == named
             assert tuple(one.server.reloads.sources) == named
             if over:
                 break

@@ -9,7 +9,7 @@ import pytest
 
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectFailedError
-from smartcam.fleet._inside import ZenohEnd
+from smartcam.fleet._inside import ZenohConnection
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.test_zenoh import two_ends
 from tests.processes import free_place
@@ -26,14 +26,14 @@ async def test_all_is_there_again() -> None:
         listens.answer("question", answer)
         listens.watch("there/*", lambda key, present: seen.append((key, present)))
         publisher = listens.publisher("topic/a", told.append)
-        closed = listens.be_present("here/closed")
-        listens.be_present("here/a")
+        closed = listens.announce("here/closed")
+        listens.announce("here/a")
         came: list[bytes] = []
         known: list[tuple[str, bool]] = []
         connects.subscribe("topic/*", lambda _, payload: came.append(payload))
         connects.watch("here/*", lambda key, present: known.append((key, present)))
-        connects.be_present("there/stays")
-        goes = connects.be_present("there/goes")
+        connects.announce("there/stays")
+        goes = connects.announce("there/goes")
         await until(lambda: len(seen) == 2 and len(known) == 2 and publisher.has_subscribers)
         closed.close()
         await until(lambda: len(known) == 3)
@@ -44,10 +44,10 @@ async def test_all_is_there_again() -> None:
         reopening = asyncio.ensure_future(listens.reopen(PATIENCE))
         await asyncio.sleep(0)
         assert not listens.opened
-        listens.be_present("here/meanwhile")
+        listens.announce("here/meanwhile")
         early = listens.publisher("topic/b")
         early.put(b"nobody hears it")
-        listens.be_present("here/taken back").close()
+        listens.announce("here/taken back").close()
         goes.close()
         await reopening
 
@@ -92,7 +92,7 @@ async def test_publisher_that_nobody_hears_any_more_is_told() -> None:
 
 async def test_again_where_it_could_not_listen() -> None:
     place = free_place()
-    one = ZenohEnd(BusLink(listen=(place,)))
+    one = ZenohConnection(BusLink(listen=(place,)))
     await one.open(PATIENCE)
     found: list[str] = []
     one.subscribe("test", lambda key, _: found.append(key))
@@ -113,10 +113,10 @@ async def test_again_where_it_could_not_listen() -> None:
 @pytest.mark.parametrize("turns", [1, 2, 3, 5, 8])
 async def test_cancelled(turns: int) -> None:
     """At any await: it closes, or is opened again."""
-    one = ZenohEnd(BusLink(listen=(free_place(),)))
+    one = ZenohConnection(BusLink(listen=(free_place(),)))
     await one.open(PATIENCE)
     for number in range(100):
-        one.be_present(f"here/{number}")
+        one.announce(f"here/{number}")
     task = asyncio.ensure_future(one.reopen(PATIENCE))
     for _ in range(turns):
         await asyncio.sleep(0.01 if turns > 3 else 0)

@@ -20,7 +20,7 @@ from tests.fleet.lossy_bus import LossyBus, as_said, only
 
 
 def gate(plant: Plant) -> Gate:
-    return plant.agent.hosts[NAME].gate
+    return plant.agent.shared_cameras[NAME].gate
 
 
 async def test_commands_of_others_wait_and_fail_naming_the_holder() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from smartcam.emulator import EmulatedCamera
 from smartcam.protocols import messages as m
-from tests.fleet.inside import plain as _plain
+from tests.fleet.inside import json_services as _services
 from tests.fleet.plainkit import (
     COUNTER,
     LOCALIZATIONS,
@@ -110,7 +110,7 @@ async def test_error_has_its_text_its_kind_and_what_is_known() -> None:
         (b"[" * 100_000, "no JSON"),
         (b'{"timeout": Infinity}', "no JSON"),
         (b"[1]", "expected a JSON object, got list"),
-        (b" " * (1 << 18) + b"{}", "262144 are taken"),
+        (b" " * (1 << 18) + b"{}", "at most 262144 are accepted"),
         ({"timeout": "5"}, "timeout"),
         ({"timeout": 0}, "timeout"),
         ({"timeout": 1e9}, "timeout"),
@@ -223,7 +223,7 @@ async def test_call_for_an_earlier_start_of_the_agent_is_not_done() -> None:
 
 
 async def test_memory_of_answers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_plain, "MAX_ANSWERS_REMEMBERED", 3)
+    monkeypatch.setattr(_services, "MAX_ANSWERS_REMEMBERED", 3)
     async with plant() as place:
         for number in range(5):
             await place.client.call("trigger", id=number)
@@ -234,7 +234,7 @@ async def test_memory_of_answers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 async def test_bytes_of_answers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_plain, "MAX_ANSWER_BYTES_REMEMBERED", 100)
+    monkeypatch.setattr(_services, "MAX_ANSWER_BYTES_REMEMBERED", 100)
     async with plant() as place:
         await place.client.call("trigger", id=1)
         await place.client.call("trigger", id=1)
@@ -260,7 +260,7 @@ async def test_call_waits_for_a_reservation_within_its_time() -> None:
 
 
 async def test_number_of_calls_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_plain, "MAX_CONCURRENT_CALLS", 2)
+    monkeypatch.setattr(_services, "MAX_CONCURRENT_CALLS", 2)
     async with plant() as place:
         await place.client.call("switch_application", application=SILENT)
         calls = [place.client.call("trigger", timeout=1) for _ in range(4)]
@@ -272,7 +272,7 @@ async def test_number_of_calls_is_bounded(monkeypatch: pytest.MonkeyPatch) -> No
 async def test_repeats_that_wait_are_bounded() -> None:
     async with plant() as place:
         await place.client.call("switch_application", application=SILENT)
-        most = _plain.MAX_WAITING_REPEATS
+        most = _services.MAX_WAITING_REPEATS
         calls = [place.client.call("trigger", timeout=1, id=1) for _ in range(most + 1)]
         kinds = [answer["kind"] for answer in await asyncio.gather(*calls)]
         assert kinds == ["TriggerTimeoutError"] * most + ["LocalProtocolError"]

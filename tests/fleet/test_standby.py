@@ -25,7 +25,7 @@ from smartcam.fleet._inside import Keys
 from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.settings import Address, CameraSettings
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
-from tests.fleet.inside import Agent, MemoryEnd, Program, Standby
+from tests.fleet.inside import Agent, MemoryConnection, Program, Standby
 
 ASK_TIMEOUT = 0.5
 HOLD_OFF = 0.2
@@ -49,7 +49,7 @@ class Pair:
         self.box = NumberedCamera(time=0.01)
         self.bus = MemoryBus()
         self.agents: dict[str, Agent] = {}
-        self.ends: dict[str, MemoryEnd] = {}
+        self.ends: dict[str, MemoryConnection] = {}
         self._stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -66,7 +66,7 @@ class Pair:
 
     async def start(self, name: str, standby: Standby | None = STANDS_BY) -> Agent:
         """Start an agent."""
-        end = self.ends[name] = self.bus.end()
+        end = self.ends[name] = self.bus.new_connection()
         settings = CameraSettings.make(self.box.url, None, {"reconnect": QUICK, "name": NAME})
         agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=standby)
         await agent.open(PATIENCE)
@@ -76,19 +76,19 @@ class Pair:
 
     def having(self) -> list[str]:
         """Return who has a session with the camera."""
-        found = [(name, one.hosts.get(NAME)) for name, one in self.agents.items()]
+        found = [(name, one.shared_cameras.get(NAME)) for name, one in self.agents.items()]
         return [name for name, host in found if host is not None and host.connected]
 
     def sharing(self) -> list[str]:
         """Return who says that it has the camera."""
-        return [name for name, one in self.agents.items() if NAME in one.hosts]
+        return [name for name, one in self.agents.items() if NAME in one.shared_cameras]
 
     def program(self) -> FleetCamera[Any]:
         """Return the camera of a program, to be opened."""
         options = {"name": NAME, "interpret_as": LAYOUT, "reconnect": QUICK}
         address = Address("fleet", "fleet", "127.0.0.1", 7447, path=NAME)
         settings = CameraSettings.of(address, options)
-        return FleetCamera(settings, NAME, Program(self.bus.end(), FLEET, NAME))
+        return FleetCamera(settings, NAME, Program(self.bus.new_connection(), FLEET, NAME))
 
 
 class Work:
@@ -186,18 +186,18 @@ async def test_agent_takes_no_camera_that_another_has_under_another_name(how: st
         north = await pair.start("north")
         settings = CameraSettings.make(pair.box.url, None, {"name": "thief", "reconnect": QUICK})
         first = {} if how == "reload" else {"thief": settings}
-        south = Agent("south", Keys(FLEET), pair.bus.end(), first, standby=STANDS_BY)
+        south = Agent("south", Keys(FLEET), pair.bus.new_connection(), first, standby=STANDS_BY)
         try:
             if how == "reload":
                 await south.open(PATIENCE)
             with pytest.raises(ConfigurationError, match=f"is the camera {NAME} of the agent"):
                 await (south.open(PATIENCE) if first else south.add_camera("thief", settings))
-            assert not south.hosts
+            assert not south.shared_cameras
             assert pair.having() == ["north"]
             if how == "reload":
                 await north.close()
                 await south.add_camera("thief", settings)  # it is free now
-                assert [*south.hosts] == ["thief"]
+                assert [*south.shared_cameras] == ["thief"]
         finally:
             await south.close()
 
@@ -207,14 +207,14 @@ async def test_camera_is_not_taken_over_while_another_name_has_it() -> None:
         north = await pair.start("north")
         await pair.start("south")
         settings = CameraSettings.make(pair.box.url, None, {"name": "thief", "reconnect": QUICK})
-        third = Agent("third", Keys(FLEET), pair.bus.end(), {})
+        third = Agent("third", Keys(FLEET), pair.bus.new_connection(), {})
         await third.open(PATIENCE)
         try:
             await north.close()
             third.share("thief", settings)  # as a Setup that was faster
             await third.wait_first_attempts()
             await asyncio.sleep(SOON)
-            assert third.hosts["thief"].connected
+            assert third.shared_cameras["thief"].connected
             assert pair.sharing() == ["north"]  # which is closed
             await third.remove_camera("thief", "a test")
             await until(lambda: "south" in pair.having())
@@ -302,8 +302,8 @@ async def test_program_that_comes_later_misses_nothing_of_before() -> None:
 async def test_of_several_the_preferred_one_takes_over() -> None:
     async with Pair() as pair:
         await pair.start("north")
-        await pair.start("late", Standby(preference=2))
-        await pair.start("soon", Standby(preference=1))
+        await pair.start("late", Standby(rank=2))
+        await pair.start("soon", Standby(rank=1))
         await pair.agents.pop("north").close()
         await until(lambda: pair.having() == ["soon"], SOON)
         await asyncio.sleep(4 * HOLD_OFF)
@@ -338,10 +338,10 @@ async def split(pair: Pair) -> str:
 async def test_split_is_settled_by_the_camera_and_nobody_flaps() -> None:
     async with pair_at_work() as (pair, _):
         winner = await split(pair)
-        sessions = [one.camera.statistics().sessions for one in hosts(pair)]
+        sessions = [one.client.statistics().sessions for one in hosts(pair)]
         await asyncio.sleep(15.0)
         assert pair.having() == [winner]
-        assert [one.camera.statistics().sessions for one in hosts(pair)] == sessions
+        assert [one.client.statistics().sessions for one in hosts(pair)] == sessions
         pair.ends["north"].attach()
         await until(lambda: len(pair.sharing()) == 1, PATIENCE)
         assert pair.having() == pair.sharing() == [winner]
@@ -412,7 +412,7 @@ async def test_bus_that_was_away_is_no_reason_to_take_over() -> None:
         pair.ends["north"].attach()
         await asyncio.sleep(10.0)
         assert (pair.having(), pair.sharing()) == (["north"], ["north"])
-        assert pair.agents["north"].hosts[NAME].camera.statistics().sessions == 1
+        assert pair.agents["north"].shared_cameras[NAME].client.statistics().sessions == 1
 
 
 async def test_who_is_back_with_the_bus_and_then_ends_is_replaced_at_once() -> None:
@@ -459,16 +459,16 @@ async def test_camera_that_was_taken_is_taken_back_from_an_agent_only(contested:
     """From one that had it, and has let go of it, too: else nobody would have it. And once."""
     async with Pair() as pair:
         await pair.start("north")
-        other = pair.bus.end()
+        other = pair.bus.new_connection()
         await other.open(1.0)
         for _ in range(1 + contested):
             await until(lambda: pair.having() == ["north"])
             if contested:
-                other.be_present(Keys(FLEET).camera("south", NAME)).close()
+                other.announce(Keys(FLEET).camera("south", NAME)).close()
             await taken_twice(pair)
         (host,) = hosts(pair)
         await asyncio.sleep(15.0)
-        assert isinstance(host.camera.trouble, ConnectionTakenError)
+        assert isinstance(host.client.trouble, ConnectionTakenError)
         assert (hosts(pair), pair.having()) == ([host], [])
 
 
@@ -481,7 +481,7 @@ async def taken_twice(pair: Pair) -> None:
 
 
 def hosts(pair: Pair) -> list[Any]:
-    return [one.hosts[NAME] for one in pair.agents.values() if NAME in one.hosts]
+    return [one.shared_cameras[NAME] for one in pair.agents.values() if NAME in one.shared_cameras]
 
 
 # ---------------------------------------------------------------------- who refuses
@@ -496,9 +496,9 @@ async def test_agent_that_does_not_stand_by_gives_way_to_one_that_does() -> None
 
 async def test_presence_of_the_dead_is_waited_for() -> None:
     async with Pair() as pair:
-        end = pair.bus.end()
+        end = pair.bus.new_connection()
         await end.open(1.0)
-        token = end.be_present(Keys(FLEET).camera("ghost", NAME))
+        token = end.announce(Keys(FLEET).camera("ghost", NAME))
         asyncio.get_running_loop().call_later(3.0, token.close)
         await pair.start("north", None)
         assert pair.having() == ["north"]
@@ -506,18 +506,18 @@ async def test_presence_of_the_dead_is_waited_for() -> None:
 
 async def test_agent_that_says_nothing_is_named() -> None:
     async with Pair() as pair:
-        end = pair.bus.end()
+        end = pair.bus.new_connection()
         await end.open(1.0)
-        end.be_present(Keys(FLEET).camera("ghost", NAME))
+        end.announce(Keys(FLEET).camera("ghost", NAME))
         with pytest.raises(ConfigurationError, match="agent ghost of fleet plant, which does not"):
             await pair.start("north", None)
 
 
 async def test_name_of_an_agent_that_goes_is_free() -> None:
     async with Pair() as pair:
-        end = pair.bus.end()
+        end = pair.bus.new_connection()
         await end.open(1.0)
-        token = end.be_present(Keys(FLEET).agent("north"))
+        token = end.announce(Keys(FLEET).agent("north"))
         asyncio.get_running_loop().call_later(0.7, token.close)
         await pair.start("north", None)
         assert pair.having() == ["north"]
@@ -534,7 +534,7 @@ async def test_two_agents_of_one_name_are_one_too_many() -> None:
 
 @pytest.mark.parametrize(
     ("said", "found"),
-    [(True, STANDS_BY), (False, None), ({"preference": 2}, Standby(preference=2)), ({}, STANDS_BY)],
+    [(True, STANDS_BY), (False, None), ({"rank": 2}, Standby(rank=2)), ({}, STANDS_BY)],
 )
 def test_standby_in_a_file(said: object, found: Standby | None) -> None:
     cameras = {"a": {"url": "bvs://192.0.2.1"}}
@@ -546,7 +546,7 @@ async def test_fleet_sees_one_camera_throughout() -> None:
     async with Pair() as pair:
         await pair.start("north")
         await pair.start("south")
-        async with Fleet(pair.bus.end(), None, FLEET, None, 2.0, {}) as fleet:
+        async with Fleet(pair.bus.new_connection(), None, FLEET, None, 2.0, {}) as fleet:
             camera = fleet[NAME]
             assert (await fleet.status())[NAME].agent == "north"
             await pair.agents.pop("north").close()

@@ -16,7 +16,7 @@ pytest.importorskip("zenoh")
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet import Fleet
-from smartcam.fleet._inside import FleetAddress, Keys, ZenohEnd
+from smartcam.fleet._inside import FleetAddress, Keys, ZenohConnection
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
 from tests.fleet.partner import Partner, partner
 from tests.fleet.test_standby import QUICK, Work
@@ -37,19 +37,19 @@ class Hosts:
     def __init__(self, box: NumberedCamera, address: str) -> None:
         self.box = box
         self.place = free_place(address)
-        self.router = ZenohEnd(BusLink(listen=(self.place,)))
+        self.router = ZenohConnection(BusLink(listen=(self.place,)))
         self.agents: dict[str, Partner] = {}
 
     async def restart_router(self) -> None:
         await self.router.close()
         await asyncio.sleep(1.0)
-        self.router = ZenohEnd(BusLink(listen=(self.place,)))
+        self.router = ZenohConnection(BusLink(listen=(self.place,)))
         await self.router.open(PATIENCE)
 
     async def sharing(self) -> list[str]:
         """Return the agents that say that they have the camera."""
         keys = Keys(FLEET)
-        found = await self.router.present(keys.camera("*", NAME), PATIENCE)
+        found = await self.router.present_keys(keys.camera("*", NAME), PATIENCE)
         return sorted(keys.tail(key, "presence/camera")[0] for key in found)
 
     async def settled(self, *agents: str) -> None:
@@ -81,7 +81,7 @@ async def hosts_at_work(
                 )
             )
         place = FleetAddress.parse(f"fleet://{hosts.place.partition('/')[2]}")
-        link = ZenohEnd(BusLink(connect=(hosts.place,)))
+        link = ZenohConnection(BusLink(connect=(hosts.place,)))
         options = {"interpret_as": LAYOUT, "reconnect": QUICK}
         fleet = Fleet(link, place, FLEET, None, PATIENCE, options)
         await stack.enter_async_context(fleet)

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("zenoh")
 
 from smartcam._zenoh import BusLink
-from smartcam.fleet._inside import Keys, ZenohEnd
+from smartcam.fleet._inside import Keys, ZenohConnection
 from tests.fleet.fleetkit import FLEET, PATIENCE, until
 from tests.processes import free_place
 
@@ -22,7 +22,7 @@ MANY = 300
 async def test_router_that_is_gone_is_known_before_its_agents_are() -> None:
     keys = Keys(FLEET)
     places = (free_place(),)
-    router, end = ZenohEnd(BusLink(listen=places)), ZenohEnd(BusLink(connect=places))
+    router, end = ZenohConnection(BusLink(listen=places)), ZenohConnection(BusLink(connect=places))
     await router.open(PATIENCE)
     try:
         await end.open(PATIENCE)
@@ -33,13 +33,13 @@ async def test_router_that_is_gone_is_known_before_its_agents_are() -> None:
             if present:
                 there.add(key)
             else:
-                reached.append(end.reached)
+                reached.append(end.is_connected)
 
         end.watch(keys.camera("*", "**"), see)
         for number in range(MANY):
-            router.be_present(keys.camera("north", f"cam{number}"))
+            router.announce(keys.camera("north", f"cam{number}"))
         await until(lambda: len(there) == MANY)
-        assert end.reached
+        assert end.is_connected
         await asyncio.to_thread(router.session.close)  # all at once, as where it is killed
         await until(lambda: len(reached) == MANY)
         assert not any(reached)

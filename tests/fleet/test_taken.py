@@ -33,7 +33,7 @@ class Shop:
             await until(lambda: self.host.connected)
             async with smartcam.connect(self.box.url):
                 await until(lambda: not self.host.connected)
-        await until(lambda: self.host.camera.is_taken)
+        await until(lambda: self.host.client.is_taken)
 
 
 @contextlib.asynccontextmanager
@@ -42,18 +42,18 @@ async def shop() -> AsyncIterator[Shop]:
     async with contextlib.AsyncExitStack() as stack:
         box = await stack.enter_async_context(NumberedCamera(time=0.01))
         settings = CameraSettings.make(box.url, None, {"reconnect": QUICK, "name": NAME})
-        agent = Agent("north", Keys(FLEET), bus.end(), {NAME: settings})
+        agent = Agent("north", Keys(FLEET), bus.new_connection(), {NAME: settings})
         await agent.open(PATIENCE)
         stack.push_async_callback(agent.close)
         await agent.wait_first_attempts()
         address = Address("fleet", "fleet", "127.0.0.1", 7447, path=NAME)
         own = {"name": NAME, "interpret_as": LAYOUT, "reconnect": QUICK}
-        program = Program(bus.end(), FLEET, NAME)
+        program = Program(bus.new_connection(), FLEET, NAME)
         camera = FleetCamera[Any](CameraSettings.of(address, own), NAME, program)
         await stack.enter_async_context(camera)
-        end = await bus.end().open(PATIENCE)
+        end = await bus.new_connection().open(PATIENCE)
         stack.push_async_callback(end.close)
-        yield Shop(box, agent.hosts[NAME], camera, end)
+        yield Shop(box, agent.shared_cameras[NAME], camera, end)
 
 
 async def test_camera_that_was_taken_is_told_and_comes_back_by_itself() -> None:
@@ -71,15 +71,15 @@ async def test_camera_that_was_taken_is_told_and_comes_back_by_itself() -> None:
 
 async def test_camera_that_is_taken_again_and_again_is_tried_ever_more_seldom() -> None:
     async with shop() as made:
-        supervisor = made.host.camera._supervisor
+        supervisor = made.host.client._supervisor
         await made.take()
         pauses: list[float] = []
         for _ in range(7):
             pauses.append(supervisor._pause_of_taken)
-            made.host.camera.try_take_back()
+            made.host.client.try_take_back()
             await until(lambda: made.host.connected)
             async with smartcam.connect(made.box.url):
-                await until(lambda: made.host.camera.is_taken)  # at the first loss already
+                await until(lambda: made.host.client.is_taken)  # at the first loss already
         assert pauses == [60.0, 120.0, 240.0, 480.0, *[600.0] * 3]
 
 
@@ -87,7 +87,7 @@ async def test_camera_that_is_taken_again_and_again_is_tried_ever_more_seldom() 
 async def test_camera_that_was_taken_is_taken_back_at_once(way: str) -> None:
     async with shop() as made:
         await made.take()
-        sessions = made.host.camera.statistics().sessions
+        sessions = made.host.client.statistics().sessions
         if way == "fleet":
             await made.camera.take_back(timeout=PATIENCE)
         else:
@@ -95,7 +95,7 @@ async def test_camera_that_was_taken_is_taken_back_at_once(way: str) -> None:
             ((_, answer),) = await made.end.ask(key, b"", PATIENCE)
             assert json.loads(answer) == {"error": ""}
         assert made.host.connected
-        assert made.host.camera.statistics().sessions == sessions + 1
+        assert made.host.client.statistics().sessions == sessions + 1
         await made.camera.wait_connected(PATIENCE)
         assert (await made.camera.trigger(2)).value.run == 1
 
@@ -103,7 +103,7 @@ async def test_camera_that_was_taken_is_taken_back_at_once(way: str) -> None:
 async def test_taking_back_what_nobody_took_changes_nothing() -> None:
     async with shop() as made:
         await made.camera.take_back()
-        assert made.host.camera.statistics().sessions == 1
+        assert made.host.client.statistics().sessions == 1
 
 
 async def test_camera_that_was_taken_and_is_switched_off_is_awaited_like_any_other() -> None:

@@ -161,7 +161,7 @@ class JsonFace(Face):
         if self._heard is None:
             key = f"{PREFIX}/thesis/topic/outputs"
             self._heard = self._session.declare_subscriber(key, take)
-        topics = self._server.hosts[NAME].topics
+        topics = self._server.shared_cameras[NAME].topics
         await until(
             lambda: topics.results_out is not None and topics.results_out.publisher.has_subscribers
         )

@@ -91,7 +91,7 @@ async def test_operator_commands_and_viewer_looks(server: FleetServer, folder: P
 async def test_viewer_reads_what_outlets_did(server: FleetServer, folder: Path) -> None:
     async with program(url(server, folder / "dashboard")) as dashboard:
         found = dashboard._program
-        for name in ("accounts", "results"):
+        for name in ("counts", "results"):
             (answer,) = await found.bus.ask(found.keys.outlets("*", name), b"", PATIENCE)
             assert b'"error":""' in answer[1]
 
@@ -106,8 +106,8 @@ async def test_who_commands_all_the_same_is_not_heard(server: FleetServer, folde
             await dashboard.trigger(timeout=0.2)
         with pytest.raises(ResponseTimeoutError, match="or stop is not allowed for another dash"):
             await dashboard.stop(timeout=0.1)
-        host = server.hosts[CAMERA]
-        assert host.results.following == 1  # none
+        host = server.shared_cameras[CAMERA]
+        assert host.results.next_number == 1  # none
         assert (await dashboard.query_application()) == 7
 
 
@@ -134,7 +134,7 @@ async def test_two_agents_and_a_router_between(folder: Path) -> None:
                 result = await robot.trigger()
                 assert (await anext(seen)).raw == result.raw
         async with program(url(first, folder / "line2")) as agent:
-            with pytest.raises(NotAllowedError, match="that of agent line2, who may look"):
+            with pytest.raises(NotAllowedError, match="that of agent line2, which may only read"):
                 await agent.trigger()
 
 
@@ -164,7 +164,7 @@ async def test_cancelling_under_the_name_of_another() -> None:
         async with robot.reserve():
             cancel()
             await spy.query_application()
-            assert plant.agent.hosts[NAME].gate.holder == own.name
+            assert plant.agent.shared_cameras[NAME].gate.holder == own.name
 
 
 # ---------------------------------------------------------------------- who does not come in
@@ -248,7 +248,7 @@ async def test_renewed_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
         await server.wait_first_attempts()
-        session = server.hosts[CAMERA].camera
+        session = server.shared_cameras[CAMERA].client
         async with (
             program(url(server, folder / "robot")) as robot,
             program(url(server, folder / "dashboard")) as dashboard,
@@ -275,7 +275,7 @@ async def test_renewed_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
             numbers = [(await anext(seen)).number for _ in range(3)]
             assert numbers == [first.number, first.number + 1, third.number]
             assert seen.statistics().missed == 0
-            assert server.hosts[CAMERA].camera is session
+            assert server.shared_cameras[CAMERA].client is session
             assert session.statistics().reconnects == 0
 
 
@@ -348,7 +348,7 @@ async def test_lost_with_a_certificate_that_has_expired(tmp_path: Path) -> None:
         smartcam.fleet.serve(plant_file(folder)) as server,
         soon_expired(server, folder, "viewer", "dashboard") as dashboard,
     ):
-        ends = read_identity(folder / "dashboard").ends
+        ends = read_identity(folder / "dashboard").expires_at
         await asyncio.sleep(max(0.0, (ends - datetime.now(UTC)).total_seconds()) + 0.01)
         await server.stop()
         await until(lambda: not dashboard.connected)
@@ -361,15 +361,15 @@ def test_warnings(tmp_path: Path) -> None:
     identity = read_identity(tmp_path / "a")
     now = datetime.now(UTC)
     for days, urgency in ((31, 0), (29, 1), (8, 1), (6, 2), (0.01, 2), (-1, 3)):
-        found = identity._replace(ends=now + timedelta(days=days))
+        found = identity._replace(expires_at=now + timedelta(days=days))
         assert found.urgency == urgency
         assert bool(found.warning) == bool(urgency)
         assert bool(found.expired_text) == (days < 0)
     assert (
         ", in 6 days; smartcam fleet"
-        in identity._replace(ends=now + timedelta(days=6, hours=1)).warning
+        in identity._replace(expires_at=now + timedelta(days=6, hours=1)).warning
     )
-    soon = identity._replace(authority_ends=now + timedelta(days=3))
+    soon = identity._replace(authority_expires_at=now + timedelta(days=3))
     assert "its authority" in soon.warning
 
 

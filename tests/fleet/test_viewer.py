@@ -27,23 +27,23 @@ from tests.fleet.inside import (
     RIGHTS,
     SERVICES,
     ProgramName,
-    TriggerOrder,
+    TriggerCall,
     decode,
-    decode_outcome,
+    decode_trigger_reply,
     encode,
-    encode_order,
+    encode_trigger,
     in_words,
     names_pattern,
 )
 from tests.fleet.inside import agent as _agent
 from tests.fleet.inside import camera_frames as _frames
-from tests.fleet.inside import plain as _plain
+from tests.fleet.inside import json_services as _services
 from tests.fleet.plainkit import SILENT, plant
 from tests.fleet.plantkit import CAMERA, certified, joined, plant_file, url_of
 
 KEYS, ANY = Keys(FLEET), Keys("*")
 
-LOOKING = frozenset(name for name, one in SERVICES.items() if not one.command)
+LOOKING = frozenset(name for name, one in SERVICES.items() if not one.is_command)
 
 VIEWER_DOES: dict[str, set[str]] = {
     "agent": {"watch"},
@@ -93,7 +93,7 @@ def keys() -> dict[str, str]:
 def test_viewer_may_do_nothing_at_a_key_of_an_operator_but_hear_and_look() -> None:
     found = {
         name: {
-            right.does
+            right.use
             for right in RIGHTS
             if "viewer" in right.roles
             and any(patterns_overlap(pattern, key) for pattern in right.keys)
@@ -109,7 +109,7 @@ def test_roles_share_no_key_under_which_anything_is_said_or_present(does: str) -
     of = [
         (role, pattern)
         for right in RIGHTS
-        if right.does == does
+        if right.use == does
         for role in right.roles
         for pattern in right.keys
     ]
@@ -123,7 +123,7 @@ def test_viewer_asks_agents_only_what_changes_nothing() -> None:
     may = [
         one
         for right in RIGHTS
-        if right.does == "query" and "viewer" in right.roles
+        if right.use == "query" and "viewer" in right.roles
         for one in right.keys
     ]
     asked = {ANY.summary("*"), ANY.listing("**"), ANY.outlets("*", "*")}
@@ -169,7 +169,7 @@ class Stranger:
         bus.subscribe(KEYS.reply(who.name), self._hear)
 
     def _hear(self, _: str, payload: bytes) -> None:
-        if decode_outcome(payload, "a reply") is None:
+        if decode_trigger_reply(payload, "a reply") is None:
             said = decode(payload, "a reply").fields
             if said["call"] > FIRST_CALL:  # else it is another's
                 self.replies.append(said)
@@ -194,7 +194,7 @@ class Stranger:
 
 
 async def stranger(plant: Plant, role: str = "viewer", who: ProgramName | None = None) -> Stranger:
-    end = plant.bus.end()
+    end = plant.bus.new_connection()
     await end.open(1.0)
     return Stranger(end, ProgramName.new(role) if who is None else who)
 
@@ -223,11 +223,11 @@ async def test_name_of_another_gets_nothing_and_changes_nothing() -> None:
                     forger.ask(role="anyone", come=0, call=number)
                     forger.command("trigger", call=number)
                     forger.command(cancel=number)
-                token = forger.bus.be_present(KEYS.program(who.token))
+                token = forger.bus.announce(KEYS.program(who.token))
                 await asyncio.sleep(0.05)
                 token.close()  # which ends nobody else's
                 assert (await triggering).number
-                assert agent.hosts[NAME].gate.holder == name
+                assert agent.shared_cameras[NAME].gate.holder == name
             assert forger.replies == []
             assert agent._programs == {name: guest}
             assert (await robot.trigger()).number
@@ -236,7 +236,7 @@ async def test_name_of_another_gets_nothing_and_changes_nothing() -> None:
 async def test_question_counts_as_one_of_the_role_whose_key_it_comes_under() -> None:
     async with Plant() as plant:
         one = await stranger(plant, "operator")
-        one.bus.be_present(KEYS.program(one.who.token))
+        one.bus.announce(KEYS.program(one.who.token))
         one.ask("hello", role="viewer")  # as a viewer's certificate lets it
         one.ask("hello")
         (answer,) = await one.answers(1)
@@ -247,9 +247,9 @@ async def test_order_by_another_name_is_not_done() -> None:
     async with Plant() as plant, plant.camera() as robot:
         who, met = who_of(robot), robot._caller.require()
         forger = await stranger(plant, who=ProgramName(who.name, "1" * 16))
-        order = TriggerOrder(7000, met.epoch, 1e9, 5.0, None, None, 1, True, False, None)
-        forger.bus.put(KEYS.command("agent", NAME), encode_order(forger.who.token, order))
-        forger.bus.put(KEYS.ask("anyone", "agent", NAME), encode_order(who.token, order))
+        order = TriggerCall(7000, met.epoch, 1e9, 5.0, None, None, 1, True, False, None)
+        forger.bus.put(KEYS.command("agent", NAME), encode_trigger(forger.who.token, order))
+        forger.bus.put(KEYS.ask("anyone", "agent", NAME), encode_trigger(who.token, order))
         await robot.query_application()  # which came behind
         assert plant.box.runs == 0
         assert (await robot.trigger()).value.run == 1
@@ -258,8 +258,8 @@ async def test_order_by_another_name_is_not_done() -> None:
 async def test_presence_of_another_does_not_keep_a_reservation() -> None:
     async with Plant() as plant, plant.cameras(2) as (robot, other):
         forger = await stranger(plant, who=ProgramName(who_of(robot).name, "2" * 16))
-        forger.bus.be_present(KEYS.program(forger.who.token))
-        forger.bus.be_present(KEYS.program(forger.who.name))
+        forger.bus.announce(KEYS.program(forger.who.token))
+        forger.bus.announce(KEYS.program(forger.who.name))
         with pytest.raises(ReservationLostError):
             await _vanish_inside_a_block(robot, other)
 
@@ -277,7 +277,7 @@ async def test_program_without_presence_is_forgotten_and_so_is_what_it_has() -> 
         one.ask("hello")
         epoch = (await one.answers(1))[0]["epoch"]
         one.command("reserve", epoch=epoch)
-        await until(lambda: plant.agent.hosts[NAME].gate.holder == one.who.name)
+        await until(lambda: plant.agent.shared_cameras[NAME].gate.holder == one.who.name)
         begun = asyncio.get_running_loop().time()
         await robot.trigger(timeout=60.0)
         waited = asyncio.get_running_loop().time() - begun
@@ -291,7 +291,7 @@ async def test_program_whose_presence_comes_late_stays() -> None:
         one.ask("hello")
         await one.answers(1)
         await asyncio.sleep(_agent.PRESENCE_TIMEOUT / 2)
-        token = one.bus.be_present(KEYS.program(one.who.token))
+        token = one.bus.announce(KEYS.program(one.who.token))
         await asyncio.sleep(_agent.PRESENCE_TIMEOUT * 2)
         assert [*plant.agent._programs] == [one.who.name]
         token.close()
@@ -303,11 +303,11 @@ async def test_crowd_of_viewers_keeps_no_operator_out(monkeypatch: pytest.Monkey
     async with Plant() as plant:
         crowd = [await stranger(plant) for _ in range(6)]
         for one in crowd:
-            one.bus.be_present(KEYS.program(one.who.token))
+            one.bus.announce(KEYS.program(one.who.token))
             one.ask("hello")
         robots = [await stranger(plant, "operator") for _ in range(3)]
         for one in robots:
-            one.bus.be_present(KEYS.program(one.who.token))
+            one.bus.announce(KEYS.program(one.who.token))
             one.ask("hello")
             await one.answers(1)
         assert sum(len(one.replies) for one in crowd) == 3
@@ -315,7 +315,7 @@ async def test_crowd_of_viewers_keeps_no_operator_out(monkeypatch: pytest.Monkey
             await end.close()
         await until(lambda: len(plant.agent._programs) == 3)
         later = await stranger(plant)
-        later.bus.be_present(KEYS.program(later.who.token))
+        later.bus.announce(KEYS.program(later.who.token))
         later.ask("hello")
         assert "answer" in (await later.answers(1))[0]  # the places of who went are free
 
@@ -327,7 +327,7 @@ async def test_questions_do_not_use_up_what_commands_may(monkeypatch: pytest.Mon
     async with Plant() as plant, plant.camera() as robot:
         asked = [await stranger(plant) for _ in range(4)]
         for one in asked:
-            one.bus.be_present(KEYS.program(one.who.token))
+            one.bus.announce(KEYS.program(one.who.token))
             one.ask("hello")
             await one.answers(1)
         waiting = [asyncio.ensure_future(robot.wait_ready()) for _ in range(2)]
@@ -349,7 +349,7 @@ async def test_streams_of_viewers_do_not_use_up_those_of_operators(
         crowd = [await stranger(plant) for _ in range(3)]
         robot = await stranger(plant, "operator")
         for one in (*crowd, robot):
-            one.bus.be_present(KEYS.program(one.who.token))
+            one.bus.announce(KEYS.program(one.who.token))
             one.ask("hello")
             epoch = (await one.answers(1))[0]["epoch"]
             one.ask("next_frame", epoch=epoch, arguments={"stream": 1})
@@ -363,8 +363,8 @@ async def test_streams_of_viewers_do_not_use_up_those_of_operators(
 async def test_questions_push_no_command_out_of_the_memory_of_ids(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(_plain, "MAX_ANSWERS_REMEMBERED", 3)
-    monkeypatch.setattr(_plain, "MAX_ANSWER_BYTES_REMEMBERED", 3000)
+    monkeypatch.setattr(_services, "MAX_ANSWERS_REMEMBERED", 3)
+    monkeypatch.setattr(_services, "MAX_ANSWER_BYTES_REMEMBERED", 3000)
     async with plant() as place:
         call = place.client.call
         first = await call("trigger", id="only-once")
@@ -379,7 +379,7 @@ async def test_questions_push_no_command_out_of_the_memory_of_ids(
 
 
 async def test_questions_under_way_keep_no_command_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_plain, "MAX_CONCURRENT_CALLS", 2)
+    monkeypatch.setattr(_services, "MAX_CONCURRENT_CALLS", 2)
     async with plant() as place:
         call = place.client.call
         await call("switch_application", application=SILENT)
@@ -413,8 +413,8 @@ async def test_flood_of_a_viewer_over_tls_has_nothing_of_an_operator_refused(
             await robot.trigger()
             own = [ProgramName.new("viewer") for _ in range(40)]
             for one in own:
-                viewer.be_present(KEYS.program(one.token))
-            viewer.be_present(KEYS.program(robot._program.name))
+                viewer.announce(KEYS.program(one.token))
+            viewer.announce(KEYS.program(robot._program.name))
             fields = {"do": "hello", "arguments": {}, "timeout": 600.0}
             forged = {**fields, "program": robot._program.name}
 
@@ -444,7 +444,7 @@ async def test_flood_of_a_viewer_over_tls_has_nothing_of_an_operator_refused(
             another = smartcam.connect(url_of(port, folder / "robot"))
             assert isinstance(another, FleetCamera)
             async with another, another.reserve(timeout=PATIENCE):
-                viewer.be_present(KEYS.program(another._program.name))
+                viewer.announce(KEYS.program(another._program.name))
                 assert (await another.trigger(timeout=PATIENCE)).raw
             assert (await robot.trigger(timeout=PATIENCE)).raw
 

@@ -13,19 +13,19 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import RemoteProtocolError
 from tests.fleet.inside import (
-    ResultRun,
-    TriggerOrder,
+    ResultGroup,
+    TriggerCall,
     decode,
-    decode_order,
-    decode_outcome,
-    decode_runs,
+    decode_groups,
     decode_state,
+    decode_trigger,
+    decode_trigger_reply,
     encode,
-    encode_order,
-    encode_outcome,
-    encode_runs,
+    encode_groups,
     encode_state,
     encode_status,
+    encode_trigger,
+    encode_trigger_reply,
     timestamp,
 )
 
@@ -44,10 +44,10 @@ FIELDS = st.dictionaries(st.text(max_size=6).filter(lambda key: key != "blobs"),
 
 
 @st.composite
-def runs(draw: st.DrawFn) -> ResultRun:
+def runs(draw: st.DrawFn) -> ResultGroup:
     """A run as an agent may say it."""
     own = draw(st.none() | TIMES)
-    return ResultRun(
+    return ResultGroup(
         number=draw(st.integers(0, 2**40)),
         application=draw(NUMBERS),
         endian=draw(NUMBERS),
@@ -63,7 +63,7 @@ def runs(draw: st.DrawFn) -> ResultRun:
     )
 
 
-def same(one: ResultRun, other: ResultRun) -> bool:
+def same(one: ResultGroup, other: ResultGroup) -> bool:
     """Return True if two runs are equal; NaN is NaN here."""
     return repr(one) == repr(other)
 
@@ -75,11 +75,11 @@ def test_message_is_what_was_said(fields: dict[str, Any], blobs: list[bytes]) ->
 
 
 @given(some=st.lists(runs(), max_size=4), epoch=st.integers(0, 2**63), following=NUMBERS)
-def test_runs_are_what_was_said(some: list[ResultRun], epoch: int, following: int) -> None:
-    batch = decode_runs(encode_runs(epoch, following, [one.encode() for one in some]), "it")
-    assert (batch.epoch, batch.following) == (epoch, following)
-    assert len(batch.runs) == len(some)
-    for got, wanted in zip(batch.runs, some, strict=True):
+def test_runs_are_what_was_said(some: list[ResultGroup], epoch: int, following: int) -> None:
+    batch = decode_groups(encode_groups(epoch, following, [one.encode() for one in some]), "it")
+    assert (batch.epoch, batch.next_number) == (epoch, following)
+    assert len(batch.groups) == len(some)
+    for got, wanted in zip(batch.groups, some, strict=True):
         assert same(got, wanted)
         assert got.next == wanted.number + len(wanted.payloads)
         assert got.received_at.timestamp() == pytest.approx(wanted.at)
@@ -87,7 +87,7 @@ def test_runs_are_what_was_said(some: list[ResultRun], epoch: int, following: in
 
 
 @given(run=runs(), number=st.integers(-3, 9))
-def test_rest_of_a_run(run: ResultRun, number: int) -> None:
+def test_rest_of_a_run(run: ResultGroup, number: int) -> None:
     rest = run.since(run.number + number)
     assert rest.payloads == run.payloads[max(0, number) :]
     assert rest.number == run.number + max(0, number)
@@ -95,7 +95,7 @@ def test_rest_of_a_run(run: ResultRun, number: int) -> None:
 
 
 ORDERS = st.builds(
-    TriggerOrder,
+    TriggerCall,
     call=st.integers(0, 2**64 - 1),
     epoch=st.integers(0, 2**64 - 1),
     deadline=CLOCKS,
@@ -112,17 +112,17 @@ ORDERS = st.builds(
 
 
 @given(order=ORDERS, program=st.text(max_size=60))
-def test_order_is_what_was_said(order: TriggerOrder, program: str) -> None:
-    assert decode_order(encode_order(program, order), "it") == (program, order)
+def test_order_is_what_was_said(order: TriggerCall, program: str) -> None:
+    assert decode_trigger(encode_trigger(program, order), "it") == (program, order)
 
 
 @pytest.mark.parametrize(
     ("field", "value"), [("application", 2**63), ("results", -1), ("layouts", "@sequence: uint32")]
 )
 def test_order_that_does_not_fit_is_a_message(field: str, value: Any) -> None:
-    order = TriggerOrder(1, 2, 3.0, 4.0, None, 5, 6, wait=True, by_application=False, data=b"7")
-    payload = encode_order("it", order._replace(**{field: value}))
-    assert decode_order(payload, "it") is None
+    order = TriggerCall(1, 2, 3.0, 4.0, None, 5, 6, wait=True, by_application=False, data=b"7")
+    payload = encode_trigger("it", order._replace(**{field: value}))
+    assert decode_trigger(payload, "it") is None
     fields, blobs = decode(payload, "it")
     assert blobs == [b"7"]
     assert fields.pop("arguments") == {
@@ -145,12 +145,12 @@ def test_order_that_does_not_fit_is_a_message(field: str, value: Any) -> None:
 
 
 @given(told=st.lists(st.binary(max_size=9), max_size=4), some=st.lists(runs(), max_size=3))
-def test_outcome_is_what_was_said(told: list[bytes], some: list[ResultRun]) -> None:
-    batch = encode_runs(9, 8, [one.encode() for one in some])
-    outcome = decode_outcome(encode_outcome(1, 2, 3.5, 4, told, batch), "it")
+def test_outcome_is_what_was_said(told: list[bytes], some: list[ResultGroup]) -> None:
+    batch = encode_groups(9, 8, [one.encode() for one in some])
+    outcome = decode_trigger_reply(encode_trigger_reply(1, 2, 3.5, 4, told, batch), "it")
     assert outcome is not None
     assert outcome[:5] == (1, 2, 3.5, 4, told)
-    assert repr(outcome.batch) == repr(decode_runs(batch, "it"))
+    assert repr(outcome.results) == repr(decode_groups(batch, "it"))
 
 
 @given(number=NUMBERS, status=NUMBERS, endian=NUMBERS, application=st.none() | NUMBERS)
@@ -176,10 +176,10 @@ def test_what_is_no_state_is_told(data: bytes) -> None:
 
 
 MESSAGE = encode({"call": 7, "do": "trigger", "arguments": {"a": [1, None]}}, [b"1234", b"", b"5"])
-RUN = ResultRun(5, 1, 0, 1, 2, 3, 1.5, 1.7e9, 1.7e9, 0.1, [b"abc", b"", b"de"], b"{}").encode()
-BATCH = encode_runs(9, 8, [RUN, RUN])
-ORDER = encode_order("it", TriggerOrder(1, 2, 3.0, 4.0, None, 5, 6, True, False, None))
-OUTCOME = encode_outcome(1, 2, 3.0, 4, [b"abc", b"d"], BATCH)
+RUN = ResultGroup(5, 1, 0, 1, 2, 3, 1.5, 1.7e9, 1.7e9, 0.1, [b"abc", b"", b"de"], b"{}").encode()
+BATCH = encode_groups(9, 8, [RUN, RUN])
+ORDER = encode_trigger("it", TriggerCall(1, 2, 3.0, 4.0, None, 5, 6, True, False, None))
+OUTCOME = encode_trigger_reply(1, 2, 3.0, 4, [b"abc", b"d"], BATCH)
 
 
 @pytest.mark.parametrize("length", range(len(MESSAGE)))
@@ -192,25 +192,29 @@ def test_no_part_of_a_message_is_one(length: int) -> None:
 @pytest.mark.parametrize("length", range(len(BATCH)))
 def test_no_part_of_runs_is_one(length: int) -> None:
     with pytest.raises(RemoteProtocolError, match=r"^a reply is broken: "):
-        decode_runs(BATCH[:length], "a reply")
+        decode_groups(BATCH[:length], "a reply")
 
 
 def test_nothing_may_stand_behind() -> None:
-    for read, payload in ((decode, MESSAGE), (decode_runs, BATCH), (decode_outcome, OUTCOME)):
+    for read, payload in (
+        (decode, MESSAGE),
+        (decode_groups, BATCH),
+        (decode_trigger_reply, OUTCOME),
+    ):
         with pytest.raises(RemoteProtocolError, match="1 bytes are left over"):
             read(payload + b"\0", "it")
     with pytest.raises(RemoteProtocolError, match=r"^it is broken: "):
-        decode_order(ORDER + b"\0", "it")
+        decode_trigger(ORDER + b"\0", "it")
 
 
 @pytest.mark.sampled(every=5)
 @pytest.mark.parametrize("length", range(4, len(OUTCOME)))
 def test_no_part_of_a_trigger_is_one(length: int) -> None:
     with pytest.raises(RemoteProtocolError, match=r"^a reply is broken: "):
-        decode_outcome(OUTCOME[:length], "a reply")
+        decode_trigger_reply(OUTCOME[:length], "a reply")
     if length < len(ORDER):
         with pytest.raises(RemoteProtocolError, match=r"^a call is broken: "):
-            decode_order(ORDER[:length], "a call")
+            decode_trigger(ORDER[:length], "a call")
 
 
 def with_head(text: str, behind: bytes = b"") -> bytes:
@@ -259,26 +263,26 @@ def times(**more: float) -> bytes:
     """Return a batch of one run with such times."""
     fields: dict[str, Any] = {"clock": 0.0, "at": 1.7e9, "triggered_at": math.nan, "latency": 0.0}
     fields |= more
-    run = ResultRun(1, 1, 0, 0, 0, 0, payloads=[b"1"], **fields)
-    return encode_runs(1, 2, [run.encode()])
+    run = ResultGroup(1, 1, 0, 0, 0, 0, payloads=[b"1"], **fields)
+    return encode_groups(1, 2, [run.encode()])
 
 
 @pytest.mark.parametrize("at", [math.inf, -math.inf, math.nan, 1e300, -1e300, 1e12])
 def test_time_that_is_none_is_broken(at: float) -> None:
     with pytest.raises(RemoteProtocolError):
-        decode_runs(times(at=at), "it")
+        decode_groups(times(at=at), "it")
     if not math.isnan(at):
         with pytest.raises(RemoteProtocolError):
-            decode_runs(times(triggered_at=at), "it")
+            decode_groups(times(triggered_at=at), "it")
 
 
 def check_runs(payload: bytes) -> None:
     """Have runs read, and everything of them that is used."""
     try:
-        batch = decode_runs(payload, "it")
+        batch = decode_groups(payload, "it")
     except RemoteProtocolError:
         return
-    for run in batch.runs:
+    for run in batch.groups:
         assert run.payloads
         assert run.size <= len(payload)
         assert isinstance(run.received_at, datetime)

@@ -23,7 +23,7 @@ from smartcam import _zenoh
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.exceptions import ConnectFailedError, ConnectionLostError, ReservationLostError
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._inside import ZenohEnd
+from smartcam.fleet._inside import ZenohConnection
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant, until
@@ -46,12 +46,12 @@ def port_of(place: str) -> int:
 
 
 @contextlib.asynccontextmanager
-async def two_ends(**more: Any) -> AsyncIterator[tuple[ZenohEnd, ZenohEnd]]:
+async def two_ends(**more: Any) -> AsyncIterator[tuple[ZenohConnection, ZenohConnection]]:
     """Give an end that listens, and one that has connected to it."""
     place = free_place()
     listens, connects = (
-        ZenohEnd(BusLink(listen=(place,)), more),
-        ZenohEnd(BusLink(connect=(place,))),
+        ZenohConnection(BusLink(listen=(place,)), more),
+        ZenohConnection(BusLink(connect=(place,))),
     )
     await listens.open(PATIENCE)
     try:
@@ -85,7 +85,7 @@ class Heard:
                 await asyncio.sleep(0.005)
 
 
-async def heard_by(listens: ZenohEnd, connects: ZenohEnd) -> Heard:
+async def heard_by(listens: ZenohConnection, connects: ZenohConnection) -> Heard:
     """Have one end hear what the other says, once they know of each other."""
     heard = Heard()
     connects.subscribe("test/**", heard)
@@ -192,7 +192,7 @@ async def test_silent_host_is_given_up_by_the_timeout(accepts: bool) -> None:
 async def test_port_in_use_is_told() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        error = await gone(ZenohEnd(BusLink(listen=(place,))).open(PATIENCE))
+        error = await gone(ZenohConnection(BusLink(listen=(place,))).open(PATIENCE))
         assert isinstance(error, ConnectFailedError)
         assert f"cannot listen on {place}" in str(error)
 
@@ -200,7 +200,7 @@ async def test_port_in_use_is_told() -> None:
 @pytest.mark.parametrize("host", ["192.0.2.1", "[2001:db8::1]", "nowhere.invalid"])
 async def test_any_port_of_a_host_that_is_not_here_is_told(host: str) -> None:
     (place,) = with_ports([f"tcp/{host}:0"])
-    error = await gone(ZenohEnd(BusLink(listen=(place,))).open(PATIENCE))
+    error = await gone(ZenohConnection(BusLink(listen=(place,))).open(PATIENCE))
     assert isinstance(error, ConnectFailedError)
     assert f"cannot listen on {place}" in str(error)
 
@@ -282,7 +282,7 @@ async def test_reservation_of_a_killed_program_ends_without_any_lease() -> None:
             await until_waits(plant)
             await holder.kill()
             assert (await waiting).value.run == 1
-        assert plant.agent.hosts[NAME].gate.holder is None
+        assert plant.agent.shared_cameras[NAME].gate.holder is None
 
 
 @pytest.mark.long
@@ -296,13 +296,13 @@ async def test_reservation_of_a_silent_program_ends_with_the_lease() -> None:
         await until_waits(plant)
         holder.signal(signal.SIGSTOP)
         assert (await waiting).value.run == 1
-        assert plant.agent.hosts[NAME].gate.holder is None
+        assert plant.agent.shared_cameras[NAME].gate.holder is None
         holder.signal(signal.SIGCONT)
         assert (await camera.trigger(timeout=PATIENCE)).value.run == 2
 
 
 async def until_waits(plant: Plant) -> None:
-    gate = plant.agent.hosts[NAME].gate
+    gate = plant.agent.shared_cameras[NAME].gate
     async with asyncio.timeout(PATIENCE):
         while not gate._queue:  # noqa: ASYNC110 - another process
             await asyncio.sleep(0.005)
@@ -331,7 +331,7 @@ def lingering(port: int) -> int:
 async def test_no_connection_lingers_for_as_long_as_a_lease(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(_zenoh, "_end_lingering", lambda _: None)
+    monkeypatch.setattr(_zenoh, "_disable_linger", lambda _: None)
     async with two_ends() as (listens, _):
         port = port_of(listens._link.listen[0])
         assert lingering(port)  # as the engine makes them
@@ -411,10 +411,10 @@ LOOP_MAY_WAIT = 0.5
 async def test_what_is_said_while_a_link_stands_still_arrives_in_order(urgent: bool) -> None:
     """The engine drops what finds its buffers full; the loop is not held up for long by them."""
     place = free_place()
-    listens, relay = ZenohEnd(BusLink(listen=(place,))), Relay(place)
+    listens, relay = ZenohConnection(BusLink(listen=(place,))), Relay(place)
     await listens.open(PATIENCE)
     async with relay as through:
-        connects = await ZenohEnd(BusLink(connect=(through,))).open(PATIENCE)
+        connects = await ZenohConnection(BusLink(connect=(through,))).open(PATIENCE)
         try:
             for says, hears in ((listens, connects), (connects, listens)):
                 heard = await heard_by(says, hears)
@@ -493,7 +493,7 @@ async def test_callback_that_raises_harms_nobody(caplog: pytest.LogCaptureFixtur
         with caplog.at_level(logging.ERROR, "smartcam.fleet"):
             for number in range(100):
                 says.put("test/it", b"%d" % number)
-            says.be_present("presence/one")
+            says.announce("presence/one")
             await heard.come_all([b"%d" % number for number in range(100)])
         assert any("was not handled" in record.message for record in caplog.records)
         caplog.clear()
@@ -587,10 +587,10 @@ async def test_program_hears_why_a_camera_is_shared_no_more_before_its_presence_
 CANCELLED_WHILE_IT_OPENS = """
 import asyncio
 from smartcam._zenoh import BusLink
-from smartcam.fleet._bus.zenoh import ZenohEnd
+from smartcam.fleet._bus.zenoh import ZenohConnection
 
 async def main():
-    opening = asyncio.create_task(ZenohEnd(BusLink(connect=({place!r},))).open(10.0))
+    opening = asyncio.create_task(ZenohConnection(BusLink(connect=({place!r},))).open(10.0))
     await asyncio.sleep({wait})
     opening.cancel()
     await asyncio.wait({{opening}})
@@ -606,7 +606,7 @@ print("ended")
 async def test_program_that_ends_while_its_bus_opens_is_not_aborted(steps: range) -> None:
     """The engine's session comes when nobody wants it; its close once ran into Python's end."""
     place = free_place()
-    listens = await ZenohEnd(BusLink(listen=(place,))).open(PATIENCE)
+    listens = await ZenohConnection(BusLink(listen=(place,))).open(PATIENCE)
     try:
         for step in steps:
             text = CANCELLED_WHILE_IT_OPENS.format(place=place, wait=0.003 * step)
@@ -632,17 +632,17 @@ async def test_flood_of_what_is_patient_neither_delays_nor_fills_up_all_else(
                 ended.set()
 
         for pattern, patient in (("ask/*", True), ("command", False), ("last", False)):
-            listens.subscribe(pattern, hear, patient=patient)
+            listens.subscribe(pattern, hear, low_priority=patient)
         for number in range(2000):
-            listens.call_in_loop_patiently(hear, 10, f"ask/{number}", b"")
+            listens.call_in_loop_later(hear, 10, f"ask/{number}", b"")
         listens.call_in_loop(hear, 10, "command", b"")
         await until(lambda: len(came) == 2001)
         assert came[0] == "command"
         assert came[1:] == [f"ask/{number}" for number in range(2000)]  # in their order
 
         monkeypatch.setattr(_zenoh, "MAX_WAITING_BYTES", 1000)
-        listens.call_in_loop_patiently(hear, 990, "ask/x", b"")
-        assert listens.full(20, patient=True)
+        listens.call_in_loop_later(hear, 990, "ask/x", b"")
+        assert listens.full(20, later=True)
         assert not listens.full(20)
         connects.put("last", b"")
         async with asyncio.timeout(PATIENCE):
@@ -657,13 +657,13 @@ async def test_each_question_waits_as_its_key_says(monkeypatch: pytest.MonkeyPat
             question.reply(question.key, b"yes")
             question.close()
 
-        listens.answer("q/*", answer, patient=lambda key: key.endswith("look"))
+        listens.answer("q/*", answer, low_priority=lambda key: key.endswith("look"))
         assert await connects.ask("q/look", b"", PATIENCE) == [("q/look", b"yes")]
         with listens._lock:
-            listens._queued_patient_bytes += 10_000  # as if so much waited
+            listens._queued_later_bytes += 10_000  # as if so much waited
         assert await connects.ask("q/look", b"", PATIENCE) == []
         assert await connects.ask("q/do", b"", PATIENCE) == [("q/do", b"yes")]
         assert await connects.ask("q/do", bytes(20_000), PATIENCE) == []
         with listens._lock:
-            listens._queued_patient_bytes -= 10_000
+            listens._queued_later_bytes -= 10_000
         assert await connects.ask("q/look", b"", PATIENCE) == [("q/look", b"yes")]

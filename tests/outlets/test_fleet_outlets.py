@@ -15,7 +15,7 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.fleet import FleetServer, MemoryBus, load_fleet
-from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
+from smartcam.fleet._inside import FleetOutlets, exposition, read_counts
 from smartcam.outlets._inside import StoreQuery, read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.broker import broker, listener, needs_mosquitto
@@ -40,10 +40,10 @@ def fleet(folder: Path, text: str = FLEET) -> Path:
 
 @contextlib.asynccontextmanager
 async def serving(path: Path) -> Any:
-    server = FleetServer(path, bus=MemoryBus().end())
+    server = FleetServer(path, bus=MemoryBus().new_connection())
     async with FleetOutlets(server) as outlets, server:
         await server.wait_first_attempts()
-        await until(lambda: server.hosts["line1/cam1"].connected)
+        await until(lambda: server.shared_cameras["line1/cam1"].connected)
         yield server, outlets.outlets
 
 
@@ -54,11 +54,11 @@ def rows(folder: Path, query: str) -> list[Any]:
 
 async def test_results_of_an_agents_triggers_are_rows_by_the_layout(tmp_path: Path) -> None:
     async with serving(fleet(tmp_path)) as (server, outlets):
-        camera = server.hosts["line1/cam1"].camera
+        camera = server.shared_cameras["line1/cam1"].client
         for _ in range(5):
             await camera.trigger(timeout=20)
         await until(lambda: outlets.states["store"].counts.delivered >= 5)
-        numbers = await read_numbers(server)
+        numbers = await read_counts(server)
         text, _ = await exposition(numbers, per_camera=False)
     assert b'smartcam_outlet_results_total{agent="' in text
     assert b'outlet="store"} 5.0' in text
@@ -94,7 +94,7 @@ async def test_results_of_a_software_camera_are_typed_and_those_that_failed_are_
     cv2.imwrite(str(tmp_path / "shots" / "1.png"), cv2.circle(part.copy(), (30, 30), 12, 240, -1))
     cv2.imwrite(str(tmp_path / "shots" / "2.png"), part)
     async with serving(fleet(tmp_path, SOFTWARE)) as (server, outlets):
-        reading = server.hosts["line1/cam1"].camera
+        reading = server.shared_cameras["line1/cam1"].client
         assert reading.settings.application_names == {"spot": 7}
         for _ in range(4):
             await reading.trigger(timeout=20)
@@ -104,7 +104,7 @@ async def test_results_of_a_software_camera_are_typed_and_those_that_failed_are_
     assert rows(tmp_path, "SELECT ok, present_count FROM app_7 ORDER BY id") == [(1, 1), (0, 0)] * 2
     units = dict(rows(tmp_path, "SELECT column_name, unit FROM fields WHERE unit != ''"))
     assert units["measure_place"] == units["present_x"] == "px"
-    made = FleetOutlets(FleetServer(tmp_path / "fleet.yaml", bus=MemoryBus().end()))
+    made = FleetOutlets(FleetServer(tmp_path / "fleet.yaml", bus=MemoryBus().new_connection()))
     read = made.interpretation("line1/cam1")  # what waits may be delivered before there is a camera
     assert read is not None
     layout: Any = getattr(read.interpreter(7), "layout", None)
@@ -113,10 +113,10 @@ async def test_results_of_a_software_camera_are_typed_and_those_that_failed_are_
 
 async def test_a_trigger_without_a_result_is_an_error_row(tmp_path: Path) -> None:
     async with serving(fleet(tmp_path)) as (server, outlets):
-        camera = server.hosts["line1/cam1"].camera
+        camera = server.shared_cameras["line1/cam1"].client
         await camera.stop()
         with pytest.raises(SmartCamError):
-            await server.hosts["line1/cam1"].camera.trigger(timeout=5)
+            await server.shared_cameras["line1/cam1"].client.trigger(timeout=5)
         await until(lambda: outlets.states["store"].counts.delivered >= 1)
     assert ("NotRunningError",) in rows(tmp_path, "SELECT error_kind FROM results")
 
@@ -129,7 +129,7 @@ async def test_a_stalled_far_end_holds_up_no_trigger(tmp_path: Path) -> None:
         text = FLEET.replace("store: {kind: sqlite, file: results.sqlite}", "list: {timeout: 600}")
         async with serving(fleet(tmp_path, text)) as (server, outlets):
             for _ in range(10):  # each within its deadline, while the far end takes nothing
-                await server.hosts["line1/cam1"].camera.trigger(timeout=20)
+                await server.shared_cameras["line1/cam1"].client.trigger(timeout=20)
             found = outlets.states["list"].counts
             assert (found.results, found.delivered, found.spooled) == (10, 0, 10)
     finally:
@@ -147,7 +147,7 @@ async def test_a_trigger_over_mqtt_reaches_a_camera_of_the_fleet(tmp_path: Path)
         path = fleet(tmp_path, f"listen: tcp/127.0.0.1:{free_port()}\n{text}")
         server = FleetServer(path)
         async with FleetOutlets(server), server:
-            await until(lambda: server.hosts["line1/cam1"].connected)
+            await until(lambda: server.shared_cameras["line1/cam1"].connected)
             async with (
                 listener(there.port, "smartcam/reply/#") as replies,
                 listener(there.port, "smartcam/result/line1/cam1") as heard,
@@ -222,7 +222,7 @@ async def test_fleet_outlets_shows_the_accounts(tmp_path: Path) -> None:
     assert code == 0, err
     assert "no spool yet" in out
     async with serving(path) as (server, outlets):
-        await server.hosts["line1/cam1"].camera.trigger(timeout=20)
+        await server.shared_cameras["line1/cam1"].client.trigger(timeout=20)
         await until(lambda: outlets.states["store"].counts.delivered == 1)
         code, out, err = await command("fleet", "outlets", str(path), "--json")
     assert code == 0, err
@@ -240,7 +240,7 @@ async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path
     server = FleetServer(path)
     async with FleetOutlets(server) as outlets, server:
         await server.wait_first_attempts()
-        await server.hosts["line1/cam1"].camera.trigger(timeout=20)
+        await server.shared_cameras["line1/cam1"].client.trigger(timeout=20)
         await until(lambda: outlets.outlets.states["store"].counts.delivered == 1)
         url = f"fleet://127.0.0.1:{server.address.port}"
         code, out, err = await command("fleet", "outlets", url, "--json", "--timeout", "30")

@@ -97,7 +97,7 @@ async def fleet_camera(program: Any) -> None:
 async def fleet(program: Any) -> None:
     """A program of a whole fleet, its agent, and frames."""
     async with FramePlant(zenoh=False) as plant:
-        whole = Fleet(plant.bus.end(), None, FLEET, None, 5.0, {"reconnect": SOON})
+        whole = Fleet(plant.bus.new_connection(), None, FLEET, None, 5.0, {"reconnect": SOON})
         results = whole.results()
         async with program.entered(whole) as made, plant.streaming():
             if made is not None:

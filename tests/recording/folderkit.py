@@ -74,7 +74,7 @@ def server(folder: Path, *urls: str, source: str | None = None) -> FleetServer:
         for place, url in enumerate(urls, 1)
     }
     file = FleetFile.model_validate({"cameras": entries})
-    return FleetServer(file, bus=MemoryBus().end(), folder=folder)
+    return FleetServer(file, bus=MemoryBus().new_connection(), folder=folder)
 
 
 @contextlib.asynccontextmanager

@@ -48,12 +48,12 @@ async def main(folder: Path) -> dict[str, Any]:
         recorder = FleetRecorder(agent, section(size=1e6))
         async with recorder, agent:
             await until(lambda: NAME in recorder.counts and recorder.counts[NAME].written > 500)
-            received = agent.hosts[NAME].results.following
+            received = agent.shared_cameras[NAME].results.next_number
             ballast = folder / "rec" / "ballast"
             fill(ballast)
             await until(lambda: recorder.trouble is not None)
             told = str(recorder.trouble)
-            await until(lambda: agent.hosts[NAME].results.following > received + 600)
+            await until(lambda: agent.shared_cameras[NAME].results.next_number > received + 600)
             at_full = [load_recording(path).counts.results for path in files(folder)]
             ballast.unlink()
             await until(lambda: recorder.trouble is None)

@@ -89,7 +89,7 @@ async def test_each_result_has_the_first_picture_of_its_trigger(
     async with NumberedCamera(time=0.02) as box:
         options: dict[str, Any] = {"source": "synthetic://", "pictures": "judged"}
         async with recording(tmp_path, box.url, **options) as (recorder, agent):
-            camera = agent.hosts[NAME].camera
+            camera = agent.shared_cameras[NAME].client
             await until(lambda: device.given)
             for _ in range(8):
                 await camera.trigger()
@@ -127,7 +127,7 @@ async def test_all_pictures_are_in_files_that_follow_each_other_within_their_bou
             device.left = 0
             while first.exists() or len(files(tmp_path)) < 2:
                 device.left = 1
-                await agent.hosts[NAME].camera.trigger()
+                await agent.shared_cameras[NAME].client.trigger()
                 await until(lambda: not device.left and not recorder.counts[NAME].waiting)
         assert recorder.counts[NAME].lost == 0
     found = load_recording(tmp_path / "rec")
@@ -177,10 +177,10 @@ async def test_pictures_leave_room_for_results(
             await until(lambda: device.given)
             device.left = 0
             monkeypatch.setattr(os, "fsync", waits)
-            first = await agent.hosts[NAME].camera.trigger()
+            first = await agent.shared_cameras[NAME].client.trigger()
             await until(stuck.is_set)
             device.give(*(frame(number, **large) for number in (9001, 9002, 9003)))
-            second = await agent.hosts[NAME].camera.trigger()
+            second = await agent.shared_cameras[NAME].client.trigger()
             assert recorder.counts[NAME].lost == 1
             go_on.set()
             await until(lambda: device.sink is not None and not recorder.counts[NAME].waiting)
@@ -196,7 +196,7 @@ def test_file_without_frames_has_no_pictures_to_record(tmp_path: Path) -> None:
     told = {"record": {"pictures": "judged", "cameras": ["b/cam1"]}, "cameras": cameras}
     path = tmp_path / "plant.yaml"
     path.write_text(json.dumps(told))
-    with pytest.raises(ConfigurationError, match=r"record\.pictures.*found none"):
+    with pytest.raises(ConfigurationError, match=r"record\.pictures.*there is none"):
         load_fleet(path)
     cameras["b/**"]["frames"] = "synthetic://"
     path.write_text(json.dumps(told))
@@ -242,7 +242,7 @@ async def test_replayed_fleet_shows_the_picture_of_each_result(
         async with recording(tmp_path, box.url, **options) as (_, agent):
             await until(lambda: device.given)
             for _ in range(6):
-                await agent.hosts[NAME].camera.trigger()
+                await agent.shared_cameras[NAME].client.trigger()
             last = device.given[-1]
             await until(lambda: device.given[-1].utc > last.utc)
     found = load_recording(tmp_path / "rec")

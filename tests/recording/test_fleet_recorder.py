@@ -122,7 +122,7 @@ async def test_each_file_says_what_the_camera_was(
 ) -> None:
     monkeypatch.setattr(folder_files, "ITEMS_PER_CHECK", 1)
     async with NumberedCamera() as box, recording(tmp_path, box.url, size=6000) as (_, agent):
-        camera = agent.hosts[NAME].camera
+        camera = agent.shared_cameras[NAME].client
         for _ in range(60):
             await camera.trigger()
         while len(files(tmp_path)) < 2:  # the thread may be late
@@ -153,13 +153,13 @@ async def test_file_is_over_when_it_is_old_also_of_a_silent_camera(tmp_path: Pat
         await until(lambda: files(tmp_path) and not recorder.counts[NAME].waiting)
         assert "no end" in load_recording(files(tmp_path)[0]).remark
         now = 59.0
-        await agent.hosts[NAME].camera.trigger()
+        await agent.shared_cameras[NAME].client.trigger()
         await until(lambda: not recorder.counts[NAME].waiting)
         assert len(files(tmp_path)) == 1
         now = 61.0
         await until(lambda: not load_recording(files(tmp_path)[0]).remark)
         assert len(files(tmp_path)) == 1  # nothing is to be said in another
-        await agent.hosts[NAME].camera.trigger()
+        await agent.shared_cameras[NAME].client.trigger()
         await until(lambda: len(files(tmp_path)) == 2)
     assert all_runs(tmp_path) == [1, 2]
 
@@ -266,7 +266,7 @@ async def test_full_disk_is_told_once_counted_and_heals(
         recorder = FleetRecorder(agent, section(), on_trouble=told.append)
         async with recorder, agent:
             await agent.wait_first_attempts()
-            camera = agent.hosts[NAME].camera
+            camera = agent.shared_cameras[NAME].client
             assert (await camera.trigger()).raw[:4] == b"\1\0\0\0"
             await until(lambda: not recorder.counts[NAME].waiting)
             before = recorder.counts[NAME].written
@@ -316,7 +316,7 @@ async def test_folder_that_goes_away_is_told_and_used_again_when_it_is_back(
     tmp_path: Path,
 ) -> None:
     async with NumberedCamera() as box, recording(tmp_path, box.url) as (recorder, agent):
-        camera = agent.hosts[NAME].camera
+        camera = agent.shared_cameras[NAME].client
         await camera.trigger()
         await until(lambda: not recorder.counts[NAME].waiting)
         shutil.move(tmp_path / "rec", tmp_path / "away")
@@ -343,10 +343,10 @@ async def test_folder_that_cannot_be_made_is_tried_again(tmp_path: Path) -> None
         recording(tmp_path, box.url, folder="later/rec") as (recorder, agent),
     ):
         assert recorder.trouble is not None
-        await agent.hosts[NAME].camera.trigger()
+        await agent.shared_cameras[NAME].client.trigger()
         (tmp_path / "later").mkdir()
         while recorder.trouble is not None:
-            await agent.hosts[NAME].camera.trigger()
+            await agent.shared_cameras[NAME].client.trigger()
             await asyncio.sleep(0.01)
     assert runs(load_recording(tmp_path / "later" / "rec"))[-1] == box.runs
 
@@ -358,7 +358,7 @@ async def test_slow_disk_costs_records_and_neither_memory_nor_time(
     disk = Disk(monkeypatch)
     async with NumberedCamera() as box:
         async with recording(tmp_path, box.url) as (recorder, agent):
-            camera = agent.hosts[NAME].camera
+            camera = agent.shared_cameras[NAME].client
             await camera.trigger()
             await until(lambda: not recorder.counts[NAME].waiting)
             disk.stuck, before = threading.Event(), disk.calls
@@ -397,7 +397,7 @@ async def test_record_that_makes_no_json_is_counted_and_the_rest_is_written(
             odd = frame(0, "> Query", odd=deep)._replace(camera=NAME)
             dialect = BVS.dialects["handbook"]
             agent.observers[0].on_raw_frame(RawFrame(odd.at, NAME, dialect, Sender.CLIENT, odd))
-            await agent.hosts[NAME].camera.trigger()
+            await agent.shared_cameras[NAME].client.trigger()
         assert recorder.counts[NAME].lost == 1
     assert all_runs(tmp_path) == [1]
 
@@ -464,11 +464,11 @@ async def test_recorder_that_is_cancelled_at_its_start_leaves_the_folder_free(
 
 async def test_only_the_chosen_cameras_and_no_frames_if_so_said(tmp_path: Path) -> None:
     async with NumberedCamera() as one, NumberedCamera() as two:
-        fields: dict[str, Any] = {"cameras": ("line1/cam2",), "frames": False}
+        fields: dict[str, Any] = {"cameras": ("line1/cam2",), "messages": False}
         async with recording(tmp_path, one.url, two.url, **fields) as (recorder, agent):
-            for host in agent.hosts.values():
+            for host in agent.shared_cameras.values():
                 for _ in range(3):
-                    await host.camera.trigger()
+                    await host.client.trigger()
         assert [*recorder.counts] == ["line1/cam2"]
     found = load_recording(tmp_path / "rec")
     assert (found.counts.frames, found.counts.results) == (0, 3)
@@ -480,10 +480,10 @@ async def test_only_the_chosen_cameras_and_no_frames_if_so_said(tmp_path: Path) 
 
 async def test_errors_of_programs_triggers_are_recorded(tmp_path: Path) -> None:
     async with NumberedCamera() as box, recording(tmp_path, box.url) as (_, agent):
-        host = agent.hosts[NAME]
-        await host.camera.stop()
+        host = agent.shared_cameras[NAME]
+        await host.client.stop()
         request = trigger_request()
         with pytest.raises(NotRunningError):
-            await host.camera.trigger_for(request, None, 1.0)
+            await host.client.trigger_for(request, None, 1.0)
     errors = [one.error for one in load_recording(tmp_path / "rec").errors()]
     assert errors == ["NotRunningError"]

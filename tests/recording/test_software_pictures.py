@@ -104,7 +104,7 @@ async def test_a_session_that_is_lost_and_a_camera_that_is_changed_mix_no_pictur
     server = smartcam.fleet.serve(path)
     async with FleetRecorder(server), server:
         await triggered(server, desk, 31, 32)
-        camera = server.hosts[NAME].camera
+        camera = server.shared_cameras[NAME].client
         sessions = camera.statistics().sessions
         inner: Any = camera
         inner._connection.require_link().abort()

@@ -141,7 +141,7 @@ async def test_cameras_with_a_page_of_their_own_are_bounded(
 async def test_camera_of_an_agent_that_comes_back_goes_on() -> None:
     async with Plant() as plant:
         options = {"interpret_as": LAYOUT, "reconnect": FAST}
-        fleet = Fleet(plant.bus.end(), None, "plant", None, 60.0, options)
+        fleet = Fleet(plant.bus.new_connection(), None, "plant", None, 60.0, options)
         async with served(fleet, control=True) as world, world.events(NAME) as events:
             row = world.site.view.rows[NAME]
             assert (await world.post("/trigger", camera=NAME)).status == 200
@@ -160,7 +160,7 @@ async def test_camera_of_an_agent_that_comes_back_goes_on() -> None:
 
 async def test_camera_whose_agent_is_back_before_it_keeps_its_page() -> None:
     async with Plant() as plant:
-        fleet = Fleet(plant.bus.end(), None, "plant", None, 60.0, {"reconnect": FAST})
+        fleet = Fleet(plant.bus.new_connection(), None, "plant", None, 60.0, {"reconnect": FAST})
         async with served(fleet) as world, world.events(NAME) as events:
             await events.until("camera", lambda told: told["connection"] == "connected")
             known = fleet[NAME].capabilities
@@ -176,7 +176,7 @@ async def test_camera_whose_agent_is_back_before_it_keeps_its_page() -> None:
 
 async def test_camera_given_up_is_followed_as_its_next_object() -> None:
     async with Plant() as plant:
-        fleet = Fleet(plant.bus.end(), None, "plant", None, 2.0, {"reconnect": None})
+        fleet = Fleet(plant.bus.new_connection(), None, "plant", None, 2.0, {"reconnect": None})
         async with served(fleet, control=True) as world, world.events(NAME) as events:
             before = world.fleet[NAME]
             await events.until("camera", lambda told: told["connection"] == "connected")
@@ -213,7 +213,7 @@ async def test_port_that_is_taken_leaves_nothing_behind() -> None:
 
 
 async def test_bus_of_nobody_is_an_empty_table() -> None:
-    fleet = Fleet(MemoryBus().end(), None, "plant", None, 0.1, {})
+    fleet = Fleet(MemoryBus().new_connection(), None, "plant", None, 0.1, {})
     async with served(fleet) as world:
         told = await world.caller.get("/api/fleet")
         assert (told["totals"]["cameras"], told["agents"]) == (0, [])

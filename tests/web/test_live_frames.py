@@ -107,7 +107,7 @@ async def test_camera_without_frames_is_not_asked_for_any() -> None:
         assert "a camera without frames" in answer.value["error"]
         await asyncio.sleep(5)  # of the loop's own time
         assert world.site.state()["frames"] is False
-        assert "frame_caller" not in vars(world.camera)  # which would ask
+        assert "frame_client" not in vars(world.camera)  # which would ask
 
 
 async def test_device_that_is_not_there_says_why_and_comes() -> None:

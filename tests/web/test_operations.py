@@ -18,7 +18,7 @@ import smartcam.exceptions
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError, MissingExtraError, SmartCamError
 from smartcam.fleet import Fleet, FleetFile, FleetServer, MemoryBus
-from smartcam.fleet._inside import exposition, read_numbers
+from smartcam.fleet._inside import exposition, read_counts
 from smartcam.web import OperationsSite
 from tests import ROOT
 from tests.fleet.fleetkit import PATIENCE, NumberedCamera, until
@@ -69,11 +69,11 @@ async def watched(
         boxes = {name: await stack.enter_async_context(NumberedCamera()) for name in names}
         bus = MemoryBus()
         urls = {name: box.url for name, box in boxes.items()}
-        server = FleetServer(file(urls, **operations), bus=bus.end())
+        server = FleetServer(file(urls, **operations), bus=bus.new_connection())
         site = await stack.enter_async_context(OperationsSite(server))
         await stack.enter_async_context(server)
         await server.wait_first_attempts()
-        fleet = Fleet(bus.end(), None, "plant", None, PATIENCE, {})
+        fleet = Fleet(bus.new_connection(), None, "plant", None, PATIENCE, {})
         yield server, site, await stack.enter_async_context(fleet), boxes
 
 
@@ -82,7 +82,7 @@ async def test_it_is_ready_once_each_camera_was_tried_and_stays_so() -> None:
         async with EmulatedCamera() as box:
             place = silent.getsockname()[1]
             urls = {"there": box.url, "silent": f"bvs://127.0.0.1:{place}"}
-            server = FleetServer(file(urls), bus=MemoryBus().end())
+            server = FleetServer(file(urls), bus=MemoryBus().new_connection())
             async with OperationsSite(server) as site:
 
                 async def readiness() -> tuple[int, dict[str, Any]]:
@@ -93,7 +93,7 @@ async def test_it_is_ready_once_each_camera_was_tried_and_stays_so() -> None:
                 assert (status, said["reason"]) == (503, "the agent is not on the bus")
                 assert await ask(site, "/healthz") == (200, "ok\n")
                 async with server:
-                    await until(lambda: server.hosts["there"].connected)
+                    await until(lambda: server.shared_cameras["there"].connected)
                     status, said = await readiness()
                     assert (status, said["reason"]) == (503, "1 of 2 cameras were tried")
                     await server.wait_first_attempts()
@@ -101,7 +101,7 @@ async def test_it_is_ready_once_each_camera_was_tried_and_stays_so() -> None:
                     assert (status, said["ready"], said["agent"]) == (200, True, "a1")
                     assert (said["connected"], said["not_connected"]) == (1, ["silent"])
                     await box.stop()
-                    await until(lambda: not server.hosts["there"].connected)
+                    await until(lambda: not server.shared_cameras["there"].connected)
                     status, said = await readiness()
                     assert (status, said["connected"]) == (200, 0)
                 status, said = await readiness()
@@ -140,7 +140,7 @@ def words_of(title: str, column: int = 0) -> set[str]:
 
 
 def test_page_has_the_words_of_readiness() -> None:
-    server = FleetServer(file({"one": "bvs://127.0.0.1:1"}), bus=MemoryBus().end())
+    server = FleetServer(file({"one": "bvs://127.0.0.1:1"}), bus=MemoryBus().new_connection())
     assert set(OperationsSite(server).readiness()) <= words_of("path", 1)
 
 
@@ -152,7 +152,7 @@ async def test_numbers_are_those_of_the_account() -> None:
         with pytest.raises(SmartCamError):
             await fleet["two"].trigger()
         boxes["one"].device.trigger()
-        await until(lambda: server.hosts["one"].camera.statistics().received == 4)
+        await until(lambda: server.shared_cameras["one"].client.statistics().received == 4)
         status, text = await ask(site, "/metrics")
         found = samples(text)
         assert status == 200
@@ -161,7 +161,7 @@ async def test_numbers_are_those_of_the_account() -> None:
         assert found["smartcam_triggers_total", "a1", "one", "result"] == 3
         assert found["smartcam_triggers_total", "a1", "two", "not_running"] == 1
         assert found["smartcam_triggers_total", "a1", "two", "result"] == 0
-        account = server.hosts["one"].camera.statistics()
+        account = server.shared_cameras["one"].client.statistics()
         told = {key[3]: n for key, n in found.items() if key[0] == "smartcam_results_total"}
         assert len(told) == 6
         for fate in told:
@@ -176,19 +176,19 @@ async def test_numbers_are_those_of_the_account() -> None:
         assert found["smartcam_agent_kept_results", "a1"] == 4
         assert found["smartcam_sessions_total", "a1", "two"] == 1
         assert found["smartcam_received_bytes_total", "a1"] == sum(
-            host.camera.statistics().bytes_received for host in server.hosts.values()
+            host.client.statistics().bytes_received for host in server.shared_cameras.values()
         )
         assert found["smartcam_agent_info", "a1", "plant", smartcam.__version__] == 1
 
 
 async def test_camera_that_another_client_took_is_in_the_numbers() -> None:
     async with watched("one") as (server, site, _, boxes):
-        host = server.hosts["one"]
+        host = server.shared_cameras["one"]
         for _ in range(2):
             await until(lambda: host.connected)
             async with smartcam.connect(boxes["one"].url):
                 await until(lambda: not host.connected)
-        await until(lambda: host.camera.is_taken)
+        await until(lambda: host.client.is_taken)
         found = samples((await ask(site, "/metrics"))[1])
         assert (found["smartcam_connected", "a1", "one"], found["smartcam_taken", "a1", "one"]) == (
             0,
@@ -223,7 +223,7 @@ async def test_each_camera_may_have_a_histogram() -> None:
 async def test_the_text_grows_by_a_few_lines_for_a_camera_and_by_no_labels_of_others() -> None:
     async with watched("one") as (server, _site, fleet, _boxes):
         await fleet["one"].trigger()
-        numbers = await read_numbers(server)
+        numbers = await read_counts(server)
         assert numbers is not None
 
     async def lines(count: int) -> int:
@@ -244,9 +244,9 @@ async def test_who_asks_at_the_same_time_gets_the_same(monkeypatch: pytest.Monke
     async def counted(server: FleetServer) -> Any:
         read.append(1)
         await asyncio.sleep(1.0)
-        return await read_numbers(server)
+        return await read_counts(server)
 
-    monkeypatch.setattr("smartcam.web._operations.read_numbers", counted)
+    monkeypatch.setattr("smartcam.web._operations.read_counts", counted)
     async with watched("one") as (_, site, _fleet, _boxes):
         answers = await asyncio.gather(*(ask(site, "/metrics") for _ in range(20)))
         assert len({text for _, text in answers}) == 1
@@ -335,10 +335,10 @@ async def test_it_stops_while_somebody_asks_and_starts_again() -> None:
 
 
 async def test_what_cannot_be_is_reported_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    nowhere = FleetServer(file({"one": "bvs://h"}, listen=None), bus=MemoryBus().end())
+    nowhere = FleetServer(file({"one": "bvs://h"}, listen=None), bus=MemoryBus().new_connection())
     with pytest.raises(ConfigurationError, match="nowhere to listen"):
         OperationsSite(nowhere)
-    server = FleetServer(file({"one": "bvs://h"}), bus=MemoryBus().end())
+    server = FleetServer(file({"one": "bvs://h"}), bus=MemoryBus().new_connection())
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place = f"127.0.0.1:{taken.getsockname()[1]}"
         site = OperationsSite(server, listen=place)

@@ -31,25 +31,25 @@ from smartcam.exceptions import (
 from smartcam.fleet._agent.bundle import AgentBundle
 from smartcam.fleet._agent.calls import ACTIONS, GATED_COMMANDS, ProgramCall, agent_clock
 from smartcam.fleet._agent.claims import Claims
-from smartcam.fleet._agent.host import Host
-from smartcam.fleet._agent.shared import Owner
+from smartcam.fleet._agent.client import Owner
+from smartcam.fleet._agent.shared_camera import SharedCamera
 from smartcam.fleet._agent.summary import Summaries
 from smartcam.fleet._agent.workers import Workers
 from smartcam.fleet._bus.errors import late_call_error, to_fields
 from smartcam.fleet._bus.keys import COMMANDS
 from smartcam.fleet._bus.wire import (
     BusMessage,
-    TriggerOrder,
+    TriggerCall,
     decode,
-    decode_order,
+    decode_trigger,
     encode,
-    encode_outcome,
+    encode_trigger_reply,
     reply_grace,
 )
 from smartcam.fleet._frames.camera_frames import NO_FRAME_SUPPLY, SharedFrames
 from smartcam.fleet._frames.encoding import FrameEncoder
 from smartcam.fleet._frames.sender import FrameSender
-from smartcam.fleet._json.plain import PlainServices
+from smartcam.fleet._json.json_services import JsonServices
 from smartcam.fleet._operations.trigger_counts import RESULT, Totals, outcome_of
 from smartcam.fleet._program.program_name import ROLES_OF_NAMES, ProgramName
 from smartcam.fleet._security.certificates import VIEWER
@@ -142,7 +142,8 @@ class Guest:
         questions, commands: numbers of the received questions, and of the received commands.
         tasks: tasks of running calls, by kind (True: a command) and number of the call.
         running_counts: number of running questions (False) and of running commands (True).
-        entered: state to restore at the end of each temporary switch of the application.
+        switches: client and state to restore after each temporary switch of the application, by the
+            camera's name and the call's number.
         last_state: number of the last state in the program's replies, by camera.
     """
 
@@ -155,7 +156,7 @@ class Guest:
         default_factory=dict[tuple[bool, int], "asyncio.Task[None]"]
     )
     running_counts: list[int] = field(default_factory=lambda: [0, 0])
-    entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
+    switches: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
     last_state: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
@@ -186,7 +187,7 @@ class Agent:
     Args:
         name: name of the agent.
         keys: keys of the fleet.
-        bus: the agent's own end of the bus.
+        bus: the agent's own connection to the bus.
         cameras: options of the client of each camera, by the camera's name.
         history: largest numbers of kept results and of their bytes for each camera.
         on_event: callback for events of the cameras.
@@ -225,7 +226,7 @@ class Agent:
         self.epoch: int = time.time_ns()
         self._keys, self._bus = keys, bus
         self._cameras, self._history, self._on_event = cameras, history, on_event
-        self.hosts: dict[str, Host] = {}
+        self.shared_cameras: dict[str, SharedCamera] = {}
         self._programs: dict[str, Guest] = {}
         # by role: present programs, by their tokens; and programs that left, oldest first, with
         # their last call
@@ -242,8 +243,8 @@ class Agent:
         self._sharing: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
         # next numbers of cameras that were shared before
         self._remembered_numbers: dict[str, tuple[int, ...]] = {}
-        self._plain = PlainServices(self, keys, bus, calibrations)
-        self.closing_hosts: set[Host] = set()  # hosts that are being closed
+        self._json_services = JsonServices(self, keys, bus, calibrations)
+        self.closing_cameras: set[SharedCamera] = set()  # cameras that are being closed
         self.past_totals: Totals = Totals()  # counts of cameras that are no longer shared
         self._summaries = Summaries(self, keys, bus)
         self._bundle = AgentBundle(name, self.epoch, keys, bus)
@@ -263,16 +264,16 @@ class Agent:
         await self._bus.open(timeout)
         keys, bus, handles = self._keys, self._bus, self._handles
         try:
-            await self._claims.refuse_namesake(timeout)
+            await self._claims.check_name_free(timeout)
             handles.append(bus.watch(keys.program("*"), self._on_program))
             for role in (None, *ROLES_OF_NAMES):
                 pattern, on_call = self._calls_key(role, "**"), self._call_handler(role)
-                handles.append(bus.subscribe(pattern, on_call, patient=role == VIEWER))
-            self._plain.open()
+                handles.append(bus.subscribe(pattern, on_call, low_priority=role == VIEWER))
+            self._json_services.open()
             self._summaries.open()
             self._bundle.open()
             await self._claims.claim_name(timeout)
-            handles.append(bus.be_present(keys.agent(self.name)))
+            handles.append(bus.announce(keys.agent(self.name)))
             await self._claims.open(self._cameras, timeout)
         except BaseException:
             await self.close()
@@ -280,13 +281,13 @@ class Agent:
         return self
 
     async def close(self) -> None:
-        """Leave the bus, end calls and sessions; bounded. Idempotent.
+        """Leave the bus, end calls and sessions, within a limited time. Idempotent.
 
         Cancellation: the sessions' links are dropped at once; the bus is still left.
         """
         handles, self._handles = self._handles, []
         self._claims.close()
-        self._plain.close()
+        self._json_services.close()
         self._summaries.close()
         for handle in (*handles, *(token for token, _ in self._sharing.values())):
             handle.close()
@@ -299,41 +300,42 @@ class Agent:
         try:
             await asyncio.gather(*self._tasks, return_exceptions=True)
             try:
-                await close_all(host.close for host in self.hosts.values())
+                await close_all(camera.close for camera in self.shared_cameras.values())
             except Exception:
-                logger.exception("%s ! a camera did not close", self.name)
+                logger.exception("%s ! closing a camera failed", self.name)
             await self._encoder.close()
         finally:
             self._bundle.close()
             self._sender.close()
             await self._bus.close()
 
-    def retire(self, why: ConfigurationError) -> None:
+    def retire(self, reason: ConfigurationError) -> None:
         """Start to end the sessions and the agent, since another agent has its name."""
         if self.retired_by is not None:
             return
-        logger.error("%s ! %s", self.name, why)
-        self.retired_by = why
-        self.start_task(self._retire(why), "smartcam.fleet.retire")
+        logger.error("%s ! %s", self.name, reason)
+        self.retired_by = reason
+        self.start_task(self._retire(reason), "smartcam.fleet.retire")
 
-    async def _retire(self, why: ConfigurationError) -> None:
+    async def _retire(self, error: ConfigurationError) -> None:
         handles, self._handles = self._handles, []
         self._claims.close()
-        self._plain.close()
+        self._json_services.close()
         self._summaries.close()
         for handle in handles:
             handle.close()
         reason = "another agent has its name"
         try:
-            await close_all(functools.partial(self.unshare, name, reason) for name in [*self.hosts])
+            names = [*self.shared_cameras]
+            await close_all(functools.partial(self.unshare, name, reason) for name in names)
         except Exception:
-            logger.exception("%s ! a camera did not close", self.name)
+            logger.exception("%s ! closing a camera failed", self.name)
         finally:
-            self._on_retired(why)
+            self._on_retired(error)
 
     def share(
         self, name: str, settings: CameraSettings, frames_of: FrameSupply | None = None
-    ) -> Host:
+    ) -> SharedCamera:
         """Start a session with a camera, and share the camera.
 
         Args:
@@ -344,7 +346,7 @@ class Agent:
         Raises:
             ConfigurationError: an option of the camera is wrong.
         """
-        bus, keys, topics = self._bus, self._keys, self._plain.topics
+        bus, keys, topics = self._bus, self._keys, self._json_services.topics
         if frames_of is not None:
             self._frames[name] = frames_of
         source = self._frames.get(name, NO_FRAME_SUPPLY)
@@ -353,7 +355,7 @@ class Agent:
             name, source.make, self._sender, self._encoder, source.url, reporter is not None
         )
         on_event = self._on_camera_event
-        host = Host(
+        camera = SharedCamera(
             name,
             settings,
             bus,
@@ -366,12 +368,12 @@ class Agent:
             self._bundle,
             self._observers if reporter is None else (reporter, *self._observers),
         )
-        host.numbers = self._remembered_numbers.pop(name, host.numbers)
-        host.first_result, host.is_only_agent = host.results.following, not self.is_standby
-        self.hosts[name] = host
-        session_task = self.start_task(host.run(), f"smartcam.fleet.{name}")
-        self._sharing[name] = bus.be_present(keys.camera(self.name, name)), session_task
-        return host
+        camera.numbers = self._remembered_numbers.pop(name, camera.numbers)
+        camera.first_result, camera.is_only_agent = camera.results.next_number, not self.is_standby
+        self.shared_cameras[name] = camera
+        session_task = self.start_task(camera.run(), f"smartcam.fleet.{name}")
+        self._sharing[name] = bus.announce(keys.camera(self.name, name)), session_task
+        return camera
 
     async def add_camera(
         self, name: str, settings: CameraSettings, frames_of: FrameSupply | None = None
@@ -387,33 +389,33 @@ class Agent:
             self._frames[name] = frames_of
         await self._claims.claim_camera(name, settings)
 
-    async def refuse_taken(self, name: str, settings: CameraSettings) -> None:
-        """Raise if the fleet has a camera already under another name.
+    async def check_address_free(self, name: str, settings: CameraSettings) -> None:
+        """Check that the fleet does not have a camera already under another name.
 
         Raises:
             ConfigurationError: the fleet has this camera; the text names it and its agent.
         """
-        await self._claims.refuse_taken({name: settings})
+        await self._claims.check_addresses_free({name: settings})
 
-    async def remove_camera(self, name: str, why: str) -> None:
-        """Stop sharing a camera, or standing by for it; bounded. Its programs get ``why``."""
+    async def remove_camera(self, name: str, reason: str) -> None:
+        """Stop sharing a camera, or standing by for it; its programs get ``reason``."""
         self._claims.drop_claim(name)
-        if name in self.hosts:
-            await self.unshare(name, why)
+        if name in self.shared_cameras:
+            await self.unshare(name, reason)
 
-    async def unshare(self, name: str, why: str) -> None:
-        """End the session with a camera, and stop sharing it; bounded.
+    async def unshare(self, name: str, reason: str) -> None:
+        """End the session with a camera, and stop sharing it, within a limited time.
 
         Args:
             name: name of the camera.
-            why: reason for the camera's programs, as a text.
+            reason: reason for the camera's programs, as a text.
 
         Cancellation: takes effect at the end.
         """
-        host = self.hosts.pop(name)
+        camera = self.shared_cameras.pop(name)
         # announced before the presence ends: without this, programs would take the agent for lost
-        host.announce_removed(why)
-        self.closing_hosts.add(host)
+        camera.announce_removed(reason)
+        self.closing_cameras.add(camera)
         token, session_task = self._sharing.pop(name)
         try:
             try:
@@ -425,13 +427,17 @@ class Agent:
             await asyncio.wait({session_task})
         finally:
             try:
-                await host.close()
+                await camera.close()
             finally:
-                self._remembered_numbers[name] = host.numbers
-                self.closing_hosts.discard(host)
-                self.past_totals.add([host.camera.statistics()])
+                self._remembered_numbers[name] = camera.numbers
+                self.closing_cameras.discard(camera)
+                self.past_totals.add([camera.client.statistics()])
         if len(self._remembered_numbers) > MAX_REMEMBERED_CAMERAS:
             del self._remembered_numbers[next(iter(self._remembered_numbers))]
+
+    def is_shared(self, camera: SharedCamera) -> bool:
+        """Return True if a camera is still shared, and by this object."""
+        return self.shared_cameras.get(camera.name) is camera
 
     @property
     def program_count(self) -> int:
@@ -448,10 +454,10 @@ class Agent:
         self._on_event(event)
 
     async def wait_first_attempts(self) -> None:
-        """Wait until the first attempt with each camera has ended; bounded."""
+        """Wait until the first attempt with each camera has ended, within a limited time."""
         deadline = asyncio.get_running_loop().time() + FIRST_ATTEMPT_TIMEOUT
-        for host in tuple(self.hosts.values()):
-            await host.wait_first_attempt(max(0.0, deadline - asyncio.get_running_loop().time()))
+        for camera in tuple(self.shared_cameras.values()):
+            await camera.wait_first_attempt(max(0.0, deadline - asyncio.get_running_loop().time()))
 
     def start_task(self, work: Any, name: str) -> asyncio.Task[None]:
         """Run a coroutine in a task, which the agent cancels at its end."""
@@ -472,9 +478,9 @@ class Agent:
     def busy(self) -> bool:
         """True while a program has reserved a camera, or a command runs."""
         return (
-            self._plain.busy
+            self._json_services.busy
             or any(command for guest in self._programs.values() for command, _ in guest.tasks)
-            or any(host.gate.holder is not None for host in self.hosts.values())
+            or any(camera.gate.holder is not None for camera in self.shared_cameras.values())
         )
 
     # ------------------------------------------------------------------ programs
@@ -509,11 +515,11 @@ class Agent:
         for task in guest.tasks.values():
             self._cancel_task(task)
         self._sender.forget_program(program)
-        for host in self.hosts.values():
-            host.gate.lose_program(program)
-            host.frames.forget_program(program)
+        for shared in self.shared_cameras.values():
+            shared.gate.lose_program(program)
+            shared.frames.forget_program(program)
         if restore_applications:
-            for camera, before in guest.entered.values():
+            for camera, before in guest.switches.values():
                 camera.leave_application(before)
 
     def _known_guest(self, program: ProgramName) -> Guest | None:
@@ -521,8 +527,8 @@ class Agent:
         guest = self._programs.get(program.name)
         return guest if guest is not None and guest.program == program else None
 
-    def _guest_of_hello(self, program: ProgramName, call: int) -> Guest | None:
-        """Return the program that sent a hello; None if the program has left since then."""
+    def _welcome(self, program: ProgramName, call: int) -> Guest | None:
+        """Return the program that sent a hello, new or known; None if it has left since then."""
         known, role = self._known_guest(program), program.role
         last_call = self._last_calls[role].get(program.name, 0)  # if the program had left
         if known is None and call > last_call:
@@ -567,11 +573,11 @@ class Agent:
         def on_call(key: str, payload: bytes) -> None:
             name = key.removeprefix(root)
             try:
-                host, order = self.hosts[name], decode_order(payload, "a call")
-                if order is None:
-                    self._on_call(host, decode(payload, "a call"), role)
+                camera, trigger = self.shared_cameras[name], decode_trigger(payload, "a call")
+                if trigger is None:
+                    self._on_call(camera, decode(payload, "a call"), role)
                 elif command:
-                    self._on_trigger_order(host, *order)
+                    self._on_trigger(camera, *trigger)
                 else:
                     raise ProtocolError(f"{name}: a trigger is no question")
             except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
@@ -590,53 +596,49 @@ class Agent:
             raise ProtocolError(f"{self.name}: a call as {program.name:.80}, by another program")
         return program
 
-    def _on_call(self, host: Host, message: BusMessage, role: str | None) -> None:
+    def _on_call(self, camera: SharedCamera, message: BusMessage, role: str | None) -> None:
         fields, command = message.fields, role is None
         program, number = self._check_caller(str(fields["program"]), role), int(fields["call"])
         name = program.name
-        if "come" in fields:
-            self._sender.confirm(name, number, fields["come"])
+        if "received" in fields:
+            self._sender.confirm(name, number, fields["received"])
             return
         if "cancel" in fields:
-            self._cancel(host, name, int(fields["cancel"]), command)
+            self._cancel(camera, name, int(fields["cancel"]), command)
             self._reply(name, number, {"answer": {}})
             return
         action, timeout = str(fields["do"]), fields.get("timeout", 1.0)
         deadline = fields.get("deadline")
         epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
-        guest = (
-            self._guest_of_hello(program, number)
-            if action == "hello"
-            else self._known_guest(program)
-        )
+        guest = self._welcome(program, number) if action == "hello" else self._known_guest(program)
         reservation = fields.get("reservation")
         if reservation is not None:
             reservation = int(reservation)
         remaining = self._admit_call(
-            host, guest, name, number, epoch, action, deadline, timeout, command, reservation
+            camera, guest, name, number, epoch, action, deadline, timeout, command, reservation
         )
         if guest is not None and remaining is not None:
             owner = Owner(guest.number, number)
-            blobs, entered = message.blobs, guest.entered
+            blobs, switches = message.blobs, guest.switches
             call = ProgramCall(
-                host, name, owner, arguments, blobs, remaining, entered, None, reservation
+                camera, name, owner, arguments, blobs, remaining, switches, None, reservation
             )
             self._start(action, call, guest, command)
 
-    def _on_trigger_order(self, host: Host, token: str, order: TriggerOrder) -> None:
-        number, action = order.call, "trigger"
+    def _on_trigger(self, camera: SharedCamera, token: str, trigger: TriggerCall) -> None:
+        number, action = trigger.call, "trigger"
         program, _, secret = token.partition(".")
         guest = self._programs.get(program)
         if guest is None or guest.program.secret != secret:
             guest, program = None, self._check_caller(token, None).name
-        epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
-        reservation = order.reservation
+        epoch, deadline, timeout = trigger.epoch, trigger.deadline, trigger.timeout
+        reservation = trigger.reservation
         remaining = self._admit_call(
-            host, guest, program, number, epoch, action, deadline, timeout, True, reservation
+            camera, guest, program, number, epoch, action, deadline, timeout, True, reservation
         )
         if guest is not None and remaining is not None:
-            owner, entered = new_tuple(Owner, (guest.number, number)), guest.entered
-            fields: Any = (host, program, owner, {}, [], remaining, entered, order, reservation)
+            owner, switches = new_tuple(Owner, (guest.number, number)), guest.switches
+            fields: Any = camera, program, owner, {}, [], remaining, switches, trigger, reservation
             call: ProgramCall = new_tuple(ProgramCall, fields)
             worker = self._workers.get_worker()
             guest.begin_call(True, number, worker.task)
@@ -644,7 +646,7 @@ class Agent:
 
     def _admit_call(
         self,
-        host: Host,
+        camera: SharedCamera,
         guest: Guest | None,
         program: str,
         number: int,
@@ -659,7 +661,7 @@ class Agent:
         if guest is None or epoch != self.epoch:
             error_class = ConnectionLostError if reservation is None else ReservationLostError
             stranger = error_class(
-                f"{host.name}: the agent {self.name} was restarted, or took this program for "
+                f"{camera.name}: the agent {self.name} was restarted, or took this program for "
                 f"gone{'' if reservation is None else ', and lost its reservation'}; {action} was "
                 "not done"
             )
@@ -670,52 +672,52 @@ class Agent:
         error: SmartCamError | None = None
         remaining = 1.0
         try:
-            timeout = check_seconds(timeout, "timeout", host.name)
+            timeout = check_seconds(timeout, "timeout", camera.name)
             if deadline is not None:
                 remaining = (
-                    check_clock_seconds(deadline, "deadline", host.name)
+                    check_clock_seconds(deadline, "deadline", camera.name)
                     + reply_grace(timeout) / 2
                     - agent_clock()
                 )
         except ConfigurationError as exc:
             error = exc
-        error = error or self._refusal_error(host, guest, action, remaining, command)
+        error = error or self._refusal_error(camera, guest, action, remaining, command)
         if error is not None:
             if action == "trigger":
-                host.triggers[outcome_of(error)] += 1
+                camera.triggers[outcome_of(error)] += 1
             self._reply(program, number, {"error": to_fields(error)})
             return None
         return min(timeout, remaining)
 
     def _refusal_error(
-        self, host: Host, guest: Guest, action: str, remaining: float, command: bool
+        self, camera: SharedCamera, guest: Guest, action: str, remaining: float, command: bool
     ) -> SmartCamError | None:
         """Return the error that refuses a call; None if the call is accepted."""
         if action not in ACTIONS or (action in COMMANDS) != command:
-            return UnsupportedError(f"{host.name}: the agent {self.name} cannot {action!r:.40}")
+            return UnsupportedError(f"{camera.name}: the agent {self.name} cannot {action!r:.40}")
         if remaining < 0:
             return late_call_error(
-                action, f"{host.name}: {action} came after its deadline; it was not done"
+                action, f"{camera.name}: {action} came after its deadline; it was not done"
             )
-        cameras = len(self.hosts)
+        cameras = len(self.shared_cameras)
         if (
             not command
             and self._question_counts[guest.program.role] >= MAX_QUESTIONS_PER_ROLE * cameras
         ):
             return LocalProtocolError(
-                f"{host.name}: too many questions of role {guest.program.role} are under way"
+                f"{camera.name}: too many questions of role {guest.program.role} are under way"
             )
         if guest.running_counts[command] >= MAX_CALLS_PER_PROGRAM * cameras:
             kind = "commands" if command else "questions"
             return LocalProtocolError(
-                f"{host.name}: {guest.running_counts[command]} {kind} of this program are under way"
+                f"{camera.name}: {guest.running_counts[command]} {kind} of this program are running"
             )
         return None
 
     def _start(self, action: str, call: ProgramCall, guest: Guest, command: bool) -> None:
         task = asyncio.get_running_loop().create_task(
             self._carry_out(action, call, guest, command),
-            name=f"smartcam.fleet.{call.host.name}.{action}",
+            name=f"smartcam.fleet.{call.camera.name}.{action}",
         )
         guest.begin_call(command, call.owner.call, task)
         if not command:
@@ -725,7 +727,7 @@ class Agent:
     def _on_question_done(self, role: str, _: object) -> None:
         self._question_counts[role] -= 1
 
-    def _cancel(self, host: Host, program: str, number: int, command: bool) -> None:
+    def _cancel(self, shared: SharedCamera, program: str, number: int, command: bool) -> None:
         guest = self._programs.get(program)
         if guest is None:
             return
@@ -736,57 +738,58 @@ class Agent:
         if not command:
             self._sender.confirm(program, number, None)
             return
-        host.gate.release((program, number))
-        entered = guest.entered.pop((host.name, number), None)
-        if entered is not None:  # the switch was done, but its program no longer waits for it
-            camera, before = entered
+        shared.gate.release((program, number))
+        switch = guest.switches.pop((shared.name, number), None)
+        if switch is not None:  # the switch was done, but its program no longer waits for it
+            camera, before = switch
             camera.leave_application(before)
 
     async def _carry_out(self, action: str, call: ProgramCall, guest: Guest, command: bool) -> None:
         """Carry out a call, and reply; a program that has cancelled gets no reply."""
-        host = call.host
-        has_entered, outcome = False, "cancelled"
+        camera = call.camera
+        has_entered_gate, outcome = False, "cancelled"
         try:
             if call.reservation is not None:
-                host.check_reserved((call.program, call.reservation), action)
+                camera.check_reserved((call.program, call.reservation), action)
             if action in GATED_COMMANDS:
-                if not host.gate.try_enter(call.program):
+                if not camera.gate.try_enter(call.program):
                     waits_since = agent_clock()
-                    await host.enter(call.program, action, call.timeout)
+                    await camera.enter_gate(call.program, action, call.timeout)
                     call = call._replace(
                         timeout=max(0.0, call.timeout - (agent_clock() - waits_since))
                     )
-                has_entered = True
+                has_entered_gate = True
             fields, blobs = await ACTIONS[action](call)
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
-                logger.exception("%s ! %s failed", host.name, action)
+                logger.exception("%s ! %s failed", camera.name, action)
             reply: dict[str, Any] = {"error": to_fields(exc)}
             blobs, outcome = [], outcome_of(exc)
         else:
             reply, outcome = {"answer": fields}, RESULT
         finally:
             if action == "trigger":
-                host.triggers[outcome] += 1
-            if has_entered:
-                host.gate.leave(call.program)
+                camera.triggers[outcome] += 1
+            if has_entered_gate:
+                camera.gate.leave(call.program)
             guest.end_call(command, call.owner.call)
         if action == "trigger" and blobs:
             self._reply_to_trigger(call, guest, blobs[0])
             return
-        host.flush()
-        reply |= {"states": host.states.following, "results": host.results.following}
+        camera.flush()
+        reply |= {"states": camera.states.next_number, "results": camera.results.next_number}
         self._reply(call.program, call.owner.call, reply, blobs)
 
-    def _reply_to_trigger(self, call: ProgramCall, guest: Guest, runs: bytes) -> None:
-        """Reply with the trigger's runs, and with states that the program does not have yet."""
-        host, following = call.host, call.host.states.following
-        states = host.unsent_states(guest.last_state.get(host.name, 0))
-        guest.last_state[host.name] = following
-        host.flush(states=not states)
+    def _reply_to_trigger(self, call: ProgramCall, guest: Guest, groups: bytes) -> None:
+        """Reply with the trigger's results, and with states that the program does not have yet."""
+        camera, next_number = call.camera, call.camera.states.next_number
+        states = camera.unsent_states(guest.last_state.get(camera.name, 0))
+        guest.last_state[camera.name] = next_number
+        camera.flush(states=not states)
         if states and len(self._programs) == 1:
-            host.drop_unsent_states()
-        reply = encode_outcome(call.owner.call, self.epoch, agent_clock(), following, states, runs)
+            camera.drop_unsent_states()
+        number, clock = call.owner.call, agent_clock()
+        reply = encode_trigger_reply(number, self.epoch, clock, next_number, states, groups)
         self._bus.put(self._keys.reply(call.program), reply)
 
     def _reply(

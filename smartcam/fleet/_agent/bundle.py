@@ -39,14 +39,15 @@ class ResultBundle(NamedTuple):
     """A decoded bundle.
 
     Attributes:
-        epoch: number of the agent's start. number: number of the bundle; an empty bundle has the
-        number of the next bundle with results. following: number of the next bundle with results.
-        parts: name of each camera, and its results in the form of :func:`encode_runs`.
+        epoch: number of the agent's start.
+        number: number of the bundle; an empty bundle has that of the next bundle with results.
+        next_number: number of the next bundle with results.
+        parts: name of each camera, and its results in the form of :func:`encode_groups`.
     """
 
     epoch: int
     number: int
-    following: int
+    next_number: int
     parts: list[tuple[str, bytes]]
 
 
@@ -57,7 +58,7 @@ def decode_bundle(payload: bytes, label: str) -> ResultBundle:
         RemoteProtocolError: the payload is not valid; the text names ``label``.
     """
     try:
-        magic, epoch, number, following, count = _HEAD.unpack_from(payload)
+        magic, epoch, number, next_number, count = _HEAD.unpack_from(payload)
         if magic != _MAGIC:
             raise ValueError(f"it begins with {magic!r}, not {_MAGIC!r}")
         position, parts = _HEAD.size, list[tuple[str, bytes]]()
@@ -74,7 +75,7 @@ def decode_bundle(payload: bytes, label: str) -> ResultBundle:
             raise ValueError(f"{len(payload) - position} bytes are left over")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
-    return ResultBundle(epoch, number, following, parts)
+    return ResultBundle(epoch, number, next_number, parts)
 
 
 class AgentBundle:
@@ -84,7 +85,7 @@ class AgentBundle:
         agent: the agent's name.
         epoch: number of the agent's start.
         keys: keys of the fleet.
-        bus: the agent's end of the bus.
+        bus: the agent's connection to the bus.
     """
 
     def __init__(self, agent: str, epoch: int, keys: Keys, bus: Bus) -> None:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from smartcam.fleet._agent.agent import Agent
-    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._agent.shared_camera import SharedCamera
     from smartcam.fleet._bus.bus import Bus, Handle
     from smartcam.fleet._bus.keys import Keys
     from smartcam.fleet._file.standby import Standby
@@ -42,13 +42,13 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 HOLD_OFF_DELAY = 0.2
 """Seconds that a standby agent waits before it takes over a camera that has no agent, for each unit
-of the agent's preference; so the agent with the lowest preference is first."""
+of the agent's rank; so the agent with the lowest rank is first."""
 
 ASK_TIMEOUT = 0.5
 """Seconds for another agent's answer, and between two checks of the other agent's cameras."""
 
 RESOLVE_TIMEOUT = 2.0
-"""Seconds to find the addresses of hosts' names."""
+"""Seconds to find the addresses of host names."""
 
 RETURN_WAIT = 4.0
 """Seconds to wait for other agents to return after the bus was lost; then their cameras are taken
@@ -69,7 +69,7 @@ class Claims:
     Args:
         agent: the agent.
         keys: keys of the fleet.
-        bus: the agent's end of the bus.
+        bus: the agent's connection to the bus.
         standby: settings of a standby agent; None: the agent does not stand by.
 
     Attributes:
@@ -82,7 +82,7 @@ class Claims:
         self._other_agents: dict[str, set[str]] = {}  # other agents that announce each camera
         # loop time until which another agent counts as the probable taker of the camera
         self._contested_until: dict[str, float] = {}
-        self._uncontested_until: dict[str, float] = {}  # loop time; a presence has no effect before
+        self._uncontested_until: dict[str, float] = {}  # before it, presences do not contest
         self._deciding: set[str] = set()
         self._undecided: set[str] = set()
         self._other_appeared: dict[
@@ -90,23 +90,23 @@ class Claims:
         ] = {}  # awaited presences of another agent, by camera
         self._presence_watch: Handle | None = None
         self.given_up: dict[str, ConnectionTakenError] = {}
-        self._start_name = f"{agent.epoch}-{secrets.token_hex(4)}"
+        self._start_id = f"{agent.epoch}-{secrets.token_hex(4)}"
         self._name_handles: list[Handle] = []
 
-    async def refuse_namesake(self, timeout: float) -> None:
-        """Raise if another agent has the name; called before the name is used on the bus.
+    async def check_name_free(self, timeout: float) -> None:
+        """Check that no other agent has the name, before the name is used on the bus.
 
         Raises:
-            ConfigurationError: another agent has the name, and stays present for longer than the
-                bus reports an agent that has died.
+            ConfigurationError: another agent has the name, and is still present after the time
+                in which the bus notices that an agent has died.
         """
         loop, name = asyncio.get_running_loop(), self._agent.name
         give_up_at = loop.time() + LEASE_TIME + 1.0
-        while await self._bus.present(self._keys.agent(name), timeout):
+        while await self._bus.present_keys(self._keys.agent(name), timeout):
             if loop.time() > give_up_at:
                 raise ConfigurationError(
-                    f"an agent named {name} is in fleet {self._keys.fleet} already; each has a "
-                    "name of its own: `agent:` in its fleet file"
+                    f"an agent named {name} is in fleet {self._keys.fleet} already: give each "
+                    "agent a name of its own, by `agent:` in its fleet file"
                 )
             await asyncio.sleep(ASK_TIMEOUT)
 
@@ -117,8 +117,8 @@ class Claims:
             ConfigurationError: another agent has the name.
         """
         keys, bus, name = self._keys, self._bus, self._agent.name
-        self._name_handles.append(bus.be_present(keys.start(name, self._start_name)))
-        for key in await bus.present(keys.start(name, "*"), timeout):
+        self._name_handles.append(bus.announce(keys.start(name, self._start_id)))
+        for key in await bus.present_keys(keys.start(name, "*"), timeout):
             if self._is_earlier(key):
                 raise self._namesake_error()
         self._name_handles.append(bus.watch(keys.start(name, "*"), self._on_namesake))
@@ -126,26 +126,26 @@ class Claims:
     def _is_earlier(self, key: str) -> bool:
         """Return True if another agent of this name was started earlier; starts are never equal."""
         return _start_order(self._keys.tail(key, "presence/start")[-1]) < _start_order(
-            self._start_name
+            self._start_id
         )
 
     def _namesake_error(self) -> ConfigurationError:
         name, fleet = self._agent.name, self._keys.fleet
         return ConfigurationError(
             f"an agent named {name} is in fleet {fleet}, which was started before this one: this "
-            "one ends its cameras; each has a name of its own: `agent:` in its fleet file"
+            "one gives up its cameras; give each agent its own name, by `agent:` in its fleet file"
         )
 
     def _on_namesake(self, key: str, present: bool) -> None:
         if present and self._is_earlier(key):
             self._agent.retire(self._namesake_error())
-        elif present and not key.endswith(f"/{self._start_name}"):
+        elif present and not key.endswith(f"/{self._start_id}"):
             logger.warning(
-                "%s ! another agent of this name was started later: that one ends", self._agent.name
+                "%s ! another agent of this name started later: that one ends", self._agent.name
             )
         elif not present:
-            for host in self._agent.hosts.values():
-                host.camera.try_take_back()  # the other agent may have taken the camera
+            for camera in self._agent.shared_cameras.values():
+                camera.client.try_take_back()  # the other agent may have taken the camera
 
     async def open(self, cameras: Mapping[str, CameraSettings], timeout: float) -> None:
         """Share the cameras that no other agent has.
@@ -156,14 +156,14 @@ class Claims:
         """
         self._wanted = dict(cameras)
         keys, bus = self._keys, self._bus
-        for key in await bus.present(keys.camera("*", "**"), timeout):
+        for key in await bus.present_keys(keys.camera("*", "**"), timeout):
             self._note_presence(key, True)
         self._presence_watch = bus.watch(keys.camera("*", "**"), self._on_presence)
         if self._standby is None:
-            await self._refuse_contested()
+            await self._check_cameras_free()
         others = self._other_agents
         free = {name: settings for name, settings in cameras.items() if not others.get(name)}
-        await self.refuse_taken(free)
+        await self.check_addresses_free(free)
         for name, settings in cameras.items():
             if self._other_agents.get(name):
                 self._decide_soon(name)
@@ -177,12 +177,12 @@ class Claims:
             ConfigurationError: another agent has the camera, and this agent does not stand by.
         """
         self._wanted[name] = settings
-        for key in await self._bus.present(self._keys.camera("*", name), ASK_TIMEOUT):
+        for key in await self._bus.present_keys(self._keys.camera("*", name), ASK_TIMEOUT):
             self._note_presence(key, True)
         others = self._other_agents.get(name)
         if not others:
             try:
-                await self.refuse_taken({name: settings})
+                await self.check_addresses_free({name: settings})
             except ConfigurationError:
                 self.drop_claim(name)
                 raise
@@ -192,11 +192,11 @@ class Claims:
         else:
             self.drop_claim(name)
             raise ConfigurationError(
-                f"{name}: the agent {min(others)} has this camera, which serves one"
+                f"{name}: the agent {min(others)} has this camera, which serves one client"
             )
 
-    async def refuse_taken(self, cameras: Mapping[str, CameraSettings]) -> None:
-        """Raise if the fleet has one of these cameras under another name.
+    async def check_addresses_free(self, cameras: Mapping[str, CameraSettings]) -> None:
+        """Check that the fleet has none of these cameras under another name.
 
         The addresses of the cameras are compared, since a camera serves one client. No other task
         runs between the check of this agent's own cameras and the return. But two agents that check
@@ -219,11 +219,11 @@ class Claims:
                 logger.warning("! an agent's message about a camera cannot be read: %s", exc)
         hosts = {settings.address.host for settings in cameras.values()}
         hosts |= {address.host for _, _, address in listed_cameras}
-        hosts |= {host.settings.address.host for host in self._agent.hosts.values()}
+        hosts |= {shared.settings.address.host for shared in self._agent.shared_cameras.values()}
         addresses = await _resolve_hosts(hosts)
         listed_cameras += [
-            (name, self._agent.name, host.settings.address)
-            for name, host in self._agent.hosts.items()
+            (name, self._agent.name, shared.settings.address)
+            for name, shared in self._agent.shared_cameras.items()
         ]
         taken: dict[tuple[str, int], list[tuple[str, str]]] = {}
         for camera, agent, address in listed_cameras:
@@ -257,8 +257,8 @@ class Claims:
             self._presence_watch.close()
             self._presence_watch = None
 
-    async def _refuse_contested(self) -> None:
-        """Raise if another agent has a camera of this agent, and neither of them stands by.
+    async def _check_cameras_free(self) -> None:
+        """Check that no other agent has a camera of this agent, unless one of them stands by.
 
         An agent that does not answer may have died just before: the bus ends its presence only
         after a lease time. So this method waits for the lease time.
@@ -318,7 +318,7 @@ class Claims:
         """Handle an event of a camera of this agent."""
         if isinstance(event, Disconnected):
             name = event.camera
-            if not self._bus.reached or self._is_contested(name):
+            if not self._bus.is_connected or self._is_contested(name):
                 self._decide_soon(name)
 
     def _is_contested(self, name: str) -> bool:
@@ -337,7 +337,7 @@ class Claims:
         try:
             while name in self._undecided and name in self._wanted:
                 self._undecided.discard(name)
-                if name in self._agent.hosts:
+                if name in self._agent.shared_cameras:
                     await self._defend(name)
                 else:
                     await self._stand_by(name)
@@ -348,10 +348,10 @@ class Claims:
         """Take over a camera that no agent has."""
         if self._standby is None or self._other_agents.get(name):
             return
-        was_cut_off = not self._bus.reached  # then the other agents may still have the camera
-        await asyncio.sleep(HOLD_OFF_DELAY * self._standby.preference)
-        while was_cut_off or not self._bus.reached:
-            if self._bus.reached:
+        was_cut_off = not self._bus.is_connected  # then the other agents may still have the camera
+        await asyncio.sleep(HOLD_OFF_DELAY * self._standby.rank)
+        while was_cut_off or not self._bus.is_connected:
+            if self._bus.is_connected:
                 if await self._wait_for_other(name, RETURN_WAIT):
                     return  # a later presence or loss starts a new decision
                 was_cut_off = False
@@ -359,16 +359,17 @@ class Claims:
                 was_cut_off = True
                 await asyncio.sleep(ASK_TIMEOUT)
         settings = self._wanted.get(name)
-        if settings is None or self._other_agents.get(name) or name in self._agent.hosts:
+        if settings is None or self._other_agents.get(name) or name in self._agent.shared_cameras:
             return
         try:
-            await self.refuse_taken({name: settings})
+            await self.check_addresses_free({name: settings})
         except ConfigurationError as exc:
             logger.warning("! %s", exc)
             await asyncio.sleep(RETURN_WAIT)
             self._undecided.add(name)
             return
-        if name not in self._wanted or self._other_agents.get(name) or name in self._agent.hosts:
+        shared_cameras = self._agent.shared_cameras
+        if name not in self._wanted or self._other_agents.get(name) or name in shared_cameras:
             return
         logger.warning("%s = the agent %s takes it over", name, self._agent.name)
         self.given_up.pop(name, None)
@@ -396,19 +397,22 @@ class Claims:
         camera. If no other agent announces it, but another client took it, this agent stands by.
         """
         agent, was_cut_off = self._agent, False
-        while (host := agent.hosts.get(name)) and not host.connected:  # a later loss is an event
+        # a session lost later is reported to on_event, which starts a new decision
+        while (camera := agent.shared_cameras.get(name)) and not camera.connected:
             if others := self._other_agents.get(name):
                 was_cut_off = False
                 other = min(others)
-                if await self._should_give_up(host, other):
+                if await self._should_give_up(camera, other):
                     await self._give_up(name, other)
                     return
                 await asyncio.sleep(ASK_TIMEOUT)
-            elif was_cut_off or not self._bus.reached:
-                was_cut_off = not self._bus.reached
+            elif was_cut_off or not self._bus.is_connected:
+                was_cut_off = not self._bus.is_connected
                 await self._wait_for_other(name, ASK_TIMEOUT if was_cut_off else RETURN_WAIT)
-            elif self._standby is not None and _is_taken(host):
-                logger.warning("! %s: no agent has it: %s stands by", name, agent.name)
+            elif self._standby is not None and _is_taken(camera):
+                logger.warning(
+                    "! %s: a client outside the fleet has it: %s stands by", name, agent.name
+                )
                 self._contested_until.pop(name, None)
                 self._uncontested_until[name] = (
                     asyncio.get_running_loop().time() + TAKE_BACK_INTERVAL
@@ -421,14 +425,14 @@ class Claims:
             else:
                 return
 
-    async def _should_give_up(self, host: Host, other: str) -> bool:
+    async def _should_give_up(self, camera: SharedCamera, other: str) -> bool:
         """Return True if this agent, which has no session, must leave a camera to another agent.
 
         If neither agent has a session, the agent whose name sorts first keeps the camera.
         """
-        agent, name = self._agent, host.name
+        agent, name = self._agent, camera.name
         cameras = await ask_cameras(self._bus, self._keys, other, name, ASK_TIMEOUT)
-        if host.connected or agent.hosts.get(name) is not host:
+        if camera.connected or not agent.is_shared(camera):
             return False
         other_keeps = bool(cameras) and (cameras[0].summary.connected or other < agent.name)
         return other_keeps and other in self._other_agents.get(name, ())
@@ -436,7 +440,7 @@ class Claims:
     async def _give_up(self, name: str, other: str) -> None:
         action = "stands by" if self._standby is not None else "shares it no more"
         error = self.given_up[name] = ConnectionTakenError(
-            f"{name}: the agent {other} has the camera now, which serves one; the agent "
+            f"{name}: the agent {other} has the camera now, which serves one client; the agent "
             f"{self._agent.name} {action}"
         )
         logger.warning("! %s", error)
@@ -478,6 +482,6 @@ async def _resolve_hosts(hosts: set[str]) -> dict[str, set[str]]:
     return addresses
 
 
-def _is_taken(host: Host) -> bool:
+def _is_taken(camera: SharedCamera) -> bool:
     """Return True if another client has taken the camera, so that no further session follows."""
-    return isinstance(host.camera.trouble, ConnectionTakenError)
+    return isinstance(camera.client.trouble, ConnectionTakenError)

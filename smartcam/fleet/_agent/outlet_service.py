@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from smartcam.exceptions import ConfigurationError, LocalProtocolError, SmartCamError
 from smartcam.fleet._bus.address import check_pattern
 from smartcam.fleet._bus.bus import always
-from smartcam.fleet._json.plain import request_fields
+from smartcam.fleet._json.json_services import request_fields
 from smartcam.fleet._json.topics import as_json
 from smartcam.fleet._program.reading import error_fields
 from smartcam.settings import validated
@@ -77,7 +77,7 @@ class ReportedStore(NamedTuple):
         errors: number of errors.
         gaps: number of gaps.
         lost: number of lost results in the gaps.
-        at_least: whether more results may be lost than ``lost``.
+        at_least: True if ``lost`` is a minimum: more results may be lost.
         error: reason why the store could not be read; "" if it was read.
     """
 
@@ -116,9 +116,9 @@ class StoredRequest(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     since: Annotated[str, Field(max_length=100), AfterValidator(_check_time_text)] | None = None
-    failed: bool = False
+    only_failed: bool = False
     camera: Annotated[str, Field(max_length=200), AfterValidator(_check_pattern_text)] = "**"
-    most: Annotated[int, Field(ge=0, le=MAX_STORED_ROWS)] = 100
+    max_rows: Annotated[int, Field(ge=0, le=MAX_STORED_ROWS)] = 100
 
 
 class OutletService:
@@ -126,7 +126,7 @@ class OutletService:
 
     Args:
         agent: the agent, whose tasks do the work.
-        bus: the agent's end of the bus.
+        bus: the agent's connection to the bus.
         keys: keys of the fleet.
         states: function that returns the states of the outlets, by name.
         read_stores: function that returns the answers of the stores, by the outlet's name.
@@ -144,7 +144,7 @@ class OutletService:
         self._states, self._read_stored = states, read_stores
         self._running_count = 0
         pattern = keys.outlets(agent.name, "*")
-        self._handle: Handle = bus.answer(pattern, self._on_question, patient=always)
+        self._handle: Handle = bus.answer(pattern, self._on_question, low_priority=always)
 
     def close(self) -> None:
         """Stop answering."""
@@ -152,14 +152,14 @@ class OutletService:
 
     def _on_question(self, question: BusQuestion) -> None:
         name = question.key.rpartition("/")[2]
-        if name == "accounts":
-            accounts = {
+        if name == "counts":
+            counts = {
                 name: {**state.counts.fields(), "trouble": state.trouble}
                 for name, state in self._states().items()
             }
-            self._reply(question, name, {"error": "", "outlets": accounts})
+            self._reply(question, name, {"error": "", "outlets": counts})
         elif name != "results":
-            error = ConfigurationError(f"outlets: expected accounts or results, got {name!r:.80}")
+            error = ConfigurationError(f"outlets: expected counts or results, got {name!r:.80}")
             self._reply(question, name, error_fields(error))
         elif self._running_count >= MAX_STORE_QUESTIONS:
             text = f"{self._running_count} questions to the stores are under way"
@@ -208,8 +208,8 @@ T = TypeVar("T", ReportedOutlet, ReportedStore)
 
 
 async def ask_outlets(bus: Bus, keys: Keys, timeout: float) -> list[ReportedOutlet]:
-    """Return the accounts of all agents' outlets that came within ``timeout`` seconds."""
-    return await _ask(bus, keys.outlets("*", "accounts"), b"", timeout, _read_accounts)
+    """Return the counts of all agents' outlets that came within ``timeout`` seconds."""
+    return await _ask(bus, keys.outlets("*", "counts"), b"", timeout, _read_counts)
 
 
 async def ask_stores(
@@ -232,7 +232,7 @@ async def _ask(
     return sorted(answers, key=lambda reported: reported[:2])
 
 
-def _read_accounts(answer: bytes) -> list[ReportedOutlet]:
+def _read_counts(answer: bytes) -> list[ReportedOutlet]:
     report: Any = json.loads(answer)
     return [
         ReportedOutlet(
@@ -241,7 +241,7 @@ def _read_accounts(answer: bytes) -> list[ReportedOutlet]:
             int(counts["results"]),
             int(counts["delivered"]),
             int(counts["spooled"]),
-            {str(why): int(count) for why, count in counts["dropped"].items()},
+            {str(reason): int(count) for reason, count in counts["dropped"].items()},
             str(counts["trouble"]),
         )
         for name, counts in report["outlets"].items()

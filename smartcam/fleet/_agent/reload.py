@@ -1,8 +1,8 @@
 """Reload a fleet file in a running agent; unchanged cameras are not touched.
 
 First the file is read and checked completely, and new emulated cameras are started. If one of these
-steps fails, nothing is changed. The changes that follow cannot fail. They run in a task of their
-own, which continues if the caller is cancelled.
+steps fails, nothing is changed. The changes that follow run in a task of their own, which continues
+if the caller is cancelled; their failures are only logged.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ class FleetChanges:
         return ", ".join([*parts, f"{self.kept} kept"])
 
 
-def _shortened(names: tuple[str, ...], most: int = 5) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+def _shortened(names: tuple[str, ...], max_names: int = 5) -> str:
+    more = f" and {len(names) - max_names} more" if len(names) > max_names else ""
+    return ", ".join(names[:max_names]) + more
 
 
 class CameraSource(NamedTuple):
@@ -77,7 +77,7 @@ class CameraSource(NamedTuple):
     Attributes:
         settings: settings of the client that has the session.
         frames: source of the camera's frames; None for none.
-        emulator: exit stack that stops the emulated camera; None for a real camera.
+        emulator: exit stack that stops the emulated camera; empty for a real camera.
     """
 
     settings: CameraSettings
@@ -157,7 +157,7 @@ class Reloader:
         current: the file as it was read last.
         sources: sources of the cameras' sessions, by name.
         last: changes, or error, of the last reload; None before the first reload.
-        outcomes: numbers of successful and of refused reloads.
+        outcomes: counts of successful and of refused reloads.
         on_reload: callback for the start of a reload (None) and for its end (changes or error).
     """
 
@@ -218,7 +218,7 @@ class Reloader:
         except SmartCamError:
             raise
         except OSError as exc:
-            raise ConfigurationError(f"fleet file: it cannot work: {exc}") from exc
+            raise ConfigurationError(f"the fleet file cannot be applied: {exc}") from exc
         except Exception as exc:
             logger.exception("! the reload failed")
             raise SmartCamError(f"fleet file: a fault of ours: {exc!r:.200}") from exc
@@ -228,7 +228,7 @@ class Reloader:
             await asyncio.wait({self._applying})
         folder = self._folder if isinstance(file, FleetFile) else Path(file).parent
         new, changes = await self._read(file, folder, agent.name)
-        _refuse_added(agent, changes)
+        _refuse_name_clashes(agent, changes)
         async with contextlib.AsyncExitStack() as stack:
             sources: dict[str, CameraSource] = {}
             for name in (*changes.added, *changes.changed):
@@ -237,7 +237,7 @@ class Reloader:
                 await asyncio.sleep(0)
             if self._closed:
                 raise ConnectionClosedError(f"the agent {agent.name} ends; nothing was changed")
-            _refuse_added(agent, changes)  # a program may have added a camera meanwhile
+            _refuse_name_clashes(agent, changes)  # a program may have added a camera meanwhile
             stack.pop_all()
             self.current = new
             work = self._apply(agent, (*changes.removed, *changes.changed), sources)
@@ -253,7 +253,7 @@ class Reloader:
             _, unfinished = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
             if unfinished:
                 raise ConfigurationError(
-                    f"fleet file {file}: the reading that began before has no end yet"
+                    f"fleet file {file}: an earlier reading of a fleet file is still running"
                 )
 
         old = self.current
@@ -279,7 +279,7 @@ class Reloader:
     async def _apply(
         self, agent: Agent, removed_names: tuple[str, ...], sources: dict[str, CameraSource]
     ) -> None:
-        """Remove cameras from the agent, then add those that may have the same addresses."""
+        """Remove cameras from the agent first, since added ones may have their addresses."""
         errors = await asyncio.gather(
             *(
                 self._remove_camera(agent, name, CHANGED if name in sources else REMOVED)
@@ -294,7 +294,7 @@ class Reloader:
             self.sources[name] = source
             if self._closed:
                 continue  # the agent ends, and closes the source
-            if name in agent.hosts:
+            if name in agent.shared_cameras:
                 logger.error("%s ! it is not shared: a program has added one meanwhile", name)
                 continue
             try:
@@ -303,10 +303,10 @@ class Reloader:
                 logger.exception("%s ! it is not shared", name)
             await asyncio.sleep(0)
 
-    async def _remove_camera(self, agent: Agent, name: str, why: str) -> None:
+    async def _remove_camera(self, agent: Agent, name: str, reason: str) -> None:
         source = self.sources.pop(name, None)
         try:
-            await agent.remove_camera(name, why)
+            await agent.remove_camera(name, reason)
         finally:
             if source is not None:
                 await source.emulator.aclose()
@@ -340,17 +340,17 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
     )
 
 
-def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
+def _refuse_name_clashes(agent: Agent, changes: FleetChanges) -> None:
     """Refuse cameras with the name of a camera that a program has added.
 
     Raises:
         ConfigurationError: a program has added a camera of the same name.
     """
     for name in changes.added:
-        if name in agent.hosts:
+        if name in agent.shared_cameras:
             raise ConfigurationError(
-                f"cameras.{name}: a program has added a camera of this name by Setup; it is to "
-                "stop it first"
+                f"cameras.{name}: a program has added a camera of this name (Setup): that "
+                "program must stop it first"
             )
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
     from smartcam.fleet._bus.keys import Keys
 
-MAX_WAITING_QUESTIONS = 16
+MAX_RUNNING_RELOADS = 16
 """Largest number of running reloads at one agent."""
 
 
@@ -27,7 +27,7 @@ class ReloadService:
 
     Args:
         agent: the agent, whose tasks do the work.
-        bus: the agent's end of the bus.
+        bus: the agent's connection to the bus.
         keys: keys of the fleet.
         reload: function that reads the file again and returns the changes.
     """
@@ -48,7 +48,7 @@ class ReloadService:
         self._handle.close()
 
     def _on_question(self, question: BusQuestion) -> None:
-        if self._running_count >= MAX_WAITING_QUESTIONS:
+        if self._running_count >= MAX_RUNNING_RELOADS:
             text = (
                 f"{self._agent.name}: {self._running_count} reloads are under way; nothing was done"
             )
@@ -86,8 +86,8 @@ async def reload_agents(
     for agent in agents:
         if agent not in outcomes:
             outcomes[agent] = ResponseTimeoutError(
-                f"reload: no answer of the agent {agent} within {timeout:.3g} s: it may be gone, "
-                "busy, or this program may not ask; whether it was done is unknown",
+                f"reload: no answer of the agent {agent} within {timeout:.3g} s: it may be gone "
+                "or busy, or this program is not allowed to ask; whether it was done is unknown",
                 waited=timeout,
             )
     return {name: outcomes[name] for name in sorted(outcomes)}

@@ -22,8 +22,8 @@ from smartcam.fleet._agent.reload import CameraSource, FleetChanges, Reloader, l
 from smartcam.fleet._agent.reload_service import ReloadService
 from smartcam.fleet._bus.address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._bus.keys import Keys
-from smartcam.fleet._bus.zenoh import ZenohEnd
-from smartcam.fleet._file.access import access_mistakes, effective_access
+from smartcam.fleet._bus.zenoh import ZenohConnection
+from smartcam.fleet._file.bus_access import access_mistakes, effective_access
 from smartcam.fleet._file.fleet_file import FleetFile, load_fleet, software_camera
 from smartcam.fleet._file.ros import RosSection
 from smartcam.fleet._frames.camera_frames import FrameSupply
@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._inside import CalibrationsByCamera
     from smartcam.emulator import WireCamera
-    from smartcam.fleet._agent.host import Host
     from smartcam.fleet._agent.outlet_service import StoredRequest
+    from smartcam.fleet._agent.shared_camera import SharedCamera
     from smartcam.fleet._bus.bus import Bus
-    from smartcam.fleet._file.access import Access
+    from smartcam.fleet._file.bus_access import Access
     from smartcam.fleet._file.fleet_file import FramesEntry, PlannedCamera
     from smartcam.fleet._ros import RosFleet
     from smartcam.frames import FrameSource
@@ -66,7 +66,7 @@ class FleetServer(Server):
 
     Args:
         file: path of a fleet file, or the contents of one.
-        bus: end of a bus to use instead of the bus in the file.
+        bus: connection to a bus to use instead of the bus in the file.
         folder: folder of the file's relative paths, if ``file`` is not a path itself.
         restore: whether application and run state of a camera are restored after a reconnect, for
             cameras whose entry does not set that. None: True if ``ros2`` in the file has nodes that
@@ -77,12 +77,12 @@ class FleetServer(Server):
         folder: folder of the file's relative paths.
         observers: observers of all sessions; add them before the server is started.
         outlet_states: function that returns the states of the outlets, by name.
-        stored_results: function that returns the answers of the stores of results, by outlet.
+        stored_results: function that answers a request for stored results, by outlet.
         calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Raises:
         ConfigurationError: the file is not valid.
-        MissingExtraError: PyYAML, or the bus' engine, is not installed.
+        MissingExtraError: PyYAML, or Zenoh, is not installed.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class FleetServer(Server):
         # with certificates, all connections must go through the router
         peer = self.file.ros2 is not None and self.file.certificates is None
         link = BusLink(listen, connect, self.file.certificates, peer)
-        self._bus = bus or ZenohEnd(link, self._engine_settings())
+        self._bus = bus or ZenohConnection(link, self._zenoh_settings())
         self._ros: RosFleet | None = None
         section = self.file.ros2
         self._restores = (section is not None and section.autostart) if restore is None else restore
@@ -127,7 +127,7 @@ class FleetServer(Server):
         self._ros_frames: dict[str, dict[str, Any]] = {}
         self._device_sources: dict[str, Callable[[], Awaitable[FrameSource]]] = {}
         self._agent: Agent | None = None
-        self._hosts: dict[str, Host] = {}
+        self._shared_cameras: dict[str, SharedCamera] = {}
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
 
@@ -162,11 +162,11 @@ class FleetServer(Server):
                 frames={name: source.frames for name, source in sources.items() if source.frames},
                 standby=file.standby,
                 observers=self.observers,
-                on_retired=self._retire,
+                on_retired=self._end_event_streams,
                 calibrations=self.calibrations,
             )
-            self._hosts = agent.hosts  # observers use the hosts from the first result on
-            stack.callback(self._forget_hosts)
+            self._shared_cameras = agent.shared_cameras  # observers need it from the start
+            stack.callback(self._forget_cameras)
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
             self._check_role()
@@ -183,12 +183,12 @@ class FleetServer(Server):
             stack.callback(outlets.close)
             stack.push_async_callback(self._leave_ros)
             await self._enter_ros()
-            if isinstance(self._bus, ZenohEnd):
+            if isinstance(self._bus, ZenohConnection):
                 ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in self._listen)
                 connection_filter = ConnectionFilter(ports, self._bus.connected_addresses)
                 connection_filter.open()
                 stack.callback(connection_filter.close)
-            if self.file.certificates is not None and isinstance(self._bus, ZenohEnd):
+            if self.file.certificates is not None and isinstance(self._bus, ZenohConnection):
                 watching = self._watch_certificates(self._bus, agent)
                 stack.push_async_callback(_cancel_and_wait, watching)
             self._agent, self._stack = agent, stack.pop_all()
@@ -208,21 +208,21 @@ class FleetServer(Server):
             calibrations = CalibrationsByCamera(folder)
         except OSError as exc:
             raise ConfigurationError(
-                f"calibrations: {folder}: expected a folder, or a place for one: {exc.strerror}"
+                f"calibrations: {folder}: expected a folder, or a path for one: {exc.strerror}"
             ) from exc
         stack.callback(calibrations.close)
         return calibrations
 
-    def _retire(self, why: ConfigurationError) -> None:
+    def _end_event_streams(self, reason: ConfigurationError) -> None:
         """End the streams of events with the reason why the agent has ended."""
         for stream in self._events:
-            stream.end(why)
+            stream.end(reason)
 
-    def _forget_hosts(self) -> None:
-        self._hosts = {}
+    def _forget_cameras(self) -> None:
+        self._shared_cameras = {}
 
-    def _engine_settings(self) -> dict[str, Any]:
-        """Return further settings of the engine."""
+    def _zenoh_settings(self) -> dict[str, Any]:
+        """Return further settings of Zenoh."""
         settings: dict[str, Any] = {}
         domain: int | None = None
         if self.file.ros2 is not None:
@@ -249,12 +249,12 @@ class FleetServer(Server):
         if self._access == "roles" and identity is not None and identity.role != AGENT:
             raise ConfigurationError(
                 f"fleet {self.file.fleet}: access: roles wants a certificate whose common name is "
-                f"{AGENT}, as smartcam fleet certificates makes them; that of "
+                f"{AGENT}, as the command `smartcam fleet certificates` makes them; that of "
                 f"{identity.folder} has {identity.role!r:.60}. access: any-certificate takes every "
                 "certificate of its authority"
             )
 
-    def _watch_certificates(self, bus: ZenohEnd, agent: Agent) -> asyncio.Task[None]:
+    def _watch_certificates(self, bus: ZenohConnection, agent: Agent) -> asyncio.Task[None]:
         """Start to watch the certificates, and use renewed ones."""
         watch = CertificateWatch(
             bus,
@@ -267,7 +267,7 @@ class FleetServer(Server):
         )
 
     async def _enter_ros(self) -> None:
-        if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
+        if self.file.ros2 is not None and isinstance(self._bus, ZenohConnection):
             self._ros = self._ros_fleet(self._bus)
             await self._ros.start()
 
@@ -291,7 +291,7 @@ class FleetServer(Server):
             else:
                 return
 
-    def _ros_fleet(self, bus: ZenohEnd) -> RosFleet:
+    def _ros_fleet(self, bus: ZenohConnection) -> RosFleet:
         with from_part("ros2", '"ros2:" in a fleet file needs'):
             from smartcam.fleet._ros import RosFleet
         file, own_name = self.file, self.file.agent_name
@@ -347,7 +347,7 @@ class FleetServer(Server):
 
         Raises:
             ConfigurationError: the file is wrong, or a change needs a restart; the text names the
-                place. Nothing was changed.
+                field. Nothing was changed.
             ConnectionClosedError: the agent is not started, or it ends.
 
         Cancellation: nothing is changed, or everything.
@@ -398,10 +398,10 @@ class FleetServer(Server):
             ConfigurationError: the agent does not have the camera.
             SmartCamError: the source cannot be opened.
         """
-        host = self._hosts.get(name)
-        if host is None:
+        camera = self._shared_cameras.get(name)
+        if camera is None:
             raise ConfigurationError(f"{name}: the agent does not have it")
-        return await host.frames.source()
+        return await camera.frames.source()
 
     async def _start_software_camera(
         self, planned: PlannedCamera, folder: Path, stack: contextlib.AsyncExitStack
@@ -419,7 +419,7 @@ class FleetServer(Server):
         observers = Observers(self.observers)
         reporter = PictureFinder(
             device.last_sent,
-            lambda: self._hosts[planned.name].camera.statistics().received,
+            lambda: self._shared_cameras[planned.name].client.statistics().received,
             lambda result, judged: observers.picture(result, judged.frame_with_drawings),
             max_kept=0,
         )
@@ -482,9 +482,9 @@ class FleetServer(Server):
         return self._agent
 
     @property
-    def reached(self) -> bool:
+    def is_connected(self) -> bool:
         """True if the agent is started, and connected to its router."""
-        return self._agent is not None and self._bus.reached
+        return self._agent is not None and self._bus.is_connected
 
     @property
     def bus_bytes(self) -> int:
@@ -512,9 +512,9 @@ class FleetServer(Server):
         return [] if self._ros is None else self._ros.names
 
     @property
-    def hosts(self) -> dict[str, Host]:
+    def shared_cameras(self) -> dict[str, SharedCamera]:
         """The agent's cameras by name, empty before the start."""
-        return self._hosts
+        return self._shared_cameras
 
     @property
     def address(self) -> FleetAddress:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from smartcam.fleet._agent.agent import Agent
-    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._agent.shared_camera import SharedCamera
     from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
     from smartcam.fleet._bus.keys import Keys
 
@@ -60,14 +60,14 @@ class ReportedCamera(NamedTuple):
 
     Attributes:
         summary: the camera's state.
-        epoch: number of the agent's start, or of its current hold of the camera.
-        following: number of the camera's next result.
+        epoch: number of the agent's start.
+        next_result: number of the camera's next result.
         standby: whether the agent is a standby agent.
     """
 
     summary: CameraSummary
     epoch: int
-    following: int
+    next_result: int
     standby: bool
 
 
@@ -77,7 +77,7 @@ class Summaries:
     Args:
         agent: the agent.
         keys: keys of the fleet.
-        bus: the agent's end of the bus.
+        bus: the agent's connection to the bus.
     """
 
     def __init__(self, agent: Agent, keys: Keys, bus: Bus) -> None:
@@ -87,7 +87,7 @@ class Summaries:
     def open(self) -> None:
         """Start to answer."""
         key = self._keys.summary(self._agent.name)
-        self._handle = self._bus.answer(key, self._on_question, patient=always)
+        self._handle = self._bus.answer(key, self._on_question, low_priority=always)
 
     def close(self) -> None:
         """Stop answering."""
@@ -102,11 +102,13 @@ class Summaries:
         """Answer in parts, so that a thousand cameras do not block the event loop."""
         key = self._keys.summary(self._agent.name)
         try:
-            hosts = [
-                host for host in self._agent.hosts.values() if patterns_overlap(pattern, host.name)
+            chosen = [
+                camera
+                for camera in self._agent.shared_cameras.values()
+                if patterns_overlap(pattern, camera.name)
             ]
-            for begin in range(0, len(hosts), CAMERAS_PER_TURN):
-                cameras = [_summary_row(host) for host in hosts[begin : begin + CAMERAS_PER_TURN]]
+            for begin in range(0, len(chosen), CAMERAS_PER_TURN):
+                cameras = [*map(_summary_row, chosen[begin : begin + CAMERAS_PER_TURN])]
                 summary = {
                     "agent": self._agent.name,
                     "standby": self._agent.is_standby,
@@ -118,17 +120,17 @@ class Summaries:
             question.close()
 
 
-def _summary_row(host: Host) -> list[Any]:
-    connected, status, application, reason = host.session_state()
+def _summary_row(camera: SharedCamera) -> list[Any]:
+    connected, status, application, reason = camera.session_state()
     return [
-        host.name,
+        camera.name,
         int(connected),
         status,
         application,
-        None if host.gate.holder is None else in_words(host.gate.holder),
+        None if camera.gate.holder is None else in_words(camera.gate.holder),
         reason,
-        host.epoch,
-        host.results.following,
+        camera.epoch,
+        camera.results.next_number,
     ]
 
 
@@ -138,7 +140,7 @@ async def ask_cameras(
     """Ask agents for their cameras; return the answers that come within ``timeout`` seconds.
 
     Args:
-        bus: an end of the bus.
+        bus: a connection to the bus.
         keys: keys of the fleet.
         agent: name of the agent to ask; ``*`` for all agents.
         pattern: pattern of the cameras' names.
@@ -169,7 +171,7 @@ def _read_cameras(payload: bytes) -> Iterable[ReportedCamera]:
 def best_by_name(
     cameras: Iterable[ReportedCamera], sort_key: Callable[[ReportedCamera], Any]
 ) -> dict[str, Any]:
-    """Return one summary for each name: of a camera's agents, that with the highest sort key."""
+    """Return one reported camera for each name: of its agents, that with the highest sort key."""
     reported: dict[str, ReportedCamera] = {}
     for camera in cameras:
         known = reported.get(camera.summary.camera)

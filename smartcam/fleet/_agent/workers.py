@@ -36,7 +36,7 @@ class TriggerWorker:
         self.task: asyncio.Task[None] = loop.create_task(self._run(), name="smartcam.fleet.worker")
 
     def start_work(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Give the worker one piece of work; a waiting worker begins at once if no task runs."""
+        """Give the worker one piece of work; it begins at once if a callback gives it."""
         self._work = work
         self._bell.ring()
 

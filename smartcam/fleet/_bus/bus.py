@@ -5,7 +5,7 @@ any number of chunks. Messages reach a subscriber in the order in which they wer
 never waits, and messages may be lost. So senders number the messages whose loss matters.
 
 :class:`MemoryBus` is the bus inside a process; :mod:`smartcam.fleet._bus.zenoh` has the bus between
-processes. An end of a bus belongs to one event loop, in which all its callbacks run.
+processes. A connection to a bus belongs to one event loop, in which all its callbacks run.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Data = bytes | bytearray | memoryview
 
 
 def never(_: str) -> bool:
-    """Return False: no question may wait until other messages were received."""
+    """Return False: no question has a low priority."""
     return False
 
 
 def always(_: str) -> bool:
-    """Return True: each question may wait until other messages were received."""
+    """Return True: each question has a low priority."""
     return True
 
 
@@ -45,7 +45,7 @@ class Handle(abc.ABC):
 
 
 class Publisher(Handle):
-    """An end that publishes under one key.
+    """A declaration that publishes under one key.
 
     Attributes:
         has_subscribers: whether the publisher has a known subscriber.
@@ -59,12 +59,12 @@ class Publisher(Handle):
 
 
 class Bus(abc.ABC):
-    """One end of a bus, of a program or an agent.
+    """A connection of a program or an agent to a bus.
 
     Attributes:
-        local: whether all ends of the bus are in this event loop. Then large data are passed on
-            without a copy, and all ends share one clock.
-        identity: identity in the certificate of this end; None without a certificate.
+        local: whether all connections to the bus are in this event loop. Then large data are passed
+            on without a copy, and all share one clock.
+        identity: identity in the certificate of this program or agent; None without a certificate.
     """
 
     local: bool = False
@@ -77,8 +77,8 @@ class Bus(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def reached(self) -> bool:
-        """True if this end is open, and no loss of the bus is known."""
+    def is_connected(self) -> bool:
+        """True if this connection is open, and no loss of the bus is known."""
 
     @abc.abstractmethod
     async def open(self, timeout: float) -> Self:
@@ -90,7 +90,7 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     async def close(self) -> None:
-        """Leave the bus, which ends all declarations of this end. Idempotent."""
+        """Leave the bus, which ends all its declarations. Idempotent."""
 
     @abc.abstractmethod
     def put(self, key: str, payload: bytes) -> None:
@@ -98,7 +98,7 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def put_part(self, key: str, head: bytes, data: Data) -> None:
-        """Send a part of large data after all other messages, with a head that describes the part.
+        """Send a part of large data at the lowest priority, with a head that describes the part.
 
         The part is dropped if there is no room in the queue. ``data`` must not be changed later.
         """
@@ -127,15 +127,15 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def subscribe(
-        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, low_priority: bool = False
     ) -> Handle:
         """Call ``on_message(key, payload)`` for messages under ``pattern``.
 
         Args:
             pattern: pattern of the keys.
             on_message: the callback.
-            patient: whether messages wait until all messages of other subscriptions were received.
-                The waiting messages have a bound of their own.
+            low_priority: whether messages wait until all messages of other subscriptions were
+                handled. The waiting messages have a bound of their own.
         """
 
     @abc.abstractmethod
@@ -144,15 +144,15 @@ class Bus(abc.ABC):
         pattern: str,
         answer: Callable[[BusQuestion], None],
         *,
-        patient: Callable[[str], bool] = never,
+        low_priority: Callable[[str], bool] = never,
     ) -> Handle:
         """Call ``answer(question)`` for questions under ``pattern``.
 
         Args:
             pattern: pattern of the keys.
             answer: the callback.
-            patient: function that returns whether a question under a key waits until other messages
-                were received, as in :meth:`subscribe`. It may be called in any thread.
+            low_priority: function that returns whether a question under a key waits until other
+                messages were received, as in :meth:`subscribe`. It may be called in any thread.
         """
 
     @abc.abstractmethod
@@ -160,16 +160,16 @@ class Bus(abc.ABC):
         """Return the answers to a question that come within ``timeout`` seconds, by their keys."""
 
     @abc.abstractmethod
-    def be_present(self, key: str) -> Handle:
-        """Announce this end's presence until the handle is closed."""
+    def announce(self, key: str) -> Handle:
+        """Announce a presence under a key until the handle is closed."""
 
     @abc.abstractmethod
-    async def present(self, pattern: str, timeout: float) -> list[str]:
-        """Return the keys of the present ends that become known within ``timeout`` seconds."""
+    async def present_keys(self, pattern: str, timeout: float) -> list[str]:
+        """Return the keys of all presences that become known within ``timeout`` seconds."""
 
     @abc.abstractmethod
     def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
-        """Call ``on_presence(key, present)`` for all ends that are present, and at each change."""
+        """Call ``on_presence(key, present)`` for all presences, and at each change."""
 
 
 class BusQuestion(abc.ABC):
@@ -201,16 +201,16 @@ class BusQuestion(abc.ABC):
 class MemoryBus:
     """A bus inside this process, for agents and programs in one event loop.
 
-    Each agent and program gets its own ``MemoryBus().end()``. Messages are delivered by the event
-    loop, in order.
+    Each agent and program gets its own ``MemoryBus().new_connection()``. Messages are delivered by
+    the event loop, in order.
     """
 
     def __init__(self) -> None:
-        self.ends: list[MemoryEnd] = []
+        self.connections: list[MemoryConnection] = []
 
-    def end(self) -> MemoryEnd:
-        """Return an end that is not open yet."""
-        return MemoryEnd(self)
+    def new_connection(self) -> MemoryConnection:
+        """Return a connection that is not open yet."""
+        return MemoryConnection(self)
 
 
 class _Patterned(Protocol):
@@ -221,7 +221,7 @@ P = TypeVar("P", bound=_Patterned)
 
 
 class _PatternTable(Generic[P]):
-    """The declarations of one kind at an end, stored by pattern to find those of a key fast."""
+    """Declarations of one kind of a connection, by pattern, to find those of a key fast."""
 
     def __init__(self) -> None:
         self._exact_keys: dict[str, dict[P, None]] = {}
@@ -262,7 +262,7 @@ class _PatternTable(Generic[P]):
 
 
 class _MemoryDeclaration(Handle):
-    """A declaration of an end under a pattern."""
+    """A declaration of a connection under a pattern."""
 
     def __init__(
         self, table: _PatternTable[_MemoryDeclaration], pattern: str, call: Callable[..., None]
@@ -289,8 +289,8 @@ class _MemoryDeclaration(Handle):
             self._on_close()
 
 
-class MemoryEnd(Bus):
-    """One end of a :class:`MemoryBus`."""
+class MemoryConnection(Bus):
+    """A connection to a :class:`MemoryBus`."""
 
     local = True
 
@@ -307,11 +307,11 @@ class MemoryEnd(Bus):
 
     @property
     def attached(self) -> bool:
-        """True if this end is on the bus now: opened, and not detached."""
-        return self in self._bus.ends
+        """True if this connection is on the bus now: opened, and not detached."""
+        return self in self._bus.connections
 
     @property
-    def reached(self) -> bool:
+    def is_connected(self) -> bool:
         return self.attached
 
     async def open(self, timeout: float) -> Self:
@@ -334,25 +334,25 @@ class MemoryEnd(Bus):
     def attach(self) -> None:
         """Join the bus, or join it again."""
         if not self.attached:
-            self._bus.ends.append(self)
+            self._bus.connections.append(self)
             self._report_presences(True)
             self._check_subscribers("**")
 
     def detach(self) -> None:
-        """Leave the bus as if a cable broke: this end and the others lose each other."""
+        """Leave the bus as if a cable broke: this connection and the others lose each other."""
         if self.attached:
             self._report_presences(False)
-            self._bus.ends.remove(self)
+            self._bus.connections.remove(self)
             self._check_subscribers("**")
 
     def put(self, key: str, payload: bytes) -> None:
-        for end in self._connected_ends():
-            for subscription in end.subscriptions.matching(key):
+        for connection in self._connections():
+            for subscription in connection.subscriptions.matching(key):
                 self._loop.call_soon(_call, subscription, key, payload)
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
-        for end in self._connected_ends():
-            for subscription in end.part_subscriptions.matching(key):
+        for connection in self._connections():
+            for subscription in connection.part_subscriptions.matching(key):
                 self._loop.call_soon(_call, subscription, key, head, data)
 
     def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
@@ -368,7 +368,7 @@ class MemoryEnd(Bus):
         return _MemoryPublisher(self, self.publishers, key, on_subscribers)
 
     def subscribe(
-        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, low_priority: bool = False
     ) -> Handle:
         declaration = _MemoryDeclaration(self.subscriptions, pattern, on_message)
         self._check_subscribers(pattern)
@@ -379,15 +379,15 @@ class MemoryEnd(Bus):
         pattern: str,
         answer: Callable[[BusQuestion], None],
         *,
-        patient: Callable[[str], bool] = never,
+        low_priority: Callable[[str], bool] = never,
     ) -> Handle:
         return _MemoryDeclaration(self.answerers, pattern, answer)
 
     async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
         questions = [
             (answerer, _MemoryQuestion(pattern, payload))
-            for end in self._connected_ends()
-            for answerer in end.answerers.matching(pattern)
+            for connection in self._connections()
+            for answerer in connection.answerers.matching(pattern)
         ]
         for answerer, question in questions:
             self._loop.call_soon(_call, answerer, question)
@@ -397,81 +397,81 @@ class MemoryEnd(Bus):
                     await question.done.wait()
         return [answer for _, question in questions for answer in question.answers]
 
-    def be_present(self, key: str) -> Handle:
+    def announce(self, key: str) -> Handle:
         declaration = _MemoryDeclaration(self.presences, key, _do_nothing)
         self._report_presence(key, True)
         return declaration.on_close(lambda: self._report_presence(key, False))
 
-    async def present(self, pattern: str, timeout: float) -> list[str]:
+    async def present_keys(self, pattern: str, timeout: float) -> list[str]:
         return [
             token.pattern
-            for end in self._connected_ends()
-            for token in end.presences.matching(pattern)
+            for connection in self._connections()
+            for token in connection.presences.matching(pattern)
         ]
 
     def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
         declaration = _MemoryDeclaration(self.watchers, pattern, on_presence)
-        for end in self._connected_ends():
-            for token in end.presences.matching(pattern):
+        for connection in self._connections():
+            for token in connection.presences.matching(pattern):
                 self._loop.call_soon(_call, declaration, token.pattern, True)
         return declaration
 
     # ------------------------------------------------------------------ presence and subscribers
 
-    def _connected_ends(self) -> list[MemoryEnd]:
-        """Return all ends on the bus, including this one; none if this end is not on the bus."""
-        return list(self._bus.ends) if self.attached else []
+    def _connections(self) -> list[MemoryConnection]:
+        """Return all connections to the bus, with this one; none if this one is not on the bus."""
+        return list(self._bus.connections) if self.attached else []
 
     def _report_presences(self, present: bool) -> None:
-        """Report this end's presences to all ends, and theirs to this one."""
-        for end in self._connected_ends():
-            for token in end.presences:
-                if end is not self:
+        """Report this connection's presences to all others, and theirs to this one."""
+        for connection in self._connections():
+            for token in connection.presences:
+                if connection is not self:
                     for watch in self.watchers.matching(token.pattern):
                         self._loop.call_soon(_call, watch, token.pattern, present)
         for token in self.presences:
             self._report_presence(token.pattern, present)
 
     def _report_presence(self, key: str, present: bool) -> None:
-        for end in self._connected_ends():
-            for watcher in end.watchers.matching(key):
+        for connection in self._connections():
+            for watcher in connection.watchers.matching(key):
                 self._loop.call_soon(_call, watcher, key, present)
 
     def _check_subscribers(self, pattern: str) -> None:
         """Make the publishers under a pattern check for subscribers."""
-        for end in self._bus.ends:
-            for publisher in end.publishers.matching(pattern):
+        for connection in self._bus.connections:
+            for publisher in connection.publishers.matching(pattern):
                 publisher.check_subscribers()
 
     def has_subscribers(self, key: str) -> bool:
-        """Return True if this end's messages under ``key`` have a subscriber."""
-        return any(end.subscriptions.matching(key) for end in self._connected_ends())
+        """Return True if this connection's messages under ``key`` have a subscriber."""
+        return any(connection.subscriptions.matching(key) for connection in self._connections())
 
 
 class _MemoryPublisher(Publisher):
     def __init__(
         self,
-        end: MemoryEnd,
+        connection: MemoryConnection,
         table: _PatternTable[_MemoryPublisher],
         key: str,
         on_subscribers: Callable[[bool], None] | None,
     ) -> None:
         self.pattern = key
-        self._end, self._table = end, table
+        self._connection, self._table = connection, table
         self._on_subscribers = on_subscribers
         table.add(self)
         self.check_subscribers()
 
     def check_subscribers(self) -> None:
         """Check for subscribers, and report a change."""
-        has_subscribers = self._end.has_subscribers(self.pattern)
+        has_subscribers = self._connection.has_subscribers(self.pattern)
         if has_subscribers != self.has_subscribers:
             self.has_subscribers = has_subscribers
             if self._on_subscribers is not None:
                 self._on_subscribers(has_subscribers)
 
     def put(self, payload: bytes) -> None:
-        self._end.put(self.pattern, payload)
+        self._connection.put(self.pattern, payload)
 
     def close(self) -> None:
         self._table.remove(self)

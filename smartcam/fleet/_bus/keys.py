@@ -17,9 +17,9 @@ COMMANDS = frozenset(
     {
         "trigger",
         "switch_application",
-        "ensure",
-        "enter",
-        "leave",
+        "ensure_application",
+        "enter_application",
+        "leave_application",
         "start",
         "stop",
         "reset_errors",
@@ -38,9 +38,9 @@ COMMANDS = frozenset(
 )
 """Calls that change something, or reserve the camera; all other calls are questions."""
 
-RESERVED_COMMANDS = COMMANDS - {"release", "leave"}
-"""Commands that name the reservation in whose block they are called. They fail if the reservation
-is lost."""
+COMMANDS_WITH_RESERVATION = COMMANDS - {"release", "leave_application"}
+"""Commands that carry the number of the reservation in whose block they are called. They fail if
+the reservation is lost."""
 
 
 @lru_cache(maxsize=4096)
@@ -75,7 +75,7 @@ def _chunks_overlap(one: str, other: str) -> bool:
 
 
 def _chunk_matches(pattern: str, chunk: str) -> bool:
-    """Return True if a chunk matches a pattern in the engine's form, such as ``cam$*``."""
+    """Return True if a chunk matches a pattern in Zenoh's form, such as ``cam$*``."""
     first, *parts = pattern.split("$*")
     if not parts or not chunk.startswith(first):
         return False
@@ -108,7 +108,7 @@ class Keys:
         return f"{self.root}/presence/agent/{agent}"
 
     def start(self, agent: str, start: str) -> str:
-        """Return the key of one start of an agent, which shows two agents with the same name."""
+        """Return the key of one start of an agent; two such keys show two agents of one name."""
         return f"{self.root}/presence/start/{agent}/{start}"
 
     def camera(self, agent: str, camera: str) -> str:
@@ -156,7 +156,7 @@ class Keys:
         return f"{self.root}/summary/{agent}"
 
     def outlets(self, agent: str, name: str) -> str:
-        """Return the key of questions about an agent's outlets: accounts, results; in JSON."""
+        """Return the key of questions about an agent's outlets: counts, results; in JSON."""
         return f"{self.root}/outlets/{agent}/{name}"
 
     def listing(self, camera: str) -> str:
@@ -172,11 +172,11 @@ class Keys:
         return f"{self.root}/service/{camera}/{name}"
 
     def thesis(self, name: str) -> str:
-        """Return the key of a service of the bus interface that the thesis defines."""
+        """Return the key of a service of the thesis with which smartcam began."""
         return f"{self.root}/thesis/{name}"
 
     def thesis_topic(self, name: str) -> str:
-        """Return the key of a topic whose name a request of that interface gives."""
+        """Return the key of a topic that a request to these services names."""
         return f"{self.root}/thesis/topic/{name}"
 
     def tail(self, key: str, kind: str) -> list[str]:

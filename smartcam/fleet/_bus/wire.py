@@ -1,10 +1,9 @@
-"""Encode and decode the messages between smartcam's own ends of a fleet.
+"""Encode and decode the messages between agents and programs that use smartcam.
 
 A message is a JSON object followed by byte strings: calls, replies, descriptions. Results are sent
-as runs: containers of one camera that came together, with consecutive numbers. The messages of each
-trigger are binary, since JSON would cost more than all the rest: the call (:class:`TriggerOrder`),
-the reply (:class:`TriggerReply`), and statuses. Everything is little endian. ``docs/bus.md`` has
-the layouts.
+in groups: consecutive results of one application of a camera. The messages of each trigger are
+binary, since JSON would cost more than all the rest: the call (:class:`TriggerCall`), the reply
+(:class:`TriggerReply`), and statuses. Everything is little endian. ``docs/bus.md`` has the layouts.
 """
 
 from __future__ import annotations
@@ -124,18 +123,18 @@ def decode(payload: bytes, label: str) -> BusMessage:
 # ---------------------------------------------------------------------- results
 
 CURRENT, LATE = 1, 2
-"""Flags of a run. CURRENT: the results are not known to belong to an older trigger. LATE: the
+"""Flags of a group. CURRENT: the results are not known to belong to an older trigger. LATE: the
 results belong to a trigger that had timed out before they came."""
 
-_RUN = struct.Struct("<QIqIBxxxIIddddI")
-_BATCH = struct.Struct("<4sQQI")
-_BATCH_MAGIC = b"scr1"
+_GROUP = struct.Struct("<QIqIBxxxIIddddI")
+_GROUPS_HEAD = struct.Struct("<4sQQI")
+_GROUPS_MAGIC = b"scr1"
 _NO_NUMBER = math.nan
 _MAX_TIMESTAMP = 253_402_300_800.0  # the year 10,000; datetime ends before it
 
 
-class ResultRun(NamedTuple):
-    """Containers of one application that came together.
+class ResultGroup(NamedTuple):
+    """Consecutive result containers of one application of a camera, which came together.
 
     Attributes:
         number: the agent's number of the first container; the other containers have the next
@@ -169,7 +168,7 @@ class ResultRun(NamedTuple):
 
     @property
     def next(self) -> int:
-        """The number that follows the run's last number."""
+        """The number that follows the group's last number."""
         return self.number + len(self.payloads)
 
     @property
@@ -188,17 +187,17 @@ class ResultRun(NamedTuple):
         at = self.triggered_at
         return None if math.isnan(at) else datetime.fromtimestamp(at, UTC)
 
-    def since(self, number: int) -> ResultRun:
-        """Return the part of the run with ``number`` and later numbers."""
+    def since(self, number: int) -> ResultGroup:
+        """Return the part of the group with ``number`` and later numbers."""
         if number <= self.number:
             return self
         return self._replace(number=number, payloads=self.payloads[number - self.number :])
 
     def encode(self) -> bytes:
-        """Return the run as bytes."""
+        """Return the group as bytes."""
         payloads = self.payloads
         count = len(payloads)
-        head = _RUN.pack(
+        head = _GROUP.pack(
             self.number,
             count,
             self.application,
@@ -216,57 +215,57 @@ class ResultRun(NamedTuple):
         return b"".join((head, lengths, *payloads, self.cells))
 
 
-def encode_runs(epoch: int, following: int, runs: Sequence[bytes]) -> bytes:
-    """Return runs as one message; ``following`` is the agent's next number."""
-    return b"".join((_BATCH.pack(_BATCH_MAGIC, epoch, following, len(runs)), *runs))
+def encode_groups(epoch: int, next_number: int, groups: Sequence[bytes]) -> bytes:
+    """Return groups as one message; ``next_number`` is the agent's next number."""
+    return b"".join((_GROUPS_HEAD.pack(_GROUPS_MAGIC, epoch, next_number, len(groups)), *groups))
 
 
-class Batch(NamedTuple):
-    """The agent's epoch, its next number, and runs in order."""
+class ResultsMessage(NamedTuple):
+    """The agent's epoch, its next number, and groups in order."""
 
     epoch: int
-    following: int
-    runs: list[ResultRun]
+    next_number: int
+    groups: list[ResultGroup]
 
 
-def decode_runs(payload: bytes, label: str) -> Batch:
-    """Return the runs in ``payload``.
+def decode_groups(payload: bytes, label: str) -> ResultsMessage:
+    """Return the groups in ``payload``.
 
     Raises:
         RemoteProtocolError: the payload is broken; ``label`` names it.
     """
     try:
-        magic, epoch, following, count = _BATCH.unpack_from(payload)
-        if magic != _BATCH_MAGIC:
-            raise ValueError(f"it begins with {magic!r}, not {_BATCH_MAGIC!r}")
-        runs: list[ResultRun] = []
-        position = _BATCH.size
+        magic, epoch, next_number, count = _GROUPS_HEAD.unpack_from(payload)
+        if magic != _GROUPS_MAGIC:
+            raise ValueError(f"it begins with {magic!r}, not {_GROUPS_MAGIC!r}")
+        groups: list[ResultGroup] = []
+        position = _GROUPS_HEAD.size
         for _ in range(count):
-            run, position = _decode_run(payload, position)
-            runs.append(run)
+            group, position = _decode_group(payload, position)
+            groups.append(group)
         if position != len(payload):
             raise ValueError(f"{len(payload) - position} bytes are left over")
     except (ValueError, struct.error, OverflowError) as exc:
         raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
-    batch: Batch = new_tuple(Batch, (epoch, following, runs))
-    return batch
+    results: ResultsMessage = new_tuple(ResultsMessage, (epoch, next_number, groups))
+    return results
 
 
-def decode_own_run(data: bytes) -> ResultRun:
-    """Decode a run of this process, from :meth:`ResultRun.encode`."""
-    return _decode_run(data, 0)[0]
+def decode_local_group(data: bytes) -> ResultGroup:
+    """Return a group that :meth:`ResultGroup.encode` has encoded in this process."""
+    return _decode_group(data, 0)[0]
 
 
-def _decode_run(payload: bytes, position: int) -> tuple[ResultRun, int]:
+def _decode_group(payload: bytes, position: int) -> tuple[ResultGroup, int]:
     number, count, application, endian, flags, owner, call, clock, at, trigger, latency, cells = (
-        _RUN.unpack_from(payload, position)
+        _GROUP.unpack_from(payload, position)
     )
-    position += _RUN.size
+    position += _GROUP.size
     has_valid_times = 0 <= at < _MAX_TIMESTAMP and (
         0 <= trigger < _MAX_TIMESTAMP or math.isnan(trigger)
     )
     if not 1 <= count <= (len(payload) - position) // 4 or not has_valid_times:
-        raise ValueError(f"a run of {count} containers at {at} does not fit")
+        raise ValueError(f"a group of {count} containers at {at} does not fit")
     lengths = struct.unpack_from(f"<{count}I", payload, position)
     position += 4 * count
     if sum(lengths) + cells > len(payload) - position:
@@ -276,23 +275,23 @@ def _decode_run(payload: bytes, position: int) -> tuple[ResultRun, int]:
         payloads.append(payload[position : position + length])
         position += length
     end, head = position + cells, (number, application, endian, flags, owner, call, clock, at)
-    run: ResultRun = new_tuple(
-        ResultRun, (*head, trigger, latency, payloads, payload[position:end])
+    group: ResultGroup = new_tuple(
+        ResultGroup, (*head, trigger, latency, payloads, payload[position:end])
     )
-    return run, end
+    return group, end
 
 
 # ---------------------------------------------------------------------- triggers
 
-_ORDER = struct.Struct("<4sQQddqqIBB")
-_ORDER_MAGIC = b"sct1"
+_TRIGGER = struct.Struct("<4sQQddqqIBB")
+_TRIGGER_MAGIC = b"sct1"
 _WAIT, _BY_APPLICATION, _INPUT, _RESERVED = 1, 2, 4, 8
 _RESERVATION = struct.Struct("<Q")
-_OUTCOME = struct.Struct("<4sQQdQI")
-_OUTCOME_MAGIC = b"sco1"
+_REPLY = struct.Struct("<4sQQdQI")
+_REPLY_MAGIC = b"sco1"
 
 
-class TriggerOrder(NamedTuple):
+class TriggerCall(NamedTuple):
     """A call for a trigger.
 
     Attributes:
@@ -306,7 +305,7 @@ class TriggerOrder(NamedTuple):
         wait: whether to wait until the camera takes the trigger.
         by_application: whether each application has its own interpretation.
         data: input of the trigger; None for none.
-        layouts: layouts that have the sequence number of a result; None for none.
+        layouts: layouts with a field for the sequence number of a result; None for none.
         reservation: number of the call that reserved the camera; None outside of a reservation.
     """
 
@@ -324,21 +323,21 @@ class TriggerOrder(NamedTuple):
     reservation: int | None = None
 
 
-def encode_order(program: str, order: TriggerOrder) -> bytes:
+def encode_trigger(program: str, call: TriggerCall) -> bytes:
     """Return a call of ``program`` as bytes; a call with layouts becomes a JSON message."""
     number, epoch, deadline, timeout, application, expected, results, wait, by_application, data = (
-        order[:10]
+        call[:10]
     )
-    layouts, reservation = order.layouts, order.reservation
+    layouts, reservation = call.layouts, call.reservation
     flags = wait * _WAIT | by_application * _BY_APPLICATION | (data is not None) * _INPUT
     if reservation is not None:
         flags |= _RESERVED
     name = program.encode()
     if layouts is None:
         try:
-            fence = b"" if reservation is None else _RESERVATION.pack(reservation)
-            head = _ORDER.pack(
-                _ORDER_MAGIC,
+            reservation_bytes = b"" if reservation is None else _RESERVATION.pack(reservation)
+            head = _TRIGGER.pack(
+                _TRIGGER_MAGIC,
                 number,
                 epoch,
                 deadline,
@@ -352,7 +351,7 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
         except struct.error:
             pass  # the agent reports wrong numbers
         else:
-            return b"".join((head, name, fence, data or b""))
+            return b"".join((head, name, reservation_bytes, data or b""))
     fields: dict[str, Any] = {
         "program": program,
         "call": number,
@@ -374,20 +373,20 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
     return encode(fields, () if data is None else (data,))
 
 
-def decode_order(payload: bytes, label: str) -> tuple[str, TriggerOrder] | None:
+def decode_trigger(payload: bytes, label: str) -> tuple[str, TriggerCall] | None:
     """Return the program and its call in ``payload``; None if it is a JSON message.
 
     Raises:
         RemoteProtocolError: the payload is broken; ``label`` names it.
     """
-    if payload[:4] != _ORDER_MAGIC:
+    if payload[:4] != _TRIGGER_MAGIC:
         return None
     try:
         (_, number, epoch, deadline, timeout, application, expected, results, flags, size) = (
-            _ORDER.unpack_from(payload)
+            _TRIGGER.unpack_from(payload)
         )
-        end = _ORDER.size + size
-        program, reservation = str(payload[_ORDER.size : end], "utf-8"), None
+        end = _TRIGGER.size + size
+        program, reservation = str(payload[_TRIGGER.size : end], "utf-8"), None
         if flags & _RESERVED:
             (reservation,) = _RESERVATION.unpack_from(payload, end)
             end += _RESERVATION.size
@@ -395,8 +394,8 @@ def decode_order(payload: bytes, label: str) -> tuple[str, TriggerOrder] | None:
             raise ValueError(f"{len(payload)} bytes came, {end} were expected")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
-    order: TriggerOrder = new_tuple(
-        TriggerOrder,
+    call: TriggerCall = new_tuple(
+        TriggerCall,
         (
             number,
             epoch,
@@ -412,7 +411,7 @@ def decode_order(payload: bytes, label: str) -> tuple[str, TriggerOrder] | None:
             reservation,
         ),
     )
-    return program, order
+    return program, call
 
 
 class TriggerReply(NamedTuple):
@@ -422,40 +421,40 @@ class TriggerReply(NamedTuple):
         call: the number of the call.
         epoch: number of the agent's start.
         clock: time of the agent's clock, seconds.
-        states: number of the agent's next event.
-        new_states: events that were not sent before.
-        batch: results of the trigger, and the agent's next number.
+        next_state: number of the agent's next event.
+        new_states: events that the agent has not published yet.
+        results: results of the trigger, and the agent's next number.
     """
 
     call: int
     epoch: int
     clock: float
-    states: int
+    next_state: int
     new_states: list[bytes]
-    batch: Batch
+    results: ResultsMessage
 
 
-def encode_outcome(
-    call: int, epoch: int, clock: float, states: int, new_states: Sequence[bytes], runs: bytes
+def encode_trigger_reply(
+    call: int, epoch: int, clock: float, states: int, new_states: Sequence[bytes], groups: bytes
 ) -> bytes:
-    """Return a reply as bytes; ``runs`` is in the form of :func:`encode_runs`."""
+    """Return a reply as bytes; ``groups`` is in the form of :func:`encode_groups`."""
     count = len(new_states)
-    head = _OUTCOME.pack(_OUTCOME_MAGIC, call, epoch, clock, states, count)
+    head = _REPLY.pack(_REPLY_MAGIC, call, epoch, clock, states, count)
     lengths = struct.pack(f"<{count}I", *map(len, new_states))
-    return b"".join((head, lengths, *new_states, runs))
+    return b"".join((head, lengths, *new_states, groups))
 
 
-def decode_outcome(payload: bytes, label: str) -> TriggerReply | None:
+def decode_trigger_reply(payload: bytes, label: str) -> TriggerReply | None:
     """Return the reply to a trigger in ``payload``; None if it is a JSON message.
 
     Raises:
         RemoteProtocolError: the payload is broken; ``label`` names it.
     """
-    if payload[:4] != _OUTCOME_MAGIC:
+    if payload[:4] != _REPLY_MAGIC:
         return None
     try:
-        _, call, epoch, clock, states, count = _OUTCOME.unpack_from(payload)
-        position = _OUTCOME.size
+        _, call, epoch, clock, states, count = _REPLY.unpack_from(payload)
+        position = _REPLY.size
         lengths = struct.unpack_from(f"<{count}I", payload, position)
         position += 4 * count
         new_states: list[bytes] = []
@@ -466,8 +465,8 @@ def decode_outcome(payload: bytes, label: str) -> TriggerReply | None:
             raise ValueError(f"{position} bytes were announced, {len(payload)} came")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
-    batch = decode_runs(payload[position:], label)
-    fields = (call, epoch, clock, states, new_states, batch)
+    results = decode_groups(payload[position:], label)
+    fields = (call, epoch, clock, states, new_states, results)
     reply: TriggerReply = new_tuple(TriggerReply, fields)
     return reply
 
@@ -477,6 +476,6 @@ def timestamp(at: datetime | None) -> float:
     return _NO_NUMBER if at is None else at.timestamp()
 
 
-def encode_each(runs: Iterable[ResultRun]) -> list[bytes]:
-    """Return the bytes of each run."""
-    return [run.encode() for run in runs]
+def encode_each(groups: Iterable[ResultGroup]) -> list[bytes]:
+    """Return the bytes of each group."""
+    return [group.encode() for group in groups]

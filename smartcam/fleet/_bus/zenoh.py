@@ -1,7 +1,7 @@
 """Define the bus between processes and hosts, over Zenoh, which calls back in its own threads.
 
 Received messages are put into one queue; many messages at once wake the event loop only once. To
-send a message, Zenoh (the *engine*) waits at most a millisecond for room in its buffers, and then
+send a message, Zenoh waits at most a millisecond for room in its buffers, and then
 drops the message. Receivers notice lost results, states and parts of frames by their numbers. Calls
 and replies are not lost: if sending one took so long, a thread sends it again, and waits for room.
 """
@@ -47,14 +47,14 @@ MAX_DIRECT_BYTES = 1 << 16
 """Largest size, bytes, of a message that the event loop sends; a thread sends larger messages."""
 
 LINK = re.compile(r"\w+/(?P<host>[0-9.]+|\[[^]]+\]):(?P<port>[0-9]+)")
-"""Address of the other end of a connection, in the engine's form."""
+"""Address of the other side of a link, in Zenoh's form."""
 
 BURST_PERIOD = 0.01
 """Period, seconds, in which only :data:`MAX_EXPRESS_MESSAGES` messages are sent without delay."""
 
 MAX_EXPRESS_MESSAGES = 8
 """Number of messages in :data:`BURST_PERIOD` that are each sent as a packet of its own, without
-delay. The engine has room for 16 such packets. Further messages share packets, which are sent up to
+delay. Zenoh has room for 16 such packets. Further messages share packets, which are sent up to
 a millisecond later."""
 
 MAX_FREQUENT_KEYS = 64
@@ -70,12 +70,12 @@ SENDER_THREADS = 8
 read its messages blocks one thread."""
 
 
-class ZenohEnd(ZenohSession, Bus):
-    """One end of a bus over Zenoh.
+class ZenohConnection(ZenohSession, Bus):
+    """A connection to a bus over Zenoh.
 
     Args:
-        link: endpoints and certificates by which this end joins the bus.
-        more: further settings of the engine, by their paths.
+        link: endpoints and certificates by which it joins the bus.
+        more: further settings of Zenoh, by their paths.
     """
 
     def __init__(self, link: BusLink, more: Mapping[str, Any] | None = None) -> None:
@@ -120,8 +120,8 @@ class ZenohEnd(ZenohSession, Bus):
         """Connect to the bus.
 
         Raises:
-            ConnectFailedError: this end cannot listen, or reach another end, within ``timeout``
-                seconds; the text names an error of a certificate.
+            ConnectFailedError: the bus cannot listen, or reach another participant, within
+                ``timeout`` seconds; the text names an error of a certificate.
             ConfigurationError: the certificates are not valid.
         """
         folder = self._link.certificates
@@ -136,11 +136,11 @@ class ZenohEnd(ZenohSession, Bus):
         except ConnectFailedError as exc:
             if self._link.listen:
                 raise
-            if why := await self._find_handshake_error(Path(folder), deadline - loop.time()):
-                raise self._connect_error(why) from exc
+            if reason := await self._find_handshake_error(Path(folder), deadline - loop.time()):
+                raise self._connect_error(reason) from exc
             raise
         self._certificate_task = loop.create_task(
-            self._watch_certificates(), name="smartcam.fleet.look"
+            self._watch_certificates(), name="smartcam.fleet.check_certificates"
         )
         return self
 
@@ -155,9 +155,9 @@ class ZenohEnd(ZenohSession, Bus):
 
     async def close(self) -> None:
         """Leave the bus, which ends all declarations. Idempotent."""
-        looking, self._certificate_task = self._certificate_task, None
-        if looking is not None:
-            looking.cancel()
+        task, self._certificate_task = self._certificate_task, None
+        if task is not None:
+            task.cancel()
         self._frequent_keys.clear()
         await super().close()
 
@@ -174,18 +174,18 @@ class ZenohEnd(ZenohSession, Bus):
             raise self._connect_error(identity.expired_text)
         warning = identity.digest, identity.urgency
         if identity.urgency and warning != self._warned:
-            logger.warning("%s ! %s", self._link.place, identity.warning)
+            logger.warning("%s ! %s", self._link.endpoints_text, identity.warning)
         self._warned, self.identity = warning, identity
         return identity
 
     async def _watch_certificates(self) -> None:
-        """Check the certificates again and again, until this end is closed."""
+        """Check the certificates again and again, until it is closed."""
         while self.identity is not None:
             await asyncio.sleep(self.identity.next_check_delay)
             try:
                 await self.check_certificates()
             except SmartCamError as exc:
-                logger.error("%s ! %s", self._link.place, exc)  # noqa: TRY400 - the text says it
+                logger.error("%s ! %s", self._link.endpoints_text, exc)  # noqa: TRY400 - the text says it
 
     async def _find_handshake_error(self, folder: Path, timeout: float) -> str:
         """Return the first error of a handshake with an endpoint; empty if there is none."""
@@ -200,15 +200,15 @@ class ZenohEnd(ZenohSession, Bus):
         return ""
 
     @property
-    def reached(self) -> bool:
+    def is_connected(self) -> bool:
         session = self._session
         if session is None:
             return False
-        # the engine notices a lost link before it notices that the router is gone
+        # Zenoh notices a lost link before it notices that the router is gone
         return bool(self._link.mode != "client" or session.info.links())
 
     def connected_addresses(self) -> set[tuple[str, int]] | None:
-        """Return the addresses of connected ends; None while they are not known."""
+        """Return the addresses of connected participants; None while they are not known."""
         if self._session is None:
             return None
         addresses = (parse_link_address(str(link.dst)) for link in self._session.info.links())
@@ -228,7 +228,7 @@ class ZenohEnd(ZenohSession, Bus):
         if started_at - self._burst_began_at > BURST_PERIOD:
             self._burst_began_at, self._burst_count = started_at, 0
         self._burst_count += 1
-        # a few messages are sent without delay; the engine has no room for many of these
+        # a few messages are sent without delay; Zenoh has no room for many of these
         express = self._burst_count <= MAX_EXPRESS_MESSAGES
         needs_thread = len(payload) > MAX_DIRECT_BYTES or self._uncertain_count
         if needs_thread or (
@@ -255,9 +255,9 @@ class ZenohEnd(ZenohSession, Bus):
         return "" if self._link.mode == "client" else key
 
     def _publisher_of(self, key: str, now: float) -> Any:
-        """Return the engine's publisher of a key that was used before; None for a new key.
+        """Return Zenoh's publisher of a key that was used before; None for a new key.
 
-        With a publisher, the engine need not look up the key's subscribers at each message.
+        With a publisher, Zenoh need not look up the key's subscribers at each message.
 
         Raises:
             ZError: the session ends meanwhile.
@@ -288,7 +288,7 @@ class ZenohEnd(ZenohSession, Bus):
                 part_head, key = head.to_bytes(), str(sample.key_expr)
                 self.call_in_loop(declared.call, len(data), on_part, key, part_head, data)
 
-        declared = _OnBus(self)
+        declared = _BusDeclaration(self)
         return declared.declare(
             lambda session: session.declare_subscriber(pattern, direct(on_sample))
         )
@@ -307,12 +307,12 @@ class ZenohEnd(ZenohSession, Bus):
 
         Args:
             queue: name of the queue whose messages are sent in order.
-            session: the engine's session.
+            session: Zenoh's session.
             key: key of the message.
             payload: the message.
             express: whether the message is sent as an own packet, without delay.
             may_be_dropped: whether the loop has sent the message before, and this took so long that
-                the engine may have dropped it. The engine may then drop further messages, too. So
+                Zenoh may have dropped it. Zenoh may then drop further messages, too. So
                 threads send all messages until this one is sent. A receiver that gets the message
                 twice recognizes the repetition by the message's number.
         """
@@ -355,12 +355,12 @@ class ZenohEnd(ZenohSession, Bus):
         return _ZenohPublisher(self, key, on_subscribers, urgent=urgent)
 
     def subscribe(
-        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, low_priority: bool = False
     ) -> Handle:
-        in_loop = self.call_in_loop_patiently if patient else self.call_in_loop
-        full = functools.partial(self.full, patient=True) if patient else self.full
+        in_loop = self.call_in_loop_later if low_priority else self.call_in_loop
+        full = functools.partial(self.full, later=True) if low_priority else self.full
 
-        key = None if "*" in pattern else pattern  # faster than the engine's text of the key
+        key = None if "*" in pattern else pattern  # faster than Zenoh's text of the key
 
         def on_sample(sample: Any) -> None:
             payload = sample.payload.to_bytes()
@@ -368,7 +368,7 @@ class ZenohEnd(ZenohSession, Bus):
                 key_text = key or str(sample.key_expr)
                 in_loop(declared.call, len(payload), on_message, key_text, payload)
 
-        declared = _OnBus(self)
+        declared = _BusDeclaration(self)
         return declared.declare(
             lambda session: session.declare_subscriber(pattern, direct(on_sample))
         )
@@ -378,18 +378,18 @@ class ZenohEnd(ZenohSession, Bus):
         pattern: str,
         answer: Callable[[BusQuestion], None],
         *,
-        patient: Callable[[str], bool] = never,
+        low_priority: Callable[[str], bool] = never,
     ) -> Handle:
         def on_query(query: Any) -> None:
             question = _ZenohQuestion(self, query)
-            is_patient, size = patient(question.key), QUERY_BYTES + len(question.payload)
-            if self.full(size, patient=is_patient):
+            is_late, size = low_priority(question.key), QUERY_BYTES + len(question.payload)
+            if self.full(size, later=is_late):
                 quietly(query.drop)
                 return
-            in_loop = self.call_in_loop_patiently if is_patient else self.call_in_loop
+            in_loop = self.call_in_loop_later if is_late else self.call_in_loop
             in_loop(declared.call, size, answer, question)
 
-        declared = _OnBus(self)
+        declared = _BusDeclaration(self)
         return declared.declare(
             lambda session: session.declare_queryable(pattern, direct(on_query), complete=False)
         )
@@ -419,7 +419,7 @@ class ZenohEnd(ZenohSession, Bus):
         def add(key: str, payload: bytes) -> None:
             answers.append((key, payload))
 
-        def end() -> None:
+        def finish() -> None:
             if not done.done():
                 done.set_result(None)
 
@@ -430,7 +430,7 @@ class ZenohEnd(ZenohSession, Bus):
 
         if session is None:
             return answers
-        on_end = functools.partial(self.call_in_loop, end, 0)
+        on_end = functools.partial(self.call_in_loop, finish, 0)
         ask(session, direct(on_reply, on_end))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
@@ -439,10 +439,12 @@ class ZenohEnd(ZenohSession, Bus):
 
     # ------------------------------------------------------------------ presence
 
-    def be_present(self, key: str) -> Handle:
-        return _OnBus(self).declare(lambda session: session.liveliness().declare_token(key))
+    def announce(self, key: str) -> Handle:
+        return _BusDeclaration(self).declare(
+            lambda session: session.liveliness().declare_token(key)
+        )
 
-    async def present(self, pattern: str, timeout: float) -> list[str]:
+    async def present_keys(self, pattern: str, timeout: float) -> list[str]:
         answers = await self._answers(
             lambda session, hear: session.liveliness().get(pattern, hear, timeout=timeout), timeout
         )
@@ -460,7 +462,7 @@ class ZenohEnd(ZenohSession, Bus):
                 keys_present.pop(key, None)
             on_presence(key, present)
 
-        def on_session_lost() -> None:  # a new session does not report which ends left meanwhile
+        def on_session_lost() -> None:  # a new session does not report who left meanwhile
             for key in [*keys_present]:
                 note_presence(key, False)
 
@@ -469,7 +471,7 @@ class ZenohEnd(ZenohSession, Bus):
                 declared.call, 0, note_presence, str(sample.key_expr), sample.kind == put
             )
 
-        declared = _OnBus(self).when_lost(on_session_lost)
+        declared = _BusDeclaration(self).when_lost(on_session_lost)
         return declared.declare(
             lambda session: session.liveliness().declare_subscriber(
                 pattern, direct(on_sample), history=True
@@ -482,7 +484,7 @@ class ZenohEnd(ZenohSession, Bus):
         """Send a message by a publisher.
 
         Args:
-            publisher: the engine's publisher; None while its session is not open yet.
+            publisher: Zenoh's publisher; None while its session is not open yet.
             payload: the message.
             urgent_key: key of an urgent message, see :meth:`publisher`; None otherwise.
         """
@@ -502,25 +504,27 @@ class ZenohEnd(ZenohSession, Bus):
             )
 
 
-class _OnBus(ZenohDeclared, Handle):
+class _BusDeclaration(ZenohDeclared, Handle):
     pass
 
 
-class _FrequentKey(_OnBus):
+class _FrequentKey(_BusDeclaration):
     """A key that is used often; from its second use on, it has a publisher.
 
     Args:
-        end: the end that uses the key.
+        connection: the connection that uses the key.
         key: the key.
-        options: the engine's options of the publisher.
+        options: Zenoh's options of the publisher.
         now: loop time.
 
     Attributes:
         used_at: loop time of the last use.
     """
 
-    def __init__(self, end: ZenohEnd, key: str, options: dict[str, Any], now: float) -> None:
-        super().__init__(end)
+    def __init__(
+        self, connection: ZenohConnection, key: str, options: dict[str, Any], now: float
+    ) -> None:
+        super().__init__(connection)
         self.used_at: float = now
         self._key, self._options = key, options
         self._is_declared = False
@@ -537,14 +541,14 @@ class _FrequentKey(_OnBus):
 class _ZenohPublisher(Publisher):
     def __init__(
         self,
-        end: ZenohEnd,
+        connection: ZenohConnection,
         key: str,
         on_subscribers: Callable[[bool], None] | None,
         *,
         urgent: bool,
     ) -> None:
-        zenoh = end.engine
-        self._end = end
+        zenoh = connection.zenoh
+        self._connection = connection
         self._on_change = on_subscribers
         self._urgent_key = key if urgent else None
 
@@ -557,9 +561,11 @@ class _ZenohPublisher(Publisher):
             )
 
         def on_matching(status: Any) -> None:
-            end.call_in_loop_uncounted(self._declared.call, self._on_subscribers, status.matching)
+            connection.call_in_loop_uncounted(
+                self._declared.call, self._on_subscribers, status.matching
+            )
 
-        self._declared = _OnBus(end)
+        self._declared = _BusDeclaration(connection)
         self._publisher: Any = None
         self._declared.declare(lambda session: self._declare(declare(session), on_matching))
 
@@ -568,7 +574,7 @@ class _ZenohPublisher(Publisher):
         publisher.declare_matching_listener(direct(on_matching))
         has_subscribers = bool(publisher.matching_status.matching)
         if is_new_session:
-            self._end.call_in_loop_uncounted(
+            self._connection.call_in_loop_uncounted(
                 self._declared.call, self._on_subscribers, has_subscribers
             )
         else:
@@ -581,17 +587,17 @@ class _ZenohPublisher(Publisher):
             self._on_change(has_subscribers)
 
     def put(self, payload: bytes) -> None:
-        self._end.publish(self._publisher, payload, self._urgent_key)
+        self._connection.publish(self._publisher, payload, self._urgent_key)
 
     def close(self) -> None:
         self._declared.close()
 
 
 class _ZenohQuestion(BusQuestion):
-    def __init__(self, end: ZenohEnd, query: Any) -> None:
+    def __init__(self, connection: ZenohConnection, query: Any) -> None:
         self.key = str(query.key_expr)
         self.payload = b"" if query.payload is None else query.payload.to_bytes()
-        self._end, self._query = end, query
+        self._connection, self._query = connection, query
         self._replies: list[tuple[str, bytes]] = []
 
     def reply(self, key: str, payload: bytes) -> None:
@@ -600,13 +606,13 @@ class _ZenohQuestion(BusQuestion):
     def close(self) -> None:
         query, self._query = self._query, None
         if query is not None:
-            self._end.reply(
-                query, self._replies, encoding=self._end.engine.Encoding.APPLICATION_JSON
+            self._connection.reply(
+                query, self._replies, encoding=self._connection.zenoh.Encoding.APPLICATION_JSON
             )
 
 
 def parse_link_address(text: str) -> tuple[str, int] | None:
-    """Return address and port from the engine's text on a link; None if it has none."""
+    """Return address and port from Zenoh's text on a link; None if it has none."""
     match = LINK.match(text)
     return None if match is None else (plain_host(match["host"]), int(match["port"]))
 

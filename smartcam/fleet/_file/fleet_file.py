@@ -32,7 +32,7 @@ from smartcam.fleet._bus.address import (
     check_word,
     missing_certificates,
 )
-from smartcam.fleet._file.access import Access, access_mistakes
+from smartcam.fleet._file.bus_access import Access, access_mistakes
 from smartcam.fleet._file.operations import OperationsSection  # noqa: TC001 - pydantic does
 from smartcam.fleet._file.recording import RecordSection, record_mistakes
 from smartcam.fleet._file.ros import Fields, RosCamera, RosSection, node_names
@@ -345,7 +345,7 @@ class PlannedCamera(NamedTuple):
     index_in_entry: int
 
 
-def _refuse_other_keys(value: object) -> object:
+def _refuse_nontext_keys(value: object) -> object:
     """Refuse names that YAML does not read as texts, such as 12 and yes."""
     if isinstance(value, dict):
         for name in cast("dict[object, object]", value):
@@ -404,7 +404,7 @@ class FleetFile(Fields):
         None,
         min_length=1,
         description="folder, beside this file, of the calibration services, made if missing; "
-        "without it they refuse",
+        "without this key they refuse requests",
     )
     standby: Annotated[Standby | None, BeforeValidator(expand_standby)] = Field(
         None,
@@ -412,7 +412,7 @@ class FleetFile(Fields):
         "true, or a mapping with more",
         json_schema_extra=_allow_bool,
     )
-    cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_refuse_other_keys)] = Field(
+    cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_refuse_nontext_keys)] = Field(
         description="cameras by name, such as line1/cam3; emulated ones by a name that ends in "
         "/**; {}: none, the agent is a router for others",
         json_schema_extra=_limit_names,
@@ -468,7 +468,7 @@ def _plan_entry(name: str, entry: CameraEntry) -> Iterator[PlannedCamera]:
     if not is_pattern:
         check_name(name)
         if count > 1:
-            raise ValueError(f"{count} cameras want a name such as {name}{_PATTERN}")
+            raise ValueError(f"an entry for {count} cameras needs a name such as {name}{_PATTERN}")
         yield PlannedCamera(name, entry, 0)
         return
     if entry.emulated is None:
@@ -527,7 +527,7 @@ def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
     yield from access_mistakes(file.access, file.endpoints[0])
     yield from _certificate_mistakes(file, folder)
     if not file.cameras and not file.endpoints[0]:
-        text = "an agent without cameras is a router for others: expected listen, which it lacks"
+        text = "an agent without cameras is only a router, which needs the key listen"
         yield ("cameras",), text
     if file.record is not None:
         with_frames = [
@@ -564,7 +564,10 @@ def _certificate_mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
     tls = [endpoint for endpoint in (*listen, *connect) if endpoint.startswith("tls/")]
     if file.certificates is None:
         if tls:
-            yield ("listen" if tls[0] in listen else "connect",), f"{tls[0]} wants certificates"
+            yield (
+                ("listen" if tls[0] in listen else "connect",),
+                f"{tls[0]} needs the key certificates",
+            )
         return
     if missing := missing_certificates(folder / file.certificates):
         yield ("certificates",), missing
@@ -582,7 +585,7 @@ def _entry_mistakes(
             return
         other = addresses.setdefault((address.host, address.port), name)
         if other != name:
-            yield ("url",), f"this is the camera {other}, and a camera takes one client"
+            yield ("url",), f"{other} has this address already, and a camera takes one client"
     elif entry.model is not None:
         yield ("model",), "is for a url"
     elif entry.emulated is not None and entry.emulated.scenario is not None:

@@ -9,22 +9,22 @@ from pydantic import AfterValidator, Field, WithJsonSchema
 
 from smartcam.fleet._file.ros import Fields
 
-DEFAULT_PLACE = "127.0.0.1:9464"
+DEFAULT_ENDPOINT = "127.0.0.1:9464"
 
-_PLACE = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
+_ENDPOINT = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 
 
-def _check_place(text: str) -> str:
-    match = _PLACE.fullmatch(text)
+def _check_endpoint(text: str) -> str:
+    match = _ENDPOINT.fullmatch(text)
     if match is None or int(match[2]) > 0xFFFF:
-        raise ValueError(f"expected HOST:PORT such as {DEFAULT_PLACE}, got {text!r:.80}")
+        raise ValueError(f"expected HOST:PORT such as {DEFAULT_ENDPOINT}, got {text!r:.80}")
     return text
 
 
-Place = Annotated[
+Endpoint = Annotated[
     str,
-    AfterValidator(_check_place),
-    WithJsonSchema({"type": "string", "pattern": f"^{_PLACE.pattern}$"}),
+    AfterValidator(_check_endpoint),
+    WithJsonSchema({"type": "string", "pattern": f"^{_ENDPOINT.pattern}$"}),
 ]
 
 
@@ -34,8 +34,8 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-
 class OperationsSection(Fields):
     """The operation of an agent: health and metrics over HTTP, and its log."""
 
-    listen: Place | None = Field(
-        DEFAULT_PLACE,
+    listen: Endpoint | None = Field(
+        DEFAULT_ENDPOINT,
         description="HOST:PORT of /healthz, /readyz and /metrics, which every client can read; "
         "null: nowhere; port 0 takes a free one",
     )
@@ -46,8 +46,8 @@ class OperationsSection(Fields):
     )
     latency: Literal["agent", "camera"] = Field(
         "agent",
-        description="histograms of latency: agent, one for all cameras together, and sum and count "
-        "for each camera; or camera, one for each camera, with 20 lines more",
+        description="histograms of latency: 'agent': one for all cameras, and sum and count for "
+        "each camera; 'camera': one for each camera, 20 more lines of /metrics per camera",
     )
     log: Literal["text", "json"] = Field(
         "text", description="form of smartcam serve's log: lines for people, or JSON"
@@ -57,7 +57,7 @@ class OperationsSection(Fields):
     )
 
     @property
-    def place(self) -> tuple[str, int] | None:
+    def endpoint(self) -> tuple[str, int] | None:
         """Host and port to listen on."""
         if self.listen is None:
             return None

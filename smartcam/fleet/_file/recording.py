@@ -32,15 +32,15 @@ class RecordSection(Fields):
         ("**",),
         description="cameras that are recorded: names, * for one part of a name, ** for any number",
     )
-    frames: bool = Field(
+    messages: bool = Field(
         True,
         description="record the messages of the protocol, too; without them a replay has only "
         "results and statuses",
     )
     pictures: Literal["none", "judged", "all"] = Field(
         "none",
-        description="record pictures of cameras with frames, too: none; judged, the picture that "
-        "belongs to each result; or all. Except for none, the device always streams",
+        description="record pictures of cameras with frames, too: 'none'; 'judged': the picture of "
+        "each result; 'all'. With 'judged' and 'all', the device streams all the time",
     )
 
     def chooses(self, camera: str) -> bool:
@@ -70,8 +70,8 @@ def record_mistakes(
     if section.pictures != "none" and not recorded:
         yield (
             ("record", "pictures"),
-            f"expected frames: or software: in the entry of a recorded camera for pictures: "
-            f"{section.pictures}, found none",
+            f"pictures: {section.pictures} needs a recorded camera with the key frames or "
+            "software; there is none",
         )
     if section.keep < 2 * section.size:
         yield (

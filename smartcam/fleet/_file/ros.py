@@ -1,4 +1,4 @@
-"""Define the sections of a fleet file on ROS 2."""
+"""Define the sections about ROS 2 in a fleet file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_FRAME_CHARACTERS = 200
 
 
 class Fields(BaseModel):
-    """The base of every part of a fleet file."""
+    """The base of every section of a fleet file."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", frozen=True, hide_input_in_errors=True
@@ -72,7 +72,7 @@ class RosCamera(Fields):
         "default: that of a calibration",
     )
     calibration: str | None = Field(
-        None, description="file with the calibration to the robot's frame, beside this one"
+        None, description="file, beside this file, with the calibration to the robot's frame"
     )
     calibrated_at: Annotated[tuple[float, ...], Field(min_length=7, max_length=7)] | None = Field(
         None,
@@ -81,7 +81,7 @@ class RosCamera(Fields):
     )
     hand_eye: str | None = Field(
         None,
-        description="file with a hand-eye calibration, beside this one: the camera's place for "
+        description="file, beside this file, with a hand-eye calibration: the camera's place for "
         "/tf_static",
     )
 

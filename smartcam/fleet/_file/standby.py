@@ -10,7 +10,7 @@ from smartcam.fleet._file.ros import Fields
 class Standby(Fields):
     """The settings of a standby agent, which takes over cameras of a lost agent."""
 
-    preference: int = Field(
+    rank: int = Field(
         0, ge=0, le=3, description="rank among several that stand by: the lowest takes over first"
     )
 

@@ -24,7 +24,7 @@ from smartcam.geometry import CameraModel
 
 if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Data
-    from smartcam.fleet._frames.stream_form import StreamForm
+    from smartcam.fleet._frames.stream_form import FleetStreamRequest
     from smartcam.fleet._frames.wire import FleetFrame, FrameForm
     from smartcam.fleet._program.caller import Caller
 
@@ -59,19 +59,19 @@ class StreamCounts:
         )  # number of frames that were sent, but did not arrive
 
 
-class FrameCaller:
+class FrameClient:
     """Asks a camera's agent for frames.
 
     Args:
         name: name of the camera, for frames and texts.
-        caller: caller of the agent.
+        caller: object that calls the camera's agent.
     """
 
     def __init__(self, name: str, caller: Caller) -> None:
         self.name, self._caller = name, caller
         self._lenses: dict[tuple[int, int], CameraModel | None] = {}
 
-    async def read_format(self, request: StreamForm) -> StreamFormat:
+    async def read_format(self, request: FleetStreamRequest) -> StreamFormat:
         """Return the format of the requested frames; the agent opens its device for this.
 
         Raises:
@@ -201,7 +201,7 @@ class FrameCaller:
             data = await incoming.complete_data(int(fields["size"]))
             if data is None:
                 return answer, []
-            caller.bound_clock(float(answer["came"]), sent_at)
+            caller.narrow_clock_lead(float(answer["asked_at"]), sent_at)
             units = answer.get("units", [fields])
             stream = "stream" in answer
             skipped, lost = (
@@ -215,7 +215,7 @@ class FrameCaller:
                 frames.append(await self._read_frame(unit, part, lost, epoch, deadline))
                 position, lost = end, 0
             if position != len(data):
-                raise ValueError(f"{len(data)} bytes of {position}")
+                raise ValueError(f"{len(data)} bytes came, {position} were expected")
         except (KeyError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError):
                 raise
@@ -243,7 +243,7 @@ class FrameCaller:
     def _clock_lead(self) -> float:
         """Seconds by which the loop's clock is ahead of frames' clock, ``time.monotonic()``."""
         if self._caller.program.bus.local:
-            return 0.0  # frames keep their time
+            return 0.0  # the times of frames need no conversion
         return asyncio.get_running_loop().time() - time.monotonic()
 
     async def _lens(self, epoch: int, number: int, deadline: float) -> CameraModel | None:
@@ -265,7 +265,7 @@ class FrameCaller:
 
     def end_stream(self, stream: int) -> None:
         """Tell the agent that a stream has ended."""
-        self._caller.notify("leave_frames", {"stream": stream})
+        self._caller.notify("end_stream", {"stream": stream})
 
     def next_stream(self) -> int:
         """Return the number of a new stream."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._frames.encoding import FrameEncoder
     from smartcam.fleet._frames.sender import FrameSender
-    from smartcam.fleet._frames.stream import FrameOrder, TakenFrame
+    from smartcam.fleet._frames.stream import FrameCall, TakenFrame
     from smartcam.fleet._frames.video import SharedVideo
     from smartcam.frames import Frame, FrameSource
     from smartcam.frames._inside import SourceStatistics
@@ -171,8 +171,8 @@ class SharedFrames:
             return self._source
         if self.make is None:
             raise UnsupportedError(
-                f"{self.name} has no frames: its entry in the fleet file wants frames: URL, such "
-                "as v4l2:///dev/video0"
+                f"{self.name} has no frames: add `frames: URL` to its entry in the fleet file, "
+                "such as v4l2:///dev/video0"
             )
         if self._closed:
             raise LocalProtocolError(f"{self.name}: the agent ends")
@@ -200,30 +200,28 @@ class SharedFrames:
         }
 
     async def send_frame(
-        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
+        self, call: FrameCall, *, max_age: float | None, after: float | None, fresh: bool
     ) -> dict[str, Any]:
         """Send the frame that :meth:`get_frame` returns; return the fields of the reply."""
         asked_at = asyncio.get_running_loop().time()
-        frame, encoding_time = await self.get_frame(
-            order, max_age=max_age, after=after, fresh=fresh
-        )
-        self._send_bytes([frame], order)
-        return {"came": asked_at, "frame": self._frame_fields(frame, encoding_time)}
+        frame, encoding_time = await self.get_frame(call, max_age=max_age, after=after, fresh=fresh)
+        self._send_bytes([frame], call)
+        return {"asked_at": asked_at, "frame": self._frame_fields(frame, encoding_time)}
 
     async def get_frame(
-        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
+        self, call: FrameCall, *, max_age: float | None, after: float | None, fresh: bool
     ) -> tuple[Frame, float]:
         """Return one frame, and the seconds that its encoding took.
 
         Args:
-            order: the asking program, and the form of the frame.
+            call: the asking program, and the form of the frame.
             max_age: largest age of the frame, seconds since it was captured; None for any.
             after: time of the agent's clock after which the frame must be exposed.
             fresh: whether the frame must be exposed after this request.
         """
         now = time.monotonic() + self.sender.clock_lead
-        with self._counting_call(order), self._naming_timeout(order.timeout, "a frame"):
-            async with asyncio.timeout(order.timeout):
+        with self._counting_call(call), self._naming_timeout(call.timeout, "a frame"):
+            async with asyncio.timeout(call.timeout):
                 source = await self.source()
                 if fresh or after is not None:
                     moment = now if after is None else after
@@ -231,27 +229,27 @@ class SharedFrames:
                 else:
                     age = math.inf if max_age is None else max_age
                     frame = await source.newest(max_age=age, timeout=None)
-                return await self._encode(frame, order.encoding)
+                return await self._encode(frame, call.encoding)
 
-    async def send_triggered_frame(self, order: FrameOrder, *, wait: bool) -> dict[str, Any]:
+    async def send_triggered_frame(self, call: FrameCall, *, wait: bool) -> dict[str, Any]:
         """Trigger the device, and send this trigger's picture; return the fields of the reply."""
         asked_at = asyncio.get_running_loop().time()
-        frame, encoding_time = await self.trigger_frame(order, wait=wait)
-        self._send_bytes([frame], order)
-        return {"came": asked_at, "frame": self._frame_fields(frame, encoding_time)}
+        frame, encoding_time = await self.trigger_frame(call, wait=wait)
+        self._send_bytes([frame], call)
+        return {"asked_at": asked_at, "frame": self._frame_fields(frame, encoding_time)}
 
-    async def trigger_frame(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
+    async def trigger_frame(self, call: FrameCall, *, wait: bool) -> tuple[Frame, float]:
         """Trigger the device; return its picture, and the seconds that its encoding took."""
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + order.timeout
-        with self._counting_call(order):
-            with self._naming_timeout(order.timeout, "the device"):
-                async with asyncio.timeout(order.timeout):
+        deadline = loop.time() + call.timeout
+        with self._counting_call(call):
+            with self._naming_timeout(call.timeout, "the device"):
+                async with asyncio.timeout(call.timeout):
                     source = await self.source()
             frame = await source.trigger(
                 timeout=max(1e-3, deadline - loop.time()), when_busy="wait" if wait else "refuse"
             )
-            return await self._encode(frame, order.encoding)
+            return await self._encode(frame, call.encoding)
 
     async def features(
         self, name: str | None, timeout: float, *, names_only: bool, value_only: bool
@@ -283,49 +281,49 @@ class SharedFrames:
             async with asyncio.timeout(timeout):
                 return await self.source()
 
-    async def send_next_frames(self, order: FrameOrder, stream_number: int) -> dict[str, Any]:
+    async def send_next_frames(self, call: FrameCall, stream_number: int) -> dict[str, Any]:
         """Send the next frames of a stream, and return the fields of the reply.
 
         If no frame comes in time, the reply is without frames.
         """
         asked_at = asyncio.get_running_loop().time()
-        key = order.program, stream_number
-        with self._counting_call(order):
+        key = call.program, stream_number
+        with self._counting_call(call):
             stream = self._streams.get(key)
             if stream is None:
-                stream = await self._begin_stream(key, order)
+                stream = await self._begin_stream(key, call)
             if stream.busy:
                 raise LocalProtocolError(f"{self.name}: two requests for the frames of one stream")
-            if isinstance(stream, VideoStream) != (order.encoding.name == VIDEO):
-                raise LocalProtocolError(f"{self.name}: a stream does not become {VIDEO}, nor back")
+            if isinstance(stream, VideoStream) != (call.encoding.name == VIDEO):
+                raise LocalProtocolError(f"{self.name}: a stream cannot change from or to {VIDEO}")
             stream.mark_busy()
             try:
-                taken = await stream.take_frames(order)
+                taken = await stream.take_frames(call)
             except FrameTimeoutError:
                 raise
             except TimeoutError:
-                return {"came": asked_at}
+                return {"asked_at": asked_at}
             except StopAsyncIteration:
                 self._end_stream(key, stream)
-                return {"came": asked_at, "ended": True}
+                return {"asked_at": asked_at, "ended": True}
             except Exception:
                 self._end_stream(key, stream)
                 raise
             finally:
                 if self._streams.get(key) is stream:
                     stream.mark_idle(lambda: self._end_stream(key, stream))
-        self._send_bytes([each.frame for each in taken], order)
+        self._send_bytes([each.frame for each in taken], call)
         return {
-            "came": asked_at,
+            "asked_at": asked_at,
             "stream": stream.number,
             **stream.counts(),
             **self._all_fields(taken),
         }
 
-    async def _begin_stream(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
+    async def _begin_stream(self, key: tuple[str, int], call: FrameCall) -> FrameStream:
         """Return a new stream with this key, or the one that another call has begun meanwhile."""
-        with self._naming_timeout(order.timeout, "the device"):
-            async with asyncio.timeout(order.timeout):
+        with self._naming_timeout(call.timeout, "the device"):
+            async with asyncio.timeout(call.timeout):
                 source = await self.source()
         if key in self._streams:
             return self._streams[key]
@@ -339,8 +337,8 @@ class SharedFrames:
             )
         number = next(self._numbers)
         stream: FrameStream
-        if order.encoding.name == VIDEO:
-            video = self._get_video(source, order.encoding)
+        if call.encoding.name == VIDEO:
+            video = self._get_video(source, call.encoding)
             stream = VideoStream(number, video, self._release_video)
         else:
             stream = PictureStream(number, source.reader(timeout=None), self._encode)
@@ -395,7 +393,7 @@ class SharedFrames:
 
     # ------------------------------------------------------------------ send and encode
 
-    def _send_bytes(self, frames: list[Frame], order: FrameOrder) -> None:
+    def _send_bytes(self, frames: list[Frame], call: FrameCall) -> None:
         """Send the bytes of frames.
 
         Raises:
@@ -408,7 +406,7 @@ class SharedFrames:
                 source=self.name,
             )
         data = frames[0].data if len(frames) == 1 else b"".join(frame.data for frame in frames)
-        self.sender.send(order.program, order.call, data)
+        self.sender.send(call.program, call.call, data)
 
     def _frame_fields(self, frame: Frame, encoding_time: float) -> dict[str, Any]:
         """Return the fields that describe a frame."""
@@ -420,11 +418,12 @@ class SharedFrames:
         """Return the fields that describe the frames of one reply."""
         if not taken[-1].number:
             return {"frame": self._frame_fields(taken[-1].frame, taken[-1].encoding_time)}
-        units = [
+        access_units = [
             {**self._frame_fields(each.frame, each.encoding_time), "number": each.number}
             for each in taken
         ]
-        return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
+        size = sum(unit["size"] for unit in access_units)
+        return {"frame": {"size": size}, "units": access_units}
 
     async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
         """Return a frame encoded, and the seconds that this took; equal requests share the work."""
@@ -469,22 +468,22 @@ class SharedFrames:
         return number
 
     @contextlib.contextmanager
-    def _counting_call(self, order: FrameOrder) -> Iterator[None]:
+    def _counting_call(self, call: FrameCall) -> Iterator[None]:
         """Count the block as a pending call of its program; refuse too many."""
-        pending_count = self._pending_calls.get(order.program, 0)
+        pending_count = self._pending_calls.get(call.program, 0)
         if pending_count >= MAX_FRAME_CALLS_PER_PROGRAM:
             raise LocalProtocolError(
                 f"{self.name}: {pending_count} calls of this program for frames are under way"
             )
-        self._pending_calls[order.program] = pending_count + 1
+        self._pending_calls[call.program] = pending_count + 1
         try:
             yield
         finally:
-            pending_count = self._pending_calls[order.program] - 1
+            pending_count = self._pending_calls[call.program] - 1
             if pending_count:
-                self._pending_calls[order.program] = pending_count
+                self._pending_calls[call.program] = pending_count
             else:
-                del self._pending_calls[order.program]
+                del self._pending_calls[call.program]
 
     @contextlib.contextmanager
     def _naming_timeout(self, seconds: float, operation: str) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""Put frames together from their parts at a program, while a call waits for the frame."""
+"""In the calling program, put frames together from their parts while the call waits."""
 
 from __future__ import annotations
 

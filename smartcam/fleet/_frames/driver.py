@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._frames.caller import as_source_error
 from smartcam.fleet._frames.shared_driver import SharedFrameDriver
-from smartcam.fleet._frames.stream_form import StreamForm
+from smartcam.fleet._frames.stream_form import FleetStreamRequest
 from smartcam.fleet._opening import fleet_camera
 
 if TYPE_CHECKING:
@@ -30,12 +30,12 @@ class FleetFrameDriver(SharedFrameDriver):
     def __init__(self, address: FrameAddress) -> None:
         url, options = _split_options(address.url)
         numbers = {
-            name: address.number(name, options[name], least, most)
-            for name, (least, most) in _NUMBERS.items()
+            name: address.number(name, options[name], low, high)
+            for name, (low, high) in _NUMBERS.items()
             if name in options
         }
         quality = numbers.get("quality")
-        request = StreamForm.checked(
+        request = FleetStreamRequest.checked(
             options.get("encoding", "raw"),
             None if quality is None else int(quality),
             numbers.get("bitrate"),
@@ -44,7 +44,7 @@ class FleetFrameDriver(SharedFrameDriver):
         )
         self._url = url
         self._camera = self._make_camera()
-        super().__init__(address, self._camera.frame_caller, request)
+        super().__init__(address, self._camera.frame_client, request)
 
     def _make_camera(self) -> FleetCamera[Any]:
         return fleet_camera(self._url, {}, ())
@@ -53,9 +53,11 @@ class FleetFrameDriver(SharedFrameDriver):
         """Connect to the agent, which opens the device."""
         if self._camera.ended:  # the driver was closed before
             self._camera = self._make_camera()
-            self._frames = self._camera.frame_caller
+            self._frame_client = self._camera.frame_client
         try:
-            await self._camera.follow(self._camera.settings.connect_timeout, session=False)
+            await self._camera.connect_to_agent(
+                self._camera.settings.connect_timeout, wait_for_session=False
+            )
         except SmartCamError as exc:
             raise as_source_error(self.name, exc) from exc
         return await super().open()

@@ -38,8 +38,8 @@ class FramePace:
         If no such frame arrives until the end of the wait, an older one is sent.
 
         Args:
-            now: time of the request for the next frame; the last frame has then arrived.
-            arrived_at: time at which the newest frame arrived.
+            now: time of the request for the next frame; the program has then got the last one.
+            arrived_at: time at which the newest frame arrived from the camera.
             min_interval: least number of seconds from one frame to the next.
         """
         if self._sent_at is not None:
@@ -59,7 +59,7 @@ class FramePace:
         """Note which frame was taken.
 
         Args:
-            arrived_at: time at which the frame arrived.
+            arrived_at: time at which the frame arrived from the camera.
             offered: number of frames that the source had given at that time.
         """
         if self._last_taken is not None and offered > self._last_taken[1]:

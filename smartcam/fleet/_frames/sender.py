@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.keys import Keys
 
 PART_BYTES = 1 << 17
-"""Bytes of a part. The loop takes less than 0.1 ms to pass a part to the engine."""
+"""Bytes of a part. The loop takes less than 0.1 ms to pass a part to Zenoh."""
 
 WINDOW_BYTES = 3 * PART_BYTES
-"""Largest number of unconfirmed bytes of one program. The engine's queue has room for 16 packets of
+"""Largest number of unconfirmed bytes of one program. Zenoh's queue has room for 16 packets of
 64 kB, and drops further ones; two programs that are connected through one router share that
 queue."""
 
@@ -76,7 +76,7 @@ class FrameSender:
     """Sends frames to programs.
 
     Args:
-        bus: the agent's end of the bus.
+        bus: the agent's connection to the bus.
         keys: keys of the fleet.
     """
 
@@ -88,7 +88,7 @@ class FrameSender:
     def clock_lead(self) -> float:
         """Seconds by which the loop's clock is ahead of ``time.monotonic()``, the clock of frames.
 
-        0 if all programs are in this process, where frames keep their time.
+        0 if all programs are in this process: the times of frames then need no conversion.
         """
         if self._bus.local:
             return 0.0

@@ -23,8 +23,8 @@ from smartcam.frames import FrameDriver
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from smartcam.fleet._frames.caller import FrameCaller
-    from smartcam.fleet._frames.stream_form import StreamForm
+    from smartcam.fleet._frames.caller import FrameClient
+    from smartcam.fleet._frames.stream_form import FleetStreamRequest
     from smartcam.fleet._frames.units import VideoReceiver
     from smartcam.fleet._frames.wire import FleetFrame
     from smartcam.frames import (
@@ -53,22 +53,24 @@ class SharedFrameDriver(FrameDriver):
 
     Args:
         address: address of the camera.
-        frames: caller that asks the agent for frames.
+        frame_client: object that asks the agent for frames.
         request: form and rate of the frames.
     """
 
     sets_captured = True
 
-    def __init__(self, address: FrameAddress, frames: FrameCaller, request: StreamForm) -> None:
+    def __init__(
+        self, address: FrameAddress, frame_client: FrameClient, request: FleetStreamRequest
+    ) -> None:
         super().__init__(address)
-        self._frames, self._request = frames, request
+        self._frame_client, self._request = frame_client, request
         self._task: asyncio.Task[None] | None = None
         self._video: VideoReceiver | None = None
 
     @property
     def name(self) -> str:
         """The camera's name."""
-        return self._frames.name
+        return self._frame_client.name
 
     async def open(self) -> StreamFormat:
         """Make the agent open the device.
@@ -81,7 +83,7 @@ class SharedFrameDriver(FrameDriver):
         if self._request.form.name == VIDEO and self._request.decode:
             load("av")
         try:
-            return await self._frames.read_format(self._request)
+            return await self._frame_client.read_format(self._request)
         except (FrameSourceError, UnsupportedError, ConfigurationError):
             raise
         except SmartCamError as exc:
@@ -90,7 +92,7 @@ class SharedFrameDriver(FrameDriver):
     @property
     def features(self) -> DeviceFeatures:
         """The features of the device, through the camera's agent."""
-        return self._frames.features
+        return self._frame_client.features
 
     async def trigger_by_owner(self, timeout: float, *, refuse: bool) -> Frame:
         """Trigger the device through the camera's agent, and return the picture.
@@ -100,7 +102,7 @@ class SharedFrameDriver(FrameDriver):
         """
         form = self._request.form
         picture = FrameForm("raw", None) if form.name == VIDEO else form
-        return await self._frames.trigger(picture, timeout, wait=not refuse)
+        return await self._frame_client.trigger(picture, timeout, wait=not refuse)
 
     async def trigger(
         self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
@@ -121,11 +123,11 @@ class SharedFrameDriver(FrameDriver):
             from smartcam.fleet._frames.units import VideoReceiver
 
             self._video = VideoReceiver(decode=self._request.decode)
-        stream = self._frames.next_stream()
+        stream = self._frame_client.next_stream()
         self._task = asyncio.get_running_loop().create_task(
             self._run(sink, stream), name=f"frames of {self.name}"
         )
-        self._task.add_done_callback(lambda _: self._frames.end_stream(stream))
+        self._task.add_done_callback(lambda _: self._frame_client.end_stream(stream))
 
     async def stop(self) -> None:
         """Stop requesting frames."""
@@ -147,7 +149,7 @@ class SharedFrameDriver(FrameDriver):
         try:
             end = await self._receive_until_end(sink, stream)
         except Exception as exc:
-            logger.exception("%s ! its frames end", self.name)
+            logger.exception("%s ! its stream of frames failed", self.name)
             end = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
         sink.ended(end)
 
@@ -158,7 +160,7 @@ class SharedFrameDriver(FrameDriver):
         while True:
             try:
                 deadline = loop.time() + HOLD_TIMEOUT + ANSWER_TIMEOUT
-                answer, frames = await self._frames.request_frames(
+                answer, frames = await self._frame_client.request_frames(
                     "next_frame", deadline, self._arguments(stream), counts
                 )
             except FrameSourceError as exc:
@@ -189,11 +191,11 @@ class SharedFrameDriver(FrameDriver):
     def _arguments(self, stream: int) -> dict[str, Any]:
         """Return the arguments of the call for the next frame."""
         arguments = {**self._request.form.fields(), "stream": stream}
-        rate = self._request.rate
-        if rate is not None:
-            arguments |= {"quality": rate.quality, "rest": rate.pause}
+        control = self._request.rate_control
+        if control is not None:
+            arguments |= {"quality": control.quality, "min_interval": control.pause}
         if self._video is not None:
-            arguments["have"] = self._video.last_number
+            arguments["last_number"] = self._video.last_number
         return arguments
 
     async def _pass_frames(
@@ -203,9 +205,9 @@ class SharedFrameDriver(FrameDriver):
         if self._video is not None:
             await self._video.give_frames(sink, answer, frames)
             return
-        frame, rate = frames[-1], self._request.rate
-        if rate is not None:
+        frame, control = frames[-1], self._request.rate_control
+        if control is not None:
             age_here, age = frame.age, float(answer["frame"]["age"])
-            rate.record_arrival(len(frame.data), frame.captured + age, age_here - age, age=age)
-            frame = replace(frame, rate=rate.statistics())
+            control.record_arrival(len(frame.data), frame.captured + age, age_here - age, age=age)
+            frame = replace(frame, rate=control.statistics())
         sink.frame(frame)

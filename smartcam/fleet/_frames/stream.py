@@ -23,7 +23,7 @@ HOLD_TIMEOUT = 1.0
 """Seconds for which a request waits for a frame; after that, it is answered without one."""
 
 
-class FrameOrder(NamedTuple):
+class FrameCall(NamedTuple):
     """A program's request for a frame.
 
     Attributes:
@@ -32,7 +32,7 @@ class FrameOrder(NamedTuple):
         encoding: form of the frame.
         timeout: seconds of the call's timeout.
         min_interval: least seconds from one frame of a stream to the next.
-        have: number of the last H.264 frame that the program has; 0 for none.
+        last_number: number of the last H.264 frame that the program has; 0 for none.
     """
 
     program: str
@@ -40,7 +40,7 @@ class FrameOrder(NamedTuple):
     encoding: FrameForm
     timeout: float
     min_interval: float = 0.0
-    have: int = 0
+    last_number: int = 0
 
 
 class TakenFrame(NamedTuple):
@@ -84,7 +84,7 @@ class FrameStream(ABC):
             self.idle_timer = None
 
     @abstractmethod
-    async def take_frames(self, order: FrameOrder) -> list[TakenFrame]:
+    async def take_frames(self, call: FrameCall) -> list[TakenFrame]:
         """Return the next frame, or several frames of H.264.
 
         Raises:
@@ -115,23 +115,23 @@ class PictureStream(FrameStream):
     encode: Callable[[Frame, FrameForm], Awaitable[tuple[Frame, float]]]
     pace: FramePace = field(default_factory=FramePace)
 
-    async def take_frames(self, order: FrameOrder) -> list[TakenFrame]:
+    async def take_frames(self, call: FrameCall) -> list[TakenFrame]:
         loop, reader = asyncio.get_running_loop(), self.reader
         oldest_arrival, wait_until = self.pace.choose_window(
-            loop.time(), reader.last_arrival, order.min_interval
+            loop.time(), reader.last_arrival, call.min_interval
         )
-        async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
+        async with asyncio.timeout(min(call.timeout, HOLD_TIMEOUT)):
             await reader.wait_newer(oldest_arrival, wait_until)
             frame = await anext(reader)
         self.pace.note_taken(reader.last_arrival, reader.statistics().offered)
-        async with asyncio.timeout(order.timeout):
-            taken = TakenFrame(*await self.encode(frame, order.encoding))
+        async with asyncio.timeout(call.timeout):
+            taken = TakenFrame(*await self.encode(frame, call.encoding))
         self.pace.note_sent(loop.time())
         return [taken]
 
     def counts(self) -> dict[str, int]:
-        account = self.reader.statistics()
-        return {"sent": account.delivered, "skipped": account.skipped, "lost": account.lost}
+        counts = self.reader.statistics()
+        return {"sent": counts.delivered, "skipped": counts.skipped, "lost": counts.lost}
 
     def close(self) -> None:
         super().close()
@@ -154,9 +154,9 @@ class VideoStream(FrameStream):
     _first_counts: tuple[int, int] | None = None  # frames offered and lost before the first frame
     _last_counts: tuple[int, int] = (0, 0)
 
-    async def take_frames(self, order: FrameOrder) -> list[TakenFrame]:
-        async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
-            units = await self.video.next_units(order.have)
+    async def take_frames(self, call: FrameCall) -> list[TakenFrame]:
+        async with asyncio.timeout(min(call.timeout, HOLD_TIMEOUT)):
+            units = await self.video.next_units(call.last_number)
         if self._first_counts is None:
             self._first_counts = units[0].offered_count - 1, units[0].lost_count
         self._sent_count += sum(unit.number > self._highest_number for unit in units)

@@ -10,17 +10,17 @@ from smartcam.fleet._frames.wire import VIDEO, FrameForm
 from smartcam.frames import RateControl, find_format
 
 
-class StreamForm(NamedTuple):
+class FleetStreamRequest(NamedTuple):
     """A program's request for a stream.
 
     Attributes:
         form: form of the frames.
-        rate: control of the stream's bit rate or latency; None for no control.
+        rate_control: control of the stream's bit rate or latency; None for no control.
         decode: whether the program decodes H.264 to pictures.
     """
 
     form: FrameForm = FrameForm()
-    rate: RateControl | None = None
+    rate_control: RateControl | None = None
     decode: bool = True
 
     @classmethod
@@ -33,7 +33,7 @@ class StreamForm(NamedTuple):
         caller: str,
         *,
         decode: bool = True,
-    ) -> StreamForm:
+    ) -> FleetStreamRequest:
         """Check arguments of :meth:`smartcam.Camera.frames`, and return the request.
 
         Raises:
@@ -47,7 +47,7 @@ class StreamForm(NamedTuple):
         if encoding != "jpeg":
             option = "latency" if bitrate is None or encoding == VIDEO else "bitrate"
             raise ConfigurationError(
-                f"{caller}: {option}: {encoding!r:.40} cannot hold one; jpeg can"
+                f"{caller}: {option}: {encoding!r:.40} cannot keep to one; jpeg can"
                 + (f", and {VIDEO}" if option == "bitrate" else "")
             )
         if quality is not None:

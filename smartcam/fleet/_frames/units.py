@@ -1,4 +1,4 @@
-"""Decode H.264 of a shared camera at a program: encoded frames in order, or pictures."""
+"""In a program that uses a shared camera, receive its H.264: encoded frames, or pictures."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class VideoReceiver:
             except FrameFormatError as exc:
                 logger.warning("%s", exc)
                 picture = None
-            if picture is None:  # the next received frame is a key frame
+            if picture is None:  # ask for a key frame next
                 self.last_number = 0
                 sink.lost(len(frames) - index)
                 return

@@ -106,13 +106,13 @@ class SharedVideo:
         self._task.cancel()
         return self._task
 
-    async def next_units(self, have: int) -> list[VideoUnit]:
+    async def next_units(self, last_number: int) -> list[VideoUnit]:
         """Return the encoded frames for a program, which can decode them all; wait for the first.
 
         The first one follows the program's last frame, or is a key frame.
 
         Args:
-            have: number of the last frame that the program has; 0: none.
+            last_number: number of the last frame that the program has; 0: none.
 
         Raises:
             FrameSourceError: the source ended with this error.
@@ -120,7 +120,7 @@ class SharedVideo:
             StopAsyncIteration: the video ended.
         """
         while True:
-            if units := self._kept_units(have):
+            if units := self._kept_units(last_number):
                 return units
             if self._end_cause is not None:
                 if self._end_cause[0] is not None:
@@ -129,9 +129,9 @@ class SharedVideo:
             self._changed.clear()
             await self._changed.wait()
 
-    def _kept_units(self, have: int) -> list[VideoUnit]:
+    def _kept_units(self, last_number: int) -> list[VideoUnit]:
         kept = self._units
-        if not kept or kept[-1].number == have:
+        if not kept or kept[-1].number == last_number:
             return []
         oldest_allowed = asyncio.get_running_loop().time() - MAX_LAG
         units: list[VideoUnit] = []
@@ -139,7 +139,7 @@ class SharedVideo:
             if unit.encoded_at < oldest_allowed and units:
                 break  # the program lags too far
             units.append(unit)
-            if unit.is_key_frame or unit.number == have + 1:
+            if unit.is_key_frame or unit.number == last_number + 1:
                 return units[::-1]
         self._needs_key_frame = True
         return []
@@ -147,8 +147,8 @@ class SharedVideo:
     async def _run(self) -> None:
         try:
             async for frame in self._reader:
-                account = self._reader.statistics()
-                await self._encode(frame, account.offered, account.lost)
+                counts = self._reader.statistics()
+                await self._encode(frame, counts.offered, counts.lost)
             self._end_cause = self._end_cause or (None,)
         except asyncio.CancelledError:
             raise

@@ -1,7 +1,7 @@
 """Encode and decode frames on the bus: their fields, and the parts of their bytes.
 
 The reply to a call for a frame has all fields of the frame, but not its bytes. The bytes are sent
-separately under another key, in parts, since the engine drops messages that are longer than its
+separately under another key, in parts, since Zenoh drops messages that are longer than its
 queue. If the queue is full, a part is dropped: sending a part never waits.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
 
 MAX_FRAME_BYTES = 1 << 28
-"""Largest number of bytes of a frame: 14,000 x 10,000 pixels of 16 bits."""
+"""Largest number of bytes of a frame: 13,000 x 10,000 pixels of 16 bits."""
 
 ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
 """Encodings of frames; raw: the camera's own encoding."""
@@ -41,7 +41,7 @@ class FrameForm(NamedTuple):
     Attributes:
         name: one of :data:`ENCODINGS`, or :data:`VIDEO`.
         quality: quality of JPEG, 1 to 100; None for the codec's default.
-        bitrate: bit rate of H.264, bits per second; None for even quality.
+        bitrate: bit rate of H.264, bits per second; None for constant quality.
     """
 
     name: str = "raw"
@@ -64,7 +64,7 @@ class FrameForm(NamedTuple):
             name: the encoding.
             quality: quality of a JPEG; None for the codec's default.
             caller: name of the caller, for error texts.
-            bitrate: bits per second; None for even quality.
+            bitrate: bits per second; None for constant quality.
             stream: whether the request is for a stream; only streams may have :data:`VIDEO`.
 
         Raises:
@@ -72,12 +72,12 @@ class FrameForm(NamedTuple):
         """
         known = (*ENCODINGS, VIDEO) if stream else ENCODINGS
         if name not in known:
-            why = ": it is for streams only, since its frames depend on each other"
+            reason = ": it is for streams only, since its frames depend on each other"
             raise ConfigurationError(
                 f"{caller}: encoding: expected {', '.join(known)}, got {name!r:.40}"
-                f"{why if name == VIDEO else ''}"
+                f"{reason if name == VIDEO else ''}"
             )
-        for option, value, needed, least, most in (
+        for option, value, needed, low, high in (
             ("quality", quality, "jpeg", 1, 100),
             ("bitrate", bitrate, VIDEO, MIN_BITRATE, MAX_BITRATE),
         ):
@@ -85,9 +85,9 @@ class FrameForm(NamedTuple):
                 continue
             if name != needed:
                 raise ConfigurationError(f"{caller}: {option}: {name} has none, got {value!r:.40}")
-            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise ConfigurationError(
-                    f"{caller}: {option}: expected {least} to {most}, got {value!r:.40}"
+                    f"{caller}: {option}: expected {low} to {high}, got {value!r:.40}"
                 )
         return cls(str(name), cast("int | None", quality), cast("int | None", bitrate))
 
@@ -164,7 +164,7 @@ def _optional_fields(frame: Frame, clock_lead: float) -> dict[str, Any]:
 
 
 def _read_optional_fields(fields: dict[str, Any], captured: float, caller: str) -> dict[str, Any]:
-    """Read the fields from :func:`_optional_fields`; their times become this side's."""
+    """Read the fields from :func:`_optional_fields`; their times become times of this program."""
     chunks, remark, trigger = (
         fields.get("chunks", {}),
         fields.get("remark", ""),
@@ -201,7 +201,7 @@ def from_fields(
     Args:
         sent: fields from :func:`to_fields`.
         data: bytes of the frame.
-        captured: time of the capture by this side's ``time.monotonic()``.
+        captured: time of the capture by this program's ``time.monotonic()``.
         uncertainty: seconds by which ``captured`` may be wrong.
         lost: number of frames lost before this one.
         source: the camera's name.
@@ -236,7 +236,7 @@ def from_fields(
         height=height,
         stride=stride,
         captured=captured,
-        duration=duration + uncertainty,
+        duration=duration + uncertainty,  # the capture is in this time
         lost=lost,
         source=source,
         camera_info=camera_info,

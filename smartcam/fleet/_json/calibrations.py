@@ -1,7 +1,4 @@
-"""Serve the thesis' five calibration services in JSON on the fleet's bus.
-
-The thesis is the one on smart cameras that defined these services for ROS.
-"""
+"""Serve the five calibration services of the thesis with which smartcam began, in JSON."""
 
 from __future__ import annotations
 
@@ -21,11 +18,11 @@ from smartcam._thesis_calibration import (
 )
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import UnsupportedError
-from smartcam.fleet._frames.stream import FrameOrder
+from smartcam.fleet._frames.stream import FrameCall
 from smartcam.fleet._frames.wire import FrameForm
 from smartcam.fleet._json.services import Service, trigger_camera
 from smartcam.fleet._json.thesis import BusFields
-from smartcam.fleet._program.reading import interpret_run
+from smartcam.fleet._program.reading import interpret_single
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -35,7 +32,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._json.services import Work
     from smartcam.models import Localization
 
-GATE_TIMEOUT = 10.0
+RESERVATION_TIMEOUT = 10.0
 """Seconds to wait for the end of another program's reservation."""
 
 PICTURE_TIMEOUT = 20.0
@@ -50,58 +47,59 @@ class JsonCalibrationCamera:
     """
 
     def __init__(self, work: Work) -> None:
-        self._work, self._host, self._topics = work, work.host, work.topics
-        self.name: str = work.host.name
-        self.y_down: bool = work.host.settings.y_down
+        self._work, self._camera, self._topics = work, work.camera, work.topics
+        self.name: str = work.camera.name
+        self.y_down: bool = work.camera.settings.y_down
         self.unit: str
-        active = self._host.camera.active_application
+        active = self._camera.client.active_application
         self._spec, self.unit = localization_spec(self._topics.interpretation, active)
 
     async def localize(self) -> list[Localization]:
         """Trigger; return the localizations in the camera's own frame."""
-        reading = self._topics.make_interpretation(self._spec)
-        async with self._entered_gate():
-            (run,) = await trigger_camera(
-                self._work_with_timeout(DEFAULT_TRIGGER_TIMEOUT), reading, None
+        interpretation = self._topics.make_interpretation(self._spec)
+        async with self._kept_unreserved():
+            (group,) = await trigger_camera(
+                self._work_with_timeout(DEFAULT_TRIGGER_TIMEOUT), interpretation, None
             )
-        return checked_localizations(interpret_run(run, reading, self.name)[0], self.name)
+        value, _, _ = interpret_single(group, interpretation, self.name)
+        return checked_localizations(value, self.name)
 
     async def take_picture(self) -> Any:
         """Return the grey levels of a picture of the camera."""
-        host = self._host
-        if host.frames.make is not None:
+        camera = self._camera
+        if camera.frames.make is not None:
             timeout = min(self._work.timeout, PICTURE_TIMEOUT)
-            order = FrameOrder("", self._work.owner.call, FrameForm(), timeout)
-            frame, _ = await host.frames.get_frame(order, max_age=None, after=None, fresh=True)
+            call = FrameCall("", self._work.owner.call, FrameForm(), timeout)
+            frame, _ = await camera.frames.get_frame(call, max_age=None, after=None, fresh=True)
             return await asyncio.to_thread(frame.grey)
-        if not host.camera.capabilities.read_image:
+        if not camera.client.capabilities.read_image:
             raise UnsupportedError(
                 f"{self.name}: its protocol sends no pictures; expected frames: in the fleet file, "
                 "or a topic with pictures"
             )
         with from_part("calibration", "the calibration services need"):
             from smartcam.calibration._inside import decode_picture
-        async with self._entered_gate():
+        async with self._kept_unreserved():
             await trigger_camera(self._work_with_timeout(DEFAULT_TRIGGER_TIMEOUT), None, None)
-            data = await host.require().read_image(timeout=PICTURE_TIMEOUT)
+            data = await camera.require_client().read_image(timeout=PICTURE_TIMEOUT)
         return await asyncio.to_thread(decode_picture, data, self.name)
 
     @contextlib.asynccontextmanager
-    async def _entered_gate(self) -> AsyncIterator[None]:
+    async def _kept_unreserved(self) -> AsyncIterator[None]:
         """Keep other programs from reserving the camera during the block."""
-        program = f"{self._work.request.program or 'a program'} without smartcam"
-        await self._host.enter(program, "a calibration", GATE_TIMEOUT)
+        program = f"{self._work.request.program or 'a program'} (not a smartcam client)"
+        await self._camera.enter_gate(program, "a calibration", RESERVATION_TIMEOUT)
         try:
             yield
         finally:
-            self._host.gate.leave(program)
+            self._camera.gate.leave(program)
 
     def _work_with_timeout(self, seconds: float) -> Work:
         """Return the running service with a timeout of at most ``seconds``."""
         return self._work._replace(timeout=min(self._work.timeout, seconds))
 
 
-class JsonCalibrationHost:
+class JsonCalibrationOwner:
     """An agent's camera as the five calibration services use it.
 
     Args:
@@ -110,11 +108,11 @@ class JsonCalibrationHost:
 
     def __init__(self, work: Work) -> None:
         self._work = work
-        self.name: str = work.host.name
+        self.name: str = work.camera.name
 
     @property
-    def calibrations(self) -> ThesisCalibration | None:
-        """The calibrations of the camera; None if there is no folder for them."""
+    def thesis_calibration(self) -> ThesisCalibration | None:
+        """The object that calibrates the camera; None if there is no folder for it."""
         calibrations = self._work.calibrations
         return None if calibrations is None else calibrations.of(self.name)
 
@@ -131,16 +129,16 @@ def _bus_service(name: str) -> Service:
     )
 
     async def carry_out(work: Work) -> dict[str, Any]:
-        call = CalibrationCall(JsonCalibrationHost(work), work.request, work.timeout)
+        call = CalibrationCall(JsonCalibrationOwner(work), work.request, work.timeout)
         fields = {key: plain(value) for key, value in (await wizard_service.do(call)).items()}
         return {**fields, "kind": "CalibrationError"} if fields.get("error") else fields
 
     empty_fields: dict[str, Any] = {"pose": None} if name == "TransformPixelPose" else {}
-    # the triggers of a service wait for the end of a reservation by themselves
+    # no command, which would wait for the end of a reservation: each of its triggers waits itself
     return Service(
         request,
         carry_out,
-        command=False,
+        is_command=False,
         timeout=wizard_service.timeout,
         empty_fields=empty_fields,
     )

@@ -14,13 +14,13 @@ from smartcam._client._inside import TriggerRequest
 from smartcam._thesis import DEFAULT_TIMEOUT, MAX_TIMEOUT
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import FrameFormatError, UnsupportedError
-from smartcam.fleet._agent.calls import ACTIONS, MAX_REPLY_BYTES, ProgramCall, trigger_runs
-from smartcam.fleet._agent.shared import AgentInterpretation
+from smartcam.fleet._agent.calls import ACTIONS, MAX_REPLY_BYTES, ProgramCall, trigger_encoded
+from smartcam.fleet._agent.client import AgentInterpretation
 from smartcam.fleet._bus.keys import COMMANDS
-from smartcam.fleet._bus.wire import decode_own_run
-from smartcam.fleet._frames.stream import FrameOrder
+from smartcam.fleet._bus.wire import decode_local_group
+from smartcam.fleet._frames.stream import FrameCall
 from smartcam.fleet._frames.wire import FrameForm, to_fields
-from smartcam.fleet._program.reading import result_fields, split_run
+from smartcam.fleet._program.reading import result_fields, split_group
 from smartcam.models import Status
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
     from smartcam._client._inside import Interpretation
     from smartcam.calibration._inside import CalibrationsByCamera
-    from smartcam.fleet._agent.host import Host
-    from smartcam.fleet._agent.shared import Owner
-    from smartcam.fleet._bus.wire import ResultRun
+    from smartcam.fleet._agent.client import Owner
+    from smartcam.fleet._agent.shared_camera import SharedCamera
+    from smartcam.fleet._bus.wire import ResultGroup
     from smartcam.fleet._json.topics import CameraTopics
     from smartcam.frames import Frame
 
@@ -41,7 +41,7 @@ MAX_INPUT_BYTES = 1 << 16
 MAX_PICTURE_BYTES = 1 << 20
 """Largest number of bytes of a frame in an answer."""
 
-MAX_ID_CHARACTERS = 200
+MAX_ID_LENGTH = 200
 
 
 def _check_hex(text: str) -> str:
@@ -53,16 +53,12 @@ def _check_hex(text: str) -> str:
 
 
 def _check_id(value: object) -> str | int:
-    if (
-        isinstance(value, int)
-        and not isinstance(value, bool)
-        and abs(value) < 10**MAX_ID_CHARACTERS
-    ):
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 10**MAX_ID_LENGTH:
         return value
-    if isinstance(value, str) and 1 <= len(value.encode(errors="replace")) <= MAX_ID_CHARACTERS:
+    if isinstance(value, str) and 1 <= len(value.encode(errors="replace")) <= MAX_ID_LENGTH:
         return value
     raise ValueError(
-        f"expected a text of 1 to {MAX_ID_CHARACTERS} bytes, or an integer of so many digits"
+        f"expected a text of 1 to {MAX_ID_LENGTH} bytes, or an integer of at most as many digits"
     )
 
 
@@ -83,7 +79,7 @@ Deadline = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Interpret = Annotated[str, Field(max_length=10_000)]
 
 
-class PlainRequest(BaseModel):
+class JsonRequest(BaseModel):
     """A request with the fields that every request may have."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -95,7 +91,7 @@ class PlainRequest(BaseModel):
     deadline: Deadline | None = None
 
 
-class _PlainTrigger(PlainRequest):
+class _JsonTrigger(JsonRequest):
     application: Number | None = None
     input: Hex | None = None
     results_per_trigger: Annotated[int, Field(ge=1, le=MAX_RESULTS)] | None = None
@@ -103,49 +99,49 @@ class _PlainTrigger(PlainRequest):
     interpret_as: Interpret | None = None
 
 
-class _PlainSwitch(PlainRequest):
+class _JsonSwitch(JsonRequest):
     application: Number | Text
 
 
-class _PlainInput(PlainRequest):
+class _JsonInput(JsonRequest):
     input: Hex
 
 
-class _PlainNumber(PlainRequest):
+class _JsonNumber(JsonRequest):
     number: Number
 
 
-class _PlainClock(PlainRequest):
+class _JsonClock(JsonRequest):
     when: Annotated[Text, AfterValidator(_check_time_text)]
 
 
-class _PlainResults(PlainRequest):
+class _JsonResults(JsonRequest):
     first: Annotated[int, Field(ge=1)] | None = None
     most: Annotated[int, Field(ge=1, le=MAX_RESULTS)] = 100
 
 
-class _PlainFrame(PlainRequest):
+class _JsonFrame(JsonRequest):
     encoding: Literal["jpeg", "png", "jpegxl"] = "jpeg"
     quality: Annotated[int, Field(ge=1, le=100)] | None = None
     max_age: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     fresh: bool = False
 
 
-class _PlainTriggerFrame(PlainRequest):
+class _JsonTriggerFrame(JsonRequest):
     encoding: Literal["jpeg", "png", "jpegxl"] = "jpeg"
     quality: Annotated[int, Field(ge=1, le=100)] | None = None
     when_busy: Literal["wait", "refuse"] = "wait"
 
 
-class _PlainFeatures(PlainRequest):
+class _JsonFeatures(JsonRequest):
     name: Name | None = None
 
 
-class _PlainFeature(PlainRequest):
+class _JsonFeature(JsonRequest):
     name: Name
 
 
-class _PlainSetFeature(PlainRequest):
+class _JsonSetFeature(JsonRequest):
     name: Name
     value: bool | int | Annotated[float, Field(allow_inf_nan=False)] | Interpret
 
@@ -154,15 +150,15 @@ class Work(NamedTuple):
     """A running service.
 
     Attributes:
-        host: the camera.
+        camera: the camera.
         topics: topics of the camera in JSON.
         request: request of the service's class.
         timeout: seconds of the service's timeout.
         owner: owner of the results of the service's trigger.
-        calibrations: calibrations of the agent's cameras; None if there is no folder for them.
+        calibrations: calibrations of the agent's cameras, by name; None without a folder for them.
     """
 
-    host: Host
+    camera: SharedCamera
     topics: CameraTopics
     request: Any
     timeout: float
@@ -177,14 +173,15 @@ class Service(NamedTuple):
         request: class of the requests.
         carry_out: function that carries out the service, and returns the fields of the answer
             without ``error``.
-        command: whether the service waits while another program has reserved the camera.
+        is_command: whether it commands the camera, so that it waits while another program has
+            reserved the camera.
         timeout: seconds of the timeout for a request without one.
         empty_fields: fields of an answer with an error, besides those of the error.
     """
 
-    request: type[PlainRequest]
+    request: type[JsonRequest]
     carry_out: Callable[[Work], Awaitable[dict[str, Any]]]
-    command: bool = True
+    is_command: bool = True
     timeout: float = DEFAULT_TIMEOUT
     empty_fields: Mapping[str, Any] = MappingProxyType({})
 
@@ -197,16 +194,16 @@ async def trigger_camera(
     data: bytes | None = None,
     result_count: int = 1,
     wait: bool = True,
-) -> list[ResultRun]:
-    """Trigger; return the trigger's containers, each as a run of one container.
+) -> list[ResultGroup]:
+    """Trigger; return the trigger's containers, each as a group of one container.
 
     Raises:
         SmartCamError: like :meth:`smartcam.Camera.trigger`.
     """
     layouts = interpretation.numbered_layouts() if interpretation is not None else None
     request = TriggerRequest(AgentInterpretation(work.owner, layouts), data, result_count, wait)
-    runs = await trigger_runs(work.host, work.owner, request, application, work.timeout)
-    return [single for run in runs for single in split_run(decode_own_run(run))]
+    groups = await trigger_encoded(work.camera, work.owner, request, application, work.timeout)
+    return [single for group in groups for single in split_group(decode_local_group(group))]
 
 
 async def _trigger(work: Work) -> dict[str, Any]:
@@ -214,7 +211,7 @@ async def _trigger(work: Work) -> dict[str, Any]:
     interpretation = topics.interpretation
     if request.interpret_as is not None:
         interpretation = topics.make_interpretation(request.interpret_as)
-    runs = await trigger_camera(
+    groups = await trigger_camera(
         work,
         interpretation,
         request.application,
@@ -222,7 +219,7 @@ async def _trigger(work: Work) -> dict[str, Any]:
         result_count=request.results_per_trigger or 1,
         wait=request.when_busy == "wait",
     )
-    results = [result_fields(run, interpretation, work.host.name) for run in runs]
+    results = [result_fields(group, interpretation, work.camera.name) for group in groups]
     answer: dict[str, Any] = {"result": results[0]}
     if request.results_per_trigger is not None:
         answer = {"results": results}
@@ -243,7 +240,7 @@ def _service_of_call(action: str) -> Callable[[Work], Awaitable[dict[str, Any]]]
     async def service(work: Work) -> dict[str, Any]:
         arguments: dict[str, Any] = work.request.model_dump(exclude=_COMMON_FIELDS)
         blobs = [bytes.fromhex(arguments.pop(name)) for name in ("input",) if name in arguments]
-        call = ProgramCall(work.host, "", work.owner, arguments, blobs, work.timeout, {})
+        call = ProgramCall(work.camera, "", work.owner, arguments, blobs, work.timeout, {})
         fields, attached = await ACTIONS[action](call)
         if "status" in fields:
             fields["status_names"] = Status(fields["status"]).names
@@ -253,42 +250,45 @@ def _service_of_call(action: str) -> Callable[[Work], Awaitable[dict[str, Any]]]
 
 
 async def _results(work: Work) -> dict[str, Any]:
-    log, most = work.host.results, work.request.most
-    first = max(1, log.following - most) if work.request.first is None else work.request.first
+    log, max_count = work.camera.results, work.request.most
+    first = work.request.first
+    if first is None:
+        first = max(1, log.next_number - max_count)
     part = log.read_part(first, MAX_REPLY_BYTES)
-    runs = map(decode_own_run, part.data)
-    matching = (single for run in runs for single in split_run(run) if single.number >= part.first)
-    results = [work.topics.result(single) for single in itertools.islice(matching, most)]
-    return {"first": part.first, "next_result": part.following, "results": results}
+    groups = map(decode_local_group, part.data)
+    each = (single for group in groups for single in split_group(group))
+    matching = (single for single in each if single.number >= part.first)
+    results = [work.topics.result(single) for single in itertools.islice(matching, max_count)]
+    return {"first": part.first, "next_result": part.next_number, "results": results}
 
 
 async def _frame(work: Work) -> dict[str, Any]:
-    request, host = work.request, work.host
-    encoding = FrameForm.checked(request.encoding, request.quality, host.name)
-    order = FrameOrder("", work.owner.call, encoding, work.timeout)
-    frame, encoding_time = await host.frames.get_frame(
-        order, max_age=request.max_age, after=None, fresh=request.fresh
+    request, camera = work.request, work.camera
+    encoding = FrameForm.checked(request.encoding, request.quality, camera.name)
+    call = FrameCall("", work.owner.call, encoding, work.timeout)
+    frame, encoding_time = await camera.frames.get_frame(
+        call, max_age=request.max_age, after=None, fresh=request.fresh
     )
-    return _frame_answer(host, encoding, frame, encoding_time)
+    return _frame_answer(camera, encoding, frame, encoding_time)
 
 
 async def _trigger_frame(work: Work) -> dict[str, Any]:
-    request, host = work.request, work.host
-    encoding = FrameForm.checked(request.encoding, request.quality, host.name)
-    order = FrameOrder("", work.owner.call, encoding, work.timeout)
-    frame, encoding_time = await host.frames.trigger_frame(order, wait=request.when_busy == "wait")
-    return _frame_answer(host, encoding, frame, encoding_time)
+    request, camera = work.request, work.camera
+    encoding = FrameForm.checked(request.encoding, request.quality, camera.name)
+    call = FrameCall("", work.owner.call, encoding, work.timeout)
+    frame, encoding_time = await camera.frames.trigger_frame(call, wait=request.when_busy == "wait")
+    return _frame_answer(camera, encoding, frame, encoding_time)
 
 
 def _frame_answer(
-    host: Host, encoding: FrameForm, frame: Frame, encoding_time: float
+    camera: SharedCamera, encoding: FrameForm, frame: Frame, encoding_time: float
 ) -> dict[str, Any]:
     """Return the fields of an answer that has a frame."""
     if len(frame.data) > MAX_PICTURE_BYTES:
         raise FrameFormatError(
-            f"{host.name}: the frame has {len(frame.data)} bytes as {encoding.name}, expected "
+            f"{camera.name}: the frame has {len(frame.data)} bytes as {encoding.name}, expected "
             f"{MAX_PICTURE_BYTES} at most",
-            source=host.name,
+            source=camera.name,
         )
     fields = to_fields(frame, 0.0, encoding_time, 0)
     public_fields = {
@@ -301,44 +301,44 @@ def _frame_answer(
 
 
 async def _unknown(work: Work) -> dict[str, Any]:
-    raise UnsupportedError(f"{work.host.name}: there is no such service")
+    raise UnsupportedError(f"{work.camera.name}: there is no such service")
 
 
-UNKNOWN = Service(PlainRequest, _unknown)
+UNKNOWN = Service(JsonRequest, _unknown)
 """Service that stands for all services that do not exist."""
 
-_COMMON_FIELDS = {*PlainRequest.model_fields}
+_COMMON_FIELDS = {*JsonRequest.model_fields}
 
-_REQUESTS: dict[str, type[PlainRequest]] = {
-    "switch_application": _PlainSwitch,
-    "start": PlainRequest,
-    "stop": PlainRequest,
-    "reset_errors": PlainRequest,
-    "set_input": _PlainInput,
-    "set_sequence_number": _PlainNumber,
-    "set_clock": _PlainClock,
-    "reboot": PlainRequest,
-    "take_back": PlainRequest,
-    "query_status": PlainRequest,
-    "query_application": PlainRequest,
-    "wait_ready": PlainRequest,
-    "get_clock": PlainRequest,
-    "read_image": PlainRequest,
-    "features": _PlainFeatures,
-    "set_feature": _PlainSetFeature,
-    "execute_feature": _PlainFeature,
+_REQUESTS: dict[str, type[JsonRequest]] = {
+    "switch_application": _JsonSwitch,
+    "start": JsonRequest,
+    "stop": JsonRequest,
+    "reset_errors": JsonRequest,
+    "set_input": _JsonInput,
+    "set_sequence_number": _JsonNumber,
+    "set_clock": _JsonClock,
+    "reboot": JsonRequest,
+    "take_back": JsonRequest,
+    "query_status": JsonRequest,
+    "query_application": JsonRequest,
+    "wait_ready": JsonRequest,
+    "get_clock": JsonRequest,
+    "read_image": JsonRequest,
+    "features": _JsonFeatures,
+    "set_feature": _JsonSetFeature,
+    "execute_feature": _JsonFeature,
 }
 """Class of the requests, for each service that does the same as a call of smartcam's programs."""
 
 SERVICES: dict[str, Service] = {
-    "trigger": Service(_PlainTrigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
-    "status": Service(PlainRequest, _status, command=False),
-    "results": Service(_PlainResults, _results, command=False),
-    "frame": Service(_PlainFrame, _frame, command=False),
-    "trigger_frame": Service(_PlainTriggerFrame, _trigger_frame),
+    "trigger": Service(_JsonTrigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
+    "status": Service(JsonRequest, _status, is_command=False),
+    "results": Service(_JsonResults, _results, is_command=False),
+    "frame": Service(_JsonFrame, _frame, is_command=False),
+    "trigger_frame": Service(_JsonTriggerFrame, _trigger_frame),
     **{
         action: Service(request, _service_of_call(action), action in COMMANDS)
         for action, request in _REQUESTS.items()
     },
 }
-"""The plain services by name."""
+"""The services in JSON by name."""

@@ -1,7 +1,4 @@
-"""Serve the thesis' camera services in JSON on the fleet's bus.
-
-The thesis is the one on smart cameras that defined these services for ROS.
-"""
+"""Serve the six camera services of the thesis with which smartcam began, in JSON on the bus."""
 
 from __future__ import annotations
 
@@ -17,13 +14,13 @@ from smartcam.fleet._agent.calls import ACTIONS, ProgramCall
 from smartcam.fleet._json.services import (
     Deadline,
     Id,
-    PlainRequest,
+    JsonRequest,
     Service,
     Text,
     Work,
     trigger_camera,
 )
-from smartcam.fleet._program.reading import interpret_run
+from smartcam.fleet._program.reading import interpret_single
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
@@ -39,7 +36,7 @@ def _none_if_empty(value: object) -> object:
     return None if is_empty else value
 
 
-class BusFields(PlainRequest):
+class BusFields(JsonRequest):
     """The fields that a request may have only on the bus, not over ROS."""
 
     camera_name: Annotated[str, Field(min_length=1, max_length=200)]
@@ -73,9 +70,9 @@ class JsonThesisCamera:
     """
 
     def __init__(self, work: Work) -> None:
-        self._work, self._host, self._topics = work, work.host, work.topics
-        self.name: str = work.host.name
-        self.address: Address = work.host.settings.address
+        self._work, self._camera, self._topics = work, work.camera, work.topics
+        self.name: str = work.camera.name
+        self.address: Address = work.camera.settings.address
 
     @property
     def stopped(self) -> bool:
@@ -89,20 +86,21 @@ class JsonThesisCamera:
     @property
     def application(self) -> int | None:
         """The id of the active application; None if that is not known."""
-        return self._host.camera.active_application
+        return self._camera.client.active_application
 
     @property
-    def reading(self) -> Interpretation | None:
+    def interpretation(self) -> Interpretation | None:
         """Interpretation of results for JSON."""
         return self._topics.interpretation
 
-    def check_reading(self, spec: str) -> None:
+    def check_interpretation(self, spec: str) -> None:
         """Raise ConfigurationError if results cannot be interpreted by ``spec``."""
         self._topics.make_interpretation(spec)
 
-    def read_as(self, spec: str | None) -> None:
+    def interpret_as(self, spec: str | None) -> None:
         """Interpret results by ``spec`` from now on; None: by the settings."""
-        self._topics.set_interpretation(self._host.settings.interpret_as if spec is None else spec)
+        own_spec = self._camera.settings.interpret_as
+        self._topics.set_interpretation(own_spec if spec is None else spec)
 
     def is_calibrated(self, application: int) -> bool:
         """Return False: JSON has poses in the camera's frame."""
@@ -124,26 +122,26 @@ class JsonThesisCamera:
         """End publishing on the topics that requests have named."""
         self._topics.end_publishing()
 
-    async def have_session(self) -> None:
+    async def require_session(self) -> None:
         """Raise an error with the reason if there is no session."""
-        self._host.require()
+        self._camera.require_client()
 
     async def ensure(self, application: int, timeout: float) -> None:
         """Load and run an application."""
-        await self._host.require().ensure_application(application, timeout)
+        await self._camera.require_client().ensure_application(application, timeout)
 
     async def switch(self, application: int, timeout: float) -> None:
         """Load an application."""
         arguments = {"application": application}
         await ACTIONS["switch_application"](
-            ProgramCall(self._host, "", self._work.owner, arguments, [], timeout, {})
+            ProgramCall(self._camera, "", self._work.owner, arguments, [], timeout, {})
         )
 
     async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
         """Trigger; return the result's application, and its value by ``spec``."""
-        reading = self._topics.make_interpretation(spec)
-        (run,) = await trigger_camera(self._work, reading, application)
-        return run.application, interpret_run(run, reading, self.name)[0]
+        interpretation = self._topics.make_interpretation(spec)
+        (group,) = await trigger_camera(self._work, interpretation, application)
+        return group.application, interpret_single(group, interpretation, self.name)[0]
 
 
 def _check_topic(text: str) -> str:
@@ -180,7 +178,7 @@ def _bus_service(name: str) -> Service:
     return Service(
         request,
         carry_out,
-        command=is_command,
+        is_command=is_command,
         timeout=thesis_service.timeout,
         empty_fields=empty_fields,
     )

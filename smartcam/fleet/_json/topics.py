@@ -12,17 +12,17 @@ from smartcam._client._inside import Interpretation
 from smartcam._json import object_json
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._program.program_name import in_words
-from smartcam.fleet._program.reading import result_fields, split_run
+from smartcam.fleet._program.reading import result_fields, split_group
 from smartcam.models import Connected, Disconnected, Reconnected, Status, StatusChanged, jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from smartcam.fleet._agent.gate import Change
-    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._agent.shared_camera import SharedCamera
     from smartcam.fleet._bus.bus import Bus, Handle, Publisher
     from smartcam.fleet._bus.keys import Keys
-    from smartcam.fleet._bus.wire import ResultRun
+    from smartcam.fleet._bus.wire import ResultGroup
     from smartcam.models import CameraEvent
 
 MAX_QUEUED_BYTES = 1 << 24
@@ -92,7 +92,7 @@ class Topics:
 
 @dataclass(eq=False)
 class Publication:
-    """Publishes the results of one camera under the topic of a request, with a delay.
+    """Publishes the results of one camera under the topic that a service call named, with a delay.
 
     Args:
         publisher: publisher of the results.
@@ -103,26 +103,26 @@ class Publication:
     publisher: Publisher
     min_delay: float
     queue_size: int
-    _queue: collections.deque[ResultRun] = field(default_factory=collections.deque["ResultRun"])
+    _queue: collections.deque[ResultGroup] = field(default_factory=collections.deque["ResultGroup"])
     _bytes: int = 0
     _timer: asyncio.TimerHandle | None = None
 
-    def offer(self, runs: Iterable[ResultRun], topics: CameraTopics) -> None:
-        """Queue results, and send them as the delay allows; each run has one container."""
+    def offer(self, groups: Iterable[ResultGroup], topics: CameraTopics) -> None:
+        """Queue results, and send them as the delay allows; each group has one container."""
         if not self.publisher.has_subscribers:
             return
-        for run in runs:
-            self._queue.append(run)
-            self._bytes += run.size
+        for group in groups:
+            self._queue.append(group)
+            self._bytes += group.size
             self._send_queued(topics)
             while len(self._queue) > self.queue_size or self._bytes > MAX_QUEUED_BYTES:
                 self._bytes -= self._queue.popleft().size
 
     def _send_queued(self, topics: CameraTopics) -> None:
         while self._queue and self._timer is None:
-            run = self._queue.popleft()
-            self._bytes -= run.size
-            self.publisher.put(as_json(topics.result(run)))
+            group = self._queue.popleft()
+            self._bytes -= group.size
+            self.publisher.put(as_json(topics.result(group)))
             if self.min_delay:
                 loop = asyncio.get_running_loop()
                 self._timer = loop.call_later(self.min_delay, self._on_delay_over, topics)
@@ -143,22 +143,22 @@ class CameraTopics:
     """The topics in JSON of one camera.
 
     Args:
-        host: the camera.
+        camera: the camera.
         topics: topics of the camera's agent.
 
     Attributes:
         interpret_as: interpreter or layout of the camera's containers, for values in JSON.
         interpretation: interpretation of the containers; None if their contents are not known.
         trouble: reason why there is no session; empty if there is one.
-        stopped: whether SmartcameraStop, a service of the thesis' interface, has closed the camera
-            for the services of that interface.
+        stopped: whether SmartcameraStop, a service of the thesis with which smartcam began, has
+            closed the camera for those services.
         next_status, next_event: numbers of the next status and of the next event.
-        status_out: publisher of the status under the topic of a request.
-        results_out: publication of the results under the topic of a request.
+        status_out: publisher of the status under the topic that a service call named.
+        results_out: publication of the results under the topic that a service call named.
     """
 
-    def __init__(self, host: Host, topics: Topics) -> None:
-        self._host, self._topics = host, topics
+    def __init__(self, camera: SharedCamera, topics: Topics) -> None:
+        self._camera, self._topics = camera, topics
         self.trouble: str = ""
         self.stopped: bool = False
         self.status_out: Publisher | None = None
@@ -166,7 +166,7 @@ class CameraTopics:
         self.next_status: int = 1
         self.next_event: int = 1
         self._last_status: Status | None = None
-        self.set_interpretation(host.settings.interpret_as)
+        self.set_interpretation(camera.settings.interpret_as)
 
     def set_interpretation(self, spec: Any) -> None:
         """Interpret the camera's containers by ``spec`` from now on; None: not at all.
@@ -185,11 +185,11 @@ class CameraTopics:
         Raises:
             ConfigurationError: ``spec`` is not valid.
         """
-        settings = self._host.settings
+        settings = self._camera.settings
         return Interpretation(spec, lenient=settings.lenient, y_down=settings.y_down)
 
     def publish_status(self, topic: str) -> str:
-        """Publish the status under a topic of the thesis' interface; return its key.
+        """Publish the status under a topic of the thesis' services; return its key.
 
         This replaces the previous topic; an empty name only ends it.
         """
@@ -202,7 +202,7 @@ class CameraTopics:
         return key
 
     def publish_results(self, topic: str, min_delay: float, queue_size: int) -> str:
-        """Publish results under a topic of the thesis' interface; return its key.
+        """Publish results under a topic of the thesis' services; return its key.
 
         This replaces the previous topic; an empty name only ends it.
         """
@@ -216,77 +216,77 @@ class CameraTopics:
         return key
 
     def end_publishing(self) -> None:
-        """End all publishing under topics of requests."""
+        """End all publishing under topics that service calls named."""
         self.publish_status("")
         self.publish_results("", 0.0, 0)
 
     def close(self) -> None:
         """End all publishing of a camera that is no longer shared."""
         self.end_publishing()
-        self._topics.close_camera(self._host.name)
+        self._topics.close_camera(self._camera.name)
 
     # ------------------------------------------------------------------ fields for JSON
 
-    def result(self, run: ResultRun) -> dict[str, Any]:
-        """Return the fields of a result; ``run`` has one container."""
-        fields = result_fields(run, self.interpretation, self._host.name)
+    def result(self, group: ResultGroup) -> dict[str, Any]:
+        """Return the fields of a result; ``group`` has one container."""
+        fields = result_fields(group, self.interpretation, self._camera.name)
         return {**self._topics.identity, **fields}
 
     def state(self) -> dict[str, Any]:
         """Return the fields of the camera's current state."""
-        host = self._host
-        state = host.state_fields()
+        camera = self._camera
+        state = camera.state_fields()
         bits: int | None = state["status"]
         return {
-            "camera": host.name,
+            "camera": camera.name,
             **self._topics.identity,
             "connected": state["connected"],
-            "failure": str(host.failure or self.trouble),
+            "failure": str(camera.failure or self.trouble),
             "status": bits,
             "status_names": [] if bits is None else Status(bits).names,
             "application": state["application"],
-            "reserved_by": None if host.gate.holder is None else in_words(host.gate.holder),
+            "reserved_by": None if camera.gate.holder is None else in_words(camera.gate.holder),
         }
 
     def listing(self) -> dict[str, Any]:
         """Return all known fields of the camera."""
-        host = self._host
+        camera = self._camera
         dialect = capabilities = None
         try:
-            features = host.camera.capabilities
+            features = camera.client.capabilities
         except SmartCamError:
             pass  # there was no session yet
         else:
             dialect, capabilities = features.dialect, features.names
         return {
             **self.state(),
-            "url": host.camera.url,
-            "protocol": host.settings.address.protocol,
+            "url": camera.client.url,
+            "protocol": camera.settings.address.protocol,
             "dialect": dialect,
-            "protocol_version": host.camera.protocol_version,
+            "protocol_version": camera.client.protocol_version,
             "capabilities": capabilities,
             "interpret_as": jsonable(self.interpret_as),
-            "y_down": host.settings.y_down,
-            "lenient": host.settings.lenient,
-            "frames": host.frames.url,
-            "next_result": host.results.following,
+            "y_down": camera.settings.y_down,
+            "lenient": camera.settings.lenient,
+            "frames": camera.frames.url,
+            "next_result": camera.results.next_number,
         }
 
     # ------------------------------------------------------------------ from the camera
 
-    def on_run(self, run: ResultRun) -> None:
+    def on_group(self, group: ResultGroup) -> None:
         """Publish received containers."""
-        out = self._topics.publisher_of("results", self._host.name)
+        out = self._topics.publisher_of("results", self._camera.name)
         if out is not None:
-            for single in split_run(run):
+            for single in split_group(group):
                 out.put(as_json(self.result(single)))
         if self.results_out is not None:
-            self.results_out.offer(split_run(run), self)
+            self.results_out.offer(split_group(group), self)
 
     def on_state(self) -> None:
         """Number the camera's state, and publish it if there is a subscriber."""
         number, self.next_status = self.next_status, self.next_status + 1
-        out = self._topics.publisher_of("status", self._host.name)
+        out = self._topics.publisher_of("status", self._camera.name)
         if out is None and self.status_out is None:
             return
         publishers = [out, self.status_out]
@@ -302,8 +302,8 @@ class CameraTopics:
         previous, self._last_status = self._last_status, status
         if status != previous:
             number, self.next_event = self.next_event, self.next_event + 1
-            if self._topics.publisher_of("events", self._host.name) is not None:
-                at, name = datetime.now(UTC), self._host.name
+            if self._topics.publisher_of("events", self._camera.name) is not None:
+                at, name = datetime.now(UTC), self._camera.name
                 changed = StatusChanged(camera=name, at=at, status=status, previous=previous)
                 self._publish_event(changed, number)
 
@@ -319,15 +319,15 @@ class CameraTopics:
     def on_reservation(self, change: Change, program: str) -> None:
         """Publish that a program has reserved the camera, or no longer has."""
         number, self.next_event = self.next_event, self.next_event + 1
-        fields = {"camera": self._host.name, "at": jsonable(datetime.now(UTC))}
-        fields["by"] = in_words(program)
+        fields = {"camera": self._camera.name, "at": jsonable(datetime.now(UTC))}
+        fields["program"] = in_words(program)
         self._put_event(change, fields, number)
 
     def _publish_event(self, event: CameraEvent, number: int) -> None:
-        if self._topics.publisher_of("events", self._host.name) is not None:
+        if self._topics.publisher_of("events", self._camera.name) is not None:
             self._put_event(type(event).__name__, jsonable(event), number)
 
     def _put_event(self, kind: str, fields: dict[str, Any], number: int) -> None:
-        out = self._topics.publisher_of("events", self._host.name)
+        out = self._topics.publisher_of("events", self._camera.name)
         if out is not None:
             out.put(as_json({**self._topics.identity, "number": number, "event": kind, **fields}))

@@ -1,4 +1,4 @@
-"""Convert an agent's numbers to Prometheus' families and their text.
+"""Convert an agent's counts to Prometheus' families and their text.
 
 To write the text for a thousand cameras takes a tenth of a second. A thread that writes it would
 block the event loop for 5 ms at a time (Python's switch interval). So the event loop writes the
@@ -18,12 +18,13 @@ from smartcam.fleet._operations.trigger_counts import RESULT, SUMS, cumulative_b
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from smartcam.fleet._operations.metrics import AgentNumbers, CameraNumbers
+    from smartcam.fleet._operations.metrics import AgentCounts, CameraCounts
+    from smartcam.models import Histogram
 
 MAX_LINES_PER_TURN = 80
 """Largest number of lines that are written in one step."""
 
-_SUMS = {
+_SUM_TEXTS = {
     "bytes_received": ("smartcam_received_bytes", "Bytes from cameras"),
     "bytes_sent": ("smartcam_sent_bytes", "Bytes to cameras"),
     "frames_received": ("smartcam_received_messages", "Whole messages from cameras"),
@@ -47,16 +48,16 @@ _GAUGES = (
     ("smartcam_agent_commands_waiting", "waiting_commands", "Commands that wait for a reservation"),
     ("smartcam_agent_reserved_cameras", "reserved", "Cameras that a program has reserved"),
     ("smartcam_agent_kept_results", "kept_results", "Results kept for programs that were cut off"),
-    ("smartcam_agent_kept_results_bytes", "kept_bytes", "Their bytes"),
+    ("smartcam_agent_kept_results_bytes", "kept_bytes", "Bytes of the kept results"),
     ("smartcam_agent_bus_queue_bytes", "bus_bytes", "Bytes that wait to be sent on the bus"),
 )
 
 
-async def exposition(numbers: AgentNumbers | None, *, per_camera: bool) -> tuple[bytes, str]:
-    """Return the text of an agent's numbers, and its content type.
+async def exposition(counts: AgentCounts | None, *, per_camera: bool) -> tuple[bytes, str]:
+    """Return the text of an agent's counts, and its content type.
 
     Args:
-        numbers: the agent's numbers; None: the agent does not run.
+        counts: the agent's counts; None: the agent does not run.
         per_camera: whether there is a histogram for each camera.
 
     Raises:
@@ -64,15 +65,15 @@ async def exposition(numbers: AgentNumbers | None, *, per_camera: bool) -> tuple
     """
     client = require_prometheus()
     parts: list[bytes] = [await asyncio.to_thread(_process_text, client)]
-    if numbers is not None:
-        for family in _agent_families(client.core, numbers):
+    if counts is not None:
+        for family in _agent_families(client.core, counts):
             parts.append(_text(client, family))
             await asyncio.sleep(0)
         for kind in _KINDS if per_camera else (*_KINDS[:-1], _SUMMARY):
-            cameras = [camera for camera in numbers.cameras if kind.applies(camera)]
+            cameras = [camera for camera in counts.cameras if kind.applies(camera)]
             size = max(1, MAX_LINES_PER_TURN // kind.lines)
             for begin in range(0, len(cameras), size):
-                family = kind.make_family(client.core, numbers.agent, cameras[begin : begin + size])
+                family = kind.make_family(client.core, counts.agent, cameras[begin : begin + size])
                 text = _text(client, family)
                 # only the first part of a family begins with the help text
                 parts.append(text.split(b"\n", 2)[2] if begin else text)
@@ -116,115 +117,117 @@ def _process_text(client: Any) -> bytes:
 # ---------------------------------------------------------------------- the agent's families
 
 
-def _agent_families(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
-    values = [numbers.agent]
+def _agent_families(core: Any, counts: AgentCounts) -> Iterator[Any]:
+    agent_label = [counts.agent]
     family = core.InfoMetricFamily("smartcam_agent", "The agent of a fleet", labels=["agent"])
-    family.add_metric(values, {"fleet": numbers.fleet, "version": _version()})
+    family.add_metric(agent_label, {"fleet": counts.fleet, "version": _version()})
     yield family
-    gauges = [(name, text, numbers.gauges[key]) for name, key, text in _GAUGES]
+    gauges = [(name, text, counts.gauges[key]) for name, key, text in _GAUGES]
     gauges += [
-        ("smartcam_agent_start_time_seconds", "When it began", numbers.started_at),
+        ("smartcam_agent_start_time_seconds", "When it began", counts.started_at),
         (
             "smartcam_last_reload_successful",
-            "Whether the last reading of the fleet file was taken",
-            float(numbers.last_reload_succeeded),
+            "Whether the last reload of the fleet file was accepted",
+            float(counts.last_reload_succeeded),
         ),
     ]
     for name, text, value in gauges:
         family = core.GaugeMetricFamily(name, text, labels=["agent"])
-        family.add_metric(values, value)
+        family.add_metric(agent_label, value)
         yield family
     labels = ["agent", "state"]
     family = core.GaugeMetricFamily("smartcam_agent_cameras", "Cameras", labels=labels)
-    connected = sum(camera.connected for camera in numbers.cameras)
-    family.add_metric([*values, "connected"], connected)
-    family.add_metric([*values, "not_connected"], len(numbers.cameras) - connected)
+    connected = sum(camera.connected for camera in counts.cameras)
+    family.add_metric([*agent_label, "connected"], connected)
+    family.add_metric([*agent_label, "not_connected"], len(counts.cameras) - connected)
     yield family
     labels = ["agent", "outcome"]
-    family = core.CounterMetricFamily("smartcam_reloads", "Readings of the file", labels=labels)
-    for outcome, count in numbers.reloads.items():
-        family.add_metric([*values, outcome], count)
+    text = "Reloads of the fleet file"
+    family = core.CounterMetricFamily("smartcam_reloads", text, labels=labels)
+    for outcome, count in counts.reloads.items():
+        family.add_metric([*agent_label, outcome], count)
     yield family
-    yield from _outlet_families(core, numbers)
+    yield from _outlet_families(core, counts)
     for key in SUMS:
-        name, text = _SUMS[key]
+        name, text = _SUM_TEXTS[key]
         family = core.CounterMetricFamily(name, text, labels=["agent"])
-        family.add_metric(values, numbers.totals.counts[key])
+        family.add_metric(agent_label, counts.totals.counts[key])
         yield family
     for name, text, histogram in (
         (
             "smartcam_request_latency_seconds",
             "From a request to a camera to its answer",
-            numbers.totals.round_trip,
+            counts.totals.round_trip,
         ),
         (
             "smartcam_trigger_latency_seconds",
             "From a trigger to its result",
-            numbers.totals.processing,
+            counts.totals.processing,
         ),
     ):
         family = core.HistogramMetricFamily(name, text, labels=["agent"])
-        family.add_metric(values, cumulative_bins(histogram), histogram.total)
+        family.add_metric(agent_label, cumulative_bins(histogram), histogram.total)
         yield family
 
 
-def _outlet_families(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
+def _outlet_families(core: Any, counts: AgentCounts) -> Iterator[Any]:
     """Yield the families of outlets: each result was delivered, waits, or was dropped."""
-    if not numbers.outlets:
+    if not counts.outlets:
         return
     labels = ["agent", "outlet"]
     received = core.CounterMetricFamily(
         "smartcam_outlet_results", "Results that came", labels=labels
     )
     delivered = core.CounterMetricFamily(
-        "smartcam_outlet_delivered", "Results that the far end took", labels=labels
+        "smartcam_outlet_delivered", "Results that the far end accepted", labels=labels
     )
     spooled = core.GaugeMetricFamily(
         "smartcam_outlet_spooled", "Results that wait for the far end", labels=labels
     )
-    well = core.GaugeMetricFamily(
-        "smartcam_outlet_up", "Whether nothing keeps results from the far end", labels=labels
+    is_up = core.GaugeMetricFamily(
+        "smartcam_outlet_up", "Whether results can be delivered or spooled", labels=labels
     )
     dropped = core.CounterMetricFamily(
         "smartcam_outlet_dropped", "Results that were given up", labels=[*labels, "reason"]
     )
-    for name, state in numbers.outlets.items():
-        values, account = [numbers.agent, name], state.counts
-        received.add_metric(values, account.results)
-        delivered.add_metric(values, account.delivered)
-        spooled.add_metric(values, account.spooled)
-        well.add_metric(values, float(not state.trouble))
-        for reason, count in account.dropped.items():
-            dropped.add_metric([*values, reason], count)
-    yield from (received, delivered, spooled, well, dropped)
+    for name, state in counts.outlets.items():
+        label_values, counts_of_outlet = [counts.agent, name], state.counts
+        received.add_metric(label_values, counts_of_outlet.results)
+        delivered.add_metric(label_values, counts_of_outlet.delivered)
+        spooled.add_metric(label_values, counts_of_outlet.spooled)
+        is_up.add_metric(label_values, float(not state.trouble))
+        for reason, count in counts_of_outlet.dropped.items():
+            dropped.add_metric([*label_values, reason], count)
+    yield from (received, delivered, spooled, is_up, dropped)
 
 
 # ---------------------------------------------------------------------- the cameras' families
 
 
 class _MetricKind(NamedTuple):
-    """A family with numbers of each camera.
+    """A family with counts of each camera.
 
     Attributes:
         type: type of the family, in the names of prometheus-client's classes.
         name: name of the family.
         text: help text of the family, for people.
         labels: names of the labels besides ``agent`` and ``camera``.
-        values: function that returns a camera's labels, and the arguments of each number.
+        values: function that returns further label values of a camera, and the arguments of
+            ``add_metric`` for each of them.
         lines: approximate number of lines for one camera.
-        applies: function that returns whether a camera has numbers of the family.
+        applies: function that returns whether a camera has counts of the family.
     """
 
     type: str
     name: str
     text: str
     labels: tuple[str, ...]
-    values: Callable[[CameraNumbers], list[tuple[tuple[str, ...], tuple[Any, ...]]]]
+    values: Callable[[CameraCounts], list[tuple[tuple[str, ...], tuple[Any, ...]]]]
     lines: int
-    applies: Callable[[CameraNumbers], bool] = lambda _: True
+    applies: Callable[[CameraCounts], bool] = lambda _: True
 
-    def make_family(self, core: Any, agent: str, cameras: Sequence[CameraNumbers]) -> Any:
-        """Return the family with the numbers of some cameras."""
+    def make_family(self, core: Any, agent: str, cameras: Sequence[CameraCounts]) -> Any:
+        """Return the family with the counts of some cameras."""
         family_class = getattr(core, f"{self.type}MetricFamily")
         family = family_class(self.name, self.text, labels=["agent", "camera", *self.labels])
         for camera in cameras:
@@ -233,8 +236,12 @@ class _MetricKind(NamedTuple):
         return family
 
 
-def _has_frames(numbers: CameraNumbers) -> bool:
-    return numbers.frames is not None
+def _bins_and_total(histogram: Histogram) -> tuple[Any, float]:
+    return cumulative_bins(histogram), histogram.total
+
+
+def _has_frames(counts: CameraCounts) -> bool:
+    return counts.frames is not None
 
 
 _LATENCY = ("smartcam_camera_trigger_latency_seconds", "From a trigger to its result, by camera")
@@ -243,7 +250,7 @@ _SUMMARY = _MetricKind(
     "Summary",
     *_LATENCY,
     (),
-    lambda numbers: [((), (numbers.account.processing.count, numbers.account.processing.total))],
+    lambda counts: [((), (counts.statistics.processing.count, counts.statistics.processing.total))],
     2,
 )
 
@@ -253,7 +260,7 @@ _KINDS = (
         "smartcam_connected",
         "Whether there is a session",
         (),
-        lambda numbers: [((), (float(numbers.connected),))],
+        lambda counts: [((), (float(counts.connected),))],
         1,
     ),
     _MetricKind(
@@ -261,7 +268,7 @@ _KINDS = (
         "smartcam_taken",
         "Whether another client has the camera",
         (),
-        lambda numbers: [((), (float(numbers.is_taken),))],
+        lambda counts: [((), (float(counts.is_taken),))],
         1,
     ),
     _MetricKind(
@@ -269,7 +276,7 @@ _KINDS = (
         "smartcam_sessions",
         "Sessions that were made",
         (),
-        lambda numbers: [((), (numbers.account.sessions,))],
+        lambda counts: [((), (counts.statistics.sessions,))],
         1,
     ),
     _MetricKind(
@@ -277,7 +284,7 @@ _KINDS = (
         "smartcam_results",
         "Results by fate",
         ("fate",),
-        lambda numbers: [((fate,), (getattr(numbers.account, fate),)) for fate in FATES],
+        lambda counts: [((fate,), (getattr(counts.statistics, fate),)) for fate in FATES],
         6,
     ),
     _MetricKind(
@@ -285,15 +292,15 @@ _KINDS = (
         "smartcam_triggers",
         "Triggers of programs by outcome",
         ("outcome",),
-        lambda numbers: [((word,), (n,)) for word, n in {RESULT: 0, **numbers.triggers}.items()],
+        lambda counts: [((word,), (n,)) for word, n in {RESULT: 0, **counts.triggers}.items()],
         3,
     ),
     _MetricKind(
         "Gauge",
-        "smartcam_frame_viewers",
+        "smartcam_frame_streams",
         "Streams of frames",
         (),
-        lambda numbers: [((), (numbers.stream_count,))],
+        lambda counts: [((), (counts.stream_count,))],
         1,
         _has_frames,
     ),
@@ -302,7 +309,7 @@ _KINDS = (
         "smartcam_frames",
         "Frames that came",
         (),
-        lambda numbers: [((), (numbers.frames.frames if numbers.frames else 0,))],
+        lambda counts: [((), (counts.frames.frames if counts.frames else 0,))],
         1,
         _has_frames,
     ),
@@ -311,7 +318,7 @@ _KINDS = (
         "smartcam_frames_lost",
         "Frames that never came",
         (),
-        lambda numbers: [((), (numbers.frames.lost if numbers.frames else 0,))],
+        lambda counts: [((), (counts.frames.lost if counts.frames else 0,))],
         1,
         _has_frames,
     ),
@@ -319,13 +326,11 @@ _KINDS = (
         "Histogram",
         *_LATENCY,
         (),
-        lambda numbers: [
-            ((), (cumulative_bins(numbers.account.processing), numbers.account.processing.total))
-        ],
+        lambda counts: [((), _bins_and_total(counts.statistics.processing))],
         20,
     ),
 )
-"""Families with numbers of each camera; without ``per_camera`` a summary replaces the last
+"""Families with counts of each camera; without ``per_camera`` a summary replaces the last
 family."""
 
 

@@ -1,4 +1,4 @@
-"""Collect the numbers for an agent's metrics from the counts that the agent keeps.
+"""Collect an agent's counts for its metrics.
 
 The counts may be read only in the agent's event loop. They are read for a few cameras at a time, so
 that the loop is not blocked.
@@ -14,8 +14,8 @@ from smartcam.fleet._operations.trigger_counts import Totals
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.fleet._agent.host import Host
     from smartcam.fleet._agent.server import FleetServer
+    from smartcam.fleet._agent.shared_camera import SharedCamera
     from smartcam.frames._inside import SourceStatistics
     from smartcam.models import Statistics
     from smartcam.outlets._inside import OutletState
@@ -26,20 +26,20 @@ CAMERAS_PER_SLICE = 24
 FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
 
 
-class CameraNumbers(NamedTuple):
-    """The numbers of one camera."""
+class CameraCounts(NamedTuple):
+    """The counts of one camera."""
 
     name: str
     connected: bool
     is_taken: bool
-    account: Statistics
+    statistics: Statistics
     triggers: dict[str, int]
     stream_count: int
     frames: SourceStatistics | None
 
 
-class AgentNumbers(NamedTuple):
-    """The numbers of an agent; ``gauges`` are current values."""
+class AgentCounts(NamedTuple):
+    """The counts of an agent; ``gauges`` are current values."""
 
     agent: str
     fleet: str
@@ -48,26 +48,27 @@ class AgentNumbers(NamedTuple):
     reloads: dict[str, int]
     last_reload_succeeded: bool
     totals: Totals
-    cameras: list[CameraNumbers]
+    cameras: list[CameraCounts]
     outlets: Mapping[str, OutletState]
 
 
-async def read_numbers(server: FleetServer) -> AgentNumbers | None:
-    """Return an agent's numbers, read in its event loop; None if the agent does not run."""
+async def read_counts(server: FleetServer) -> AgentCounts | None:
+    """Return an agent's counts, read in its event loop; None if the agent does not run."""
     agent = server.agent
     if agent is None:
         return None
-    hosts = [*agent.hosts.values()]
-    numbers_read: list[tuple[Host, CameraNumbers]] = []
+    shared_cameras = [*agent.shared_cameras.values()]
+    numbers_read: list[tuple[SharedCamera, CameraCounts]] = []
     kept_results = kept_bytes = waiting_count = reserved_count = 0
-    for begin in range(0, len(hosts), CAMERAS_PER_SLICE):
-        for host in hosts[begin : begin + CAMERAS_PER_SLICE]:
-            if agent.hosts.get(host.name) is host:  # the camera may have been removed meanwhile
-                numbers_read.append((host, _camera_numbers(host)))
-                kept_results += host.results.kept_count
-                kept_bytes += host.results.kept_bytes
-                waiting_count += host.gate.waiting_count
-                reserved_count += host.gate.holder is not None
+    is_shared = agent.is_shared  # a camera may have been removed meanwhile
+    for begin in range(0, len(shared_cameras), CAMERAS_PER_SLICE):
+        for shared in shared_cameras[begin : begin + CAMERAS_PER_SLICE]:
+            if is_shared(shared):
+                numbers_read.append((shared, _camera_counts(shared)))
+                kept_results += shared.results.kept_count
+                kept_bytes += shared.results.kept_bytes
+                waiting_count += shared.gate.waiting_count
+                reserved_count += shared.gate.holder is not None
         await asyncio.sleep(0)
     gauges: dict[str, float] = {
         "programs": agent.program_count,
@@ -79,14 +80,14 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
         "bus_bytes": server.bus_bytes,
     }
     reloads = server.reloads
-    # no await from here on, so that each camera counts once: here, or among the removed cameras
-    cameras = [numbers for host, numbers in numbers_read if agent.hosts.get(host.name) is host]
+    # no await until the closing cameras are added, so that each camera counts once
+    cameras = [counts for shared, counts in numbers_read if is_shared(shared)]
     totals = Totals(agent.past_totals)
-    totals.add(host.camera.statistics() for host in agent.closing_hosts)
+    totals.add(shared.client.statistics() for shared in agent.closing_cameras)
     for begin in range(0, len(cameras), 4 * CAMERAS_PER_SLICE):
-        totals.add(camera.account for camera in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
+        totals.add(camera.statistics for camera in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
         await asyncio.sleep(0)
-    return AgentNumbers(
+    return AgentCounts(
         agent.name,
         server.file.fleet,
         agent.epoch / 1e9,
@@ -99,14 +100,14 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     )
 
 
-def _camera_numbers(host: Host) -> CameraNumbers:
-    frames = host.frames
-    return CameraNumbers(
-        host.name,
-        host.connected,
-        host.camera.is_taken,
-        host.camera.statistics(),
-        dict(host.triggers),
+def _camera_counts(camera: SharedCamera) -> CameraCounts:
+    frames = camera.frames
+    return CameraCounts(
+        camera.name,
+        camera.connected,
+        camera.client.is_taken,
+        camera.client.statistics(),
+        dict(camera.triggers),
         frames.stream_count,
         frames.statistics,
     )

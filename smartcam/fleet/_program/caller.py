@@ -20,13 +20,13 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet._bus.errors import from_fields
-from smartcam.fleet._bus.keys import COMMANDS, RESERVED_COMMANDS
+from smartcam.fleet._bus.keys import COMMANDS, COMMANDS_WITH_RESERVATION
 from smartcam.fleet._bus.wire import (
     BusMessage,
-    TriggerOrder,
+    TriggerCall,
     TriggerReply,
     encode,
-    encode_order,
+    encode_trigger,
     reply_grace,
 )
 from smartcam.fleet._security.certificates import may_command
@@ -47,8 +47,12 @@ HELLO_TIMEOUT = 2.0
 sent again if the agent is still present."""
 
 
-NAMES_FOR_USERS = {"ensure": "switch_application", "enter": "switch_application"}
-"""The names that texts for users give to calls whose name on the bus is another one."""
+PUBLIC_NAMES = {
+    "ensure_application": "switch_application",
+    "enter_application": "switch_application",
+}
+"""Public names of calls that have another name on the bus, for error texts."""
+
 OTHER_AGENT_INTERVAL = 0.25
 """Seconds between two searches for an agent that has a session, while the current agent has
 none."""
@@ -64,8 +68,8 @@ RESEND_DELAY = 1.0
 """Seconds until an unconfirmed message, which may be lost, is sent again."""
 
 
-class MetAgent:
-    """An agent that has answered a hello.
+class CameraAgent:
+    """The agent that answers for a camera.
 
     Attributes:
         name: name of the agent.
@@ -115,7 +119,7 @@ class Caller:
         camera: the camera's name in the fleet.
         program: program that makes the calls.
         counters: counters of the messages.
-        on_met: callback that is called when an agent has answered the hello, before other calls.
+        on_agent_found: callback for an agent that has answered the hello, before other calls.
         on_lost: callback for the loss of the agent, with its error.
         on_lease_lost: callback for the loss of this program's reservations, once for each loss.
 
@@ -134,7 +138,7 @@ class Caller:
         camera: str,
         program: Program,
         counters: Counters,
-        on_met: Callable[[MetAgent], None],
+        on_agent_found: Callable[[CameraAgent], None],
         on_lost: Callable[[LinkError], None],
         on_lease_lost: Callable[[], None] = lambda: None,
     ) -> None:
@@ -143,7 +147,7 @@ class Caller:
         self.camera: str = camera
         self.program: Program = program
         self.counters: Counters = counters
-        self.agent: MetAgent | None = None
+        self.agent: CameraAgent | None = None
         self.no_agent_error: LinkError | None = None
         self.final_error: LinkError | None = None
         self.has_session: bool = False
@@ -151,7 +155,7 @@ class Caller:
         self.streams_results: bool = False
         self._command_key = "", ""  # the agent of the last command, and the key of commands to it
         self._epochs: dict[str, int] = {}  # epoch of each agent that has answered
-        self._on_met, self._on_lost = on_met, on_lost
+        self._on_agent_found, self._on_lost = on_agent_found, on_lost
         self._agents: dict[str, None] = {}  # present agents that share the camera
         self._changed = asyncio.Event()
         self._presence_watch: Handle | None = None
@@ -197,7 +201,7 @@ class Caller:
 
     # ------------------------------------------------------------------ the agent
 
-    def require(self) -> MetAgent:
+    def require(self) -> CameraAgent:
         """Return the agent.
 
         Raises:
@@ -231,21 +235,22 @@ class Caller:
         """End the calls of an agent that no longer shares the camera. Idempotent."""
         self._agents.pop(agent, None)
         if self.agent is not None and self.agent.name == agent:
-            why = self._removal_reason
+            reason = self._removal_reason
             lost = f"the agent {agent} is gone, or the way to it"
-            self.lose_agent(f"the agent {agent} shares the camera no more: {why}" if why else lost)
+            removed = f"the agent {agent} shares the camera no more: {reason}"
+            self.lose_agent(removed if reason else lost)
         self._changed.set()
 
-    def note_removal(self, why: str) -> None:
+    def note_removal(self, reason: str) -> None:
         """Note why the agent will no longer share the camera; :meth:`agent_left` follows."""
-        self._removal_reason = why
+        self._removal_reason = reason
 
-    def lose_agent(self, why: str) -> None:
+    def lose_agent(self, reason: str) -> None:
         """Forget the lost agent, and end every running call with an unknown outcome."""
         if self.agent is None:
             return
         self.agent, self.has_session = None, False
-        error = self.no_agent_error = ConnectionLostError(f"{self.name}: {why}")
+        error = self.no_agent_error = ConnectionLostError(f"{self.name}: {reason}")
         self.program.fail_calls(self, lambda: _unknown_outcome_error(error))
         self._changed.set()
         self._on_lost(error)
@@ -264,28 +269,29 @@ class Caller:
                     await self._changed.wait()
                     quiet_since = loop.time()
             self._changed.clear()
-            met = self.agent
-            if met is not None and self.has_session:
+            current = self.agent
+            if current is not None and self.has_session:
                 continue
-            if met is not None and loop.time() - quiet_since >= SESSION_QUESTION_INTERVAL:
+            if current is not None and loop.time() - quiet_since >= SESSION_QUESTION_INTERVAL:
                 quiet_since = loop.time()
-                await self._greet_again(met)
+                await self._greet_again(current)
                 continue
-            others = sorted(self._agents.keys() - ({met.name} if met is not None else set()))
+            own = set[str]() if current is None else {current.name}
+            others = sorted(self._agents.keys() - own)
             if not others:
                 continue
             try:
-                await self._choose_agent(others, met)
+                await self._choose_agent(others, current)
             except SmartCamError as error:
-                if met is None:
+                if current is None:
                     self.no_agent_error = ConnectionLostError(f"{self.name}: {error}")
                     if self._agents:
                         await asyncio.sleep(HELLO_TIMEOUT / 10)
                         self._changed.set()
 
-    async def _choose_agent(self, agents: list[str], met: MetAgent | None) -> None:
+    async def _choose_agent(self, agents: list[str], current: CameraAgent | None) -> None:
         """Choose an agent, if possible one with a session; it may replace the current agent."""
-        needs_session = met is not None
+        needs_session = current is not None
         replies: list[_HelloReply] = []
         failed: SmartCamError | None = None
         for agent in agents:
@@ -295,8 +301,8 @@ class Caller:
                 failed = error
                 continue
             if replies[-1].hello.get("connected") and not replies[-1].hello.get("trying"):
-                break  # a camera has one session
-        if self.agent is not met:
+                break  # it has a session, and a camera has only one
+        if self.agent is not current:
             return  # an agent appeared or disappeared
         if not replies:
             if failed is not None:
@@ -305,17 +311,17 @@ class Caller:
         best = replies[-1] if replies[-1].hello.get("connected") else replies[0]
         if needs_session and not best.hello.get("connected"):
             return
-        if met is not None:
+        if current is not None:
             self.lose_agent(
-                f"the agent {met.name} has no session with the camera, {best.agent} has one"
+                f"the agent {current.name} has no session with the camera, {best.agent} has one"
             )
         self._accept_agent(best)
 
-    async def _greet_again(self, met: MetAgent) -> None:
+    async def _greet_again(self, current: CameraAgent) -> None:
         """Send the agent another hello, and use the state in its answer if it has a session now."""
         with contextlib.suppress(SmartCamError):
-            reply = await self._greet_agent(met.name)
-            if self.agent is met and not self.has_session and reply.hello.get("connected"):
+            reply = await self._greet_agent(current.name)
+            if self.agent is current and not self.has_session and reply.hello.get("connected"):
                 self._accept_agent(reply)
 
     async def _greet_agent(self, agent: str) -> _HelloReply:
@@ -333,22 +339,22 @@ class Caller:
     def _accept_agent(self, reply: _HelloReply) -> None:
         self._min_clock_lead, self._min_lead_at = reply.clock - reply.answered_at, reply.answered_at
         self._max_clock_lead = math.inf
-        self.bound_clock(reply.clock, reply.asked_at)
+        self.narrow_clock_lead(reply.clock, reply.asked_at)
         if reply.agent in self._agents:
             self._epochs[reply.agent] = reply.epoch
             if len(self._epochs) > MAX_AGENTS_REMEMBERED:
                 del self._epochs[next(iter(self._epochs))]
-            self.agent = MetAgent(reply.agent, reply.epoch, reply.hello)
+            self.agent = CameraAgent(reply.agent, reply.epoch, reply.hello)
             self._removal_reason = ""
             self.no_agent_error = None
-            self._on_met(self.agent)
+            self._on_agent_found(self.agent)
 
     def has_restarted(self, epoch: int) -> bool:
         """Return True if a received epoch shows that the current agent has been started again."""
-        met = self.agent
-        if met is None or epoch <= met.epoch or len(self._agents) > 1:
+        current = self.agent
+        if current is None or epoch <= current.epoch or len(self._agents) > 1:
             return False
-        return all(known != epoch for agent, known in self._epochs.items() if agent != met.name)
+        return all(known != epoch for agent, known in self._epochs.items() if agent != current.name)
 
     def note_session_end(self) -> None:
         """Note that the agent has no session, and look for an agent that has one."""
@@ -363,8 +369,8 @@ class Caller:
         min_lead = self._min_clock_lead - MAX_DRIFT_RATIO * (now - self._min_lead_at)
         self._min_clock_lead, self._min_lead_at = max(min_lead, clock - now), now
 
-    def bound_clock(self, clock: float, sent_at: float) -> None:
-        """Bound the agent's clock: it showed ``clock`` after a message was sent at ``sent_at``."""
+    def narrow_clock_lead(self, clock: float, sent_at: float) -> None:
+        """Narrow the clock's lead: it showed ``clock`` after a message was sent at ``sent_at``."""
         now = asyncio.get_running_loop().time()
         max_lead = self._max_clock_lead + MAX_DRIFT_RATIO * (now - self._max_lead_at)
         self._max_clock_lead, self._max_lead_at = min(max_lead, clock - sent_at), now
@@ -396,10 +402,10 @@ class Caller:
         Raises:
             ReservationLostError: the reservation is known to be lost.
         """
-        lease, met = self.leases[number], self.agent
-        if not lease.lost and met is not None and met.epoch != lease.epoch:
-            why = f"the agent {met.name} has the camera now, which was started since"
-            self.lose_lease(number, why)
+        lease, current = self.leases[number], self.agent
+        if not lease.lost and current is not None and current.epoch != lease.epoch:
+            reason = f"its agent is now {current.name}, which was started after the reservation"
+            self.lose_lease(number, reason)
         if lease.lost:
             raise ReservationLostError(
                 f"{self.name}: the reservation was lost: {lease.lost}; commands of others may have "
@@ -407,9 +413,9 @@ class Caller:
             )
         return lease
 
-    def lose_lease(self, number: int, why: str) -> None:
+    def lose_lease(self, number: int, reason: str) -> None:
         """Note that a reservation is lost; later commands of its block are refused."""
-        self.leases[number].lost = why
+        self.leases[number].lost = reason
         self.report_leases_lost()
 
     def report_leases_lost(self) -> None:
@@ -432,7 +438,7 @@ class Caller:
         Raises:
             ReservationLostError: one of the reservations is lost; nothing was sent.
         """
-        if not self.leases or do not in RESERVED_COMMANDS:
+        if not self.leases or do not in COMMANDS_WITH_RESERVATION:
             return None
         for number in self.leases:
             self.require_lease(number)
@@ -464,8 +470,10 @@ class Caller:
 
         Cancellation: the agent receives a cancelling message.
         """
-        met = self.require()
-        reply = await self._exchange(do, deadline, met.name, met, arguments, blobs, number, timeout)
+        agent = self.require()
+        reply = await self._exchange(
+            do, deadline, agent.name, agent, arguments, blobs, number, timeout
+        )
         self.sample_clock(float(reply.fields.get("clock", -1e300)))
         return reply
 
@@ -474,7 +482,7 @@ class Caller:
         do: str,
         deadline: float,
         agent: str,
-        met: MetAgent | None = None,
+        current: CameraAgent | None = None,
         arguments: dict[str, Any] | None = None,
         blobs: Sequence[bytes] = (),
         number: int | None = None,
@@ -488,10 +496,10 @@ class Caller:
             "do": do,
             "arguments": arguments or {},
         }
-        if met is not None:
+        if current is not None:
             timeout = deadline - asked_at if timeout is None else timeout
             fields |= {
-                "epoch": met.epoch,
+                "epoch": current.epoch,
                 "deadline": self.earliest_agent_time(deadline),
                 "timeout": timeout,
             }
@@ -499,7 +507,7 @@ class Caller:
                 fields["reservation"] = reservation
             deadline += reply_grace(timeout)
         reply = await self._await_reply(
-            do, number, encode(fields, blobs), asked_at, deadline, agent, met
+            do, number, encode(fields, blobs), asked_at, deadline, agent, current
         )
         if not isinstance(reply, BusMessage):
             raise RemoteProtocolError(f"{self.name}: the agent {agent} answers {do} as a trigger")
@@ -529,13 +537,13 @@ class Caller:
 
         Cancellation: the agent receives a cancelling message.
         """
-        met = self.require()
+        current = self.require()
         interpretation = request.interpretation
-        order: TriggerOrder = new_tuple(
-            TriggerOrder,
+        call: TriggerCall = new_tuple(
+            TriggerCall,
             (
                 number,
-                met.epoch,
+                current.epoch,
                 self.earliest_agent_time(deadline),
                 timeout,
                 application,
@@ -548,10 +556,10 @@ class Caller:
                 self._reservation_of("trigger"),
             ),
         )
-        payload = encode_order(self.program.token, order)
+        payload = encode_trigger(self.program.token, call)
         asked_at, reply_deadline = deadline - timeout, deadline + reply_grace(timeout)
         reply = await self._await_reply(
-            "trigger", number, payload, asked_at, reply_deadline, met.name, met
+            "trigger", number, payload, asked_at, reply_deadline, current.name, current
         )
         if not isinstance(reply, TriggerReply):
             raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
@@ -566,7 +574,7 @@ class Caller:
         asked_at: float,
         deadline: float,
         agent: str,
-        met: MetAgent | None,
+        current: CameraAgent | None,
     ) -> Reply:
         """Send a call, and wait for the reply until ``deadline``, a time of this program's loop."""
         self._check_allowed(do)
@@ -587,8 +595,8 @@ class Caller:
         self.counters.frames_received += 1
         if isinstance(reply, TriggerReply):
             return reply
-        if reply.fields.get("stranger") and self.agent is met and met is not None:
-            self.lose_agent(f"the agent {met.name} was restarted, or took this program for gone")
+        if reply.fields.get("stranger") and self.agent is current and current is not None:
+            self.lose_agent(f"the agent {agent} was restarted, or took this program for gone")
         if "error" in reply.fields:
             error = from_fields(reply.fields["error"])
             if isinstance(error, ReservationLostError) and self.leases:
@@ -603,9 +611,9 @@ class Caller:
             self._send_until_confirmed(self._key_of_call(self.agent.name, do), fields)
 
     def confirm_bytes(self, number: int, offset: int | None) -> None:
-        """Report the number of received bytes of a call's frame; None: send no further bytes."""
+        """Report how many bytes of a call's picture were received; None: send no further bytes."""
         if self.agent is not None:
-            fields = {"call": number, "come": offset}
+            fields = {"call": number, "received": offset}
             self.program.send(self._key_of_call(self.agent.name, "frame"), fields)
 
     def _cancel(self, key: str, number: int) -> None:
@@ -616,7 +624,7 @@ class Caller:
 
         Sending stops when the agent is lost, since a lost agent's work for the program has ended.
         """
-        program, met = self.program, self.agent
+        program, current = self.program, self.agent
 
         def send() -> tuple[int, AnyFuture]:
             number = program.next_call()
@@ -629,7 +637,7 @@ class Caller:
                     async with asyncio.timeout(RESEND_DELAY):
                         await answer
                 except TimeoutError:
-                    if self.agent is not met or met is None:
+                    if self.agent is not current or current is None:
                         return
                 except SmartCamError:
                     return
@@ -657,10 +665,10 @@ class Caller:
         """
         identity = self.program.bus.identity
         if identity is not None and not self._is_allowed(do):
-            what = NAMES_FOR_USERS.get(do, do)
+            what = PUBLIC_NAMES.get(do, do)
             raise NotAllowedError(
                 f"{self.name}: {what} is a command, and this program's certificate is that of "
-                f"{identity}, who may look; nothing was sent",
+                f"{identity}, which may only read; nothing was sent",
                 role=identity.role,
                 certificate=identity.name,
             )

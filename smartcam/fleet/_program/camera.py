@@ -38,7 +38,7 @@ from smartcam.exceptions import (
 from smartcam.fleet._bus.errors import from_fields
 from smartcam.fleet._bus.wire import reply_grace
 from smartcam.fleet._frames.wire import FrameForm
-from smartcam.fleet._program.caller import Caller, Lease, MetAgent
+from smartcam.fleet._program.caller import Caller, CameraAgent, Lease
 from smartcam.fleet._program.program_name import in_words
 from smartcam.fleet._program.receiver import FleetListeners, OwnTrigger, Receiver
 from smartcam.models import (
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from smartcam._client._inside import Listeners, TriggerRequest
     from smartcam.camera import FrameRequest, StreamEncoding
     from smartcam.fleet._bus.wire import BusMessage
-    from smartcam.fleet._frames.caller import FrameCaller
+    from smartcam.fleet._frames.caller import FrameClient
     from smartcam.fleet._frames.wire import FleetFrame
     from smartcam.fleet._program.program import Program
     from smartcam.frames import FrameReader, FrameSource
@@ -75,9 +75,9 @@ QUESTION_TIMEOUT = 2.0
 """Seconds for the answer to a question; after that, the question is sent again, until its
 deadline."""
 
-REACH_TIMEOUT = 0.5
-"""Seconds to wait for events that the agent sent before a reply. Events that have not arrived by
-then count as lost."""
+CATCH_UP_TIMEOUT = 0.5
+"""Seconds to wait for events that the agent sent before a reply, or before a reboot ended the
+session. Events that have not arrived by then count as lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,10 +85,10 @@ class ReservationLost(CameraEvent):
     """A program has lost its reservation of the camera before its block has ended.
 
     Attributes:
-        by: the program that had the reservation, such as ``robot1 on host7, pid 31``.
+        program: the program that had the reservation, such as ``robot1 on host7, pid 31``.
     """
 
-    by: str
+    program: str
 
 
 class FleetCamera(Camera[ValueT]):
@@ -104,7 +104,7 @@ class FleetCamera(Camera[ValueT]):
     Args:
         settings: validated options; the agent's file has the options of the camera's session.
         camera: name of the camera in the fleet.
-        program: program with an end of the bus.
+        program: program with a connection to the bus.
         shared: whether other cameras use this program, too; then this camera does not close it.
         observers: observers of the camera.
     """
@@ -120,7 +120,7 @@ class FleetCamera(Camera[ValueT]):
     ) -> None:
         self._agents_layout: Any = None  # layout for results if this program gives none
         self._layout_error: ConfigurationError | None = None  # why that layout cannot be used
-        self._has_met_agent = False
+        self._has_agent_options = False
         super().__init__(settings, observers=observers)
         self._program, self._shared = program, shared
         self._wire = Counters()
@@ -129,7 +129,7 @@ class FleetCamera(Camera[ValueT]):
             camera,
             program,
             self._wire,
-            self._on_met,
+            self._on_agent_found,
             self._on_lost,
             self._on_lease_lost,
         )
@@ -149,7 +149,7 @@ class FleetCamera(Camera[ValueT]):
         self.opening_task: asyncio.Task[None] | None = None  # waits for the agent's first answer
         self._sessions = 0
         self._has_session = False  # the agent has a session with the camera
-        self._is_first_attempt = True  # whether the agent's first attempt to connect has not ended
+        self._first_attempt_pending = True  # until the agent's first attempt to connect has ended
         self._status: Status | None = None
         self._active_application: int | None = None
         self._agent_facts: dict[str, Any] = {}  # facts about the camera from its agent
@@ -165,11 +165,11 @@ class FleetCamera(Camera[ValueT]):
     def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
         if spec is None:
             spec = self._agents_layout
-        if self._has_met_agent:
+        if self._has_agent_options:
             return super()._interpretation(spec, of_camera=of_camera)
         return self._provisional_interpretation(spec, of_camera)
 
-    def _provisional_interpretation(self, spec: object, own: bool) -> Interpretation:
+    def _provisional_interpretation(self, spec: object, strict_calibration: bool) -> Interpretation:
         """Return the interpretation of results that applies until the agent has answered.
 
         Raises:
@@ -187,7 +187,7 @@ class FleetCamera(Camera[ValueT]):
                     lenient=settings.lenient,
                     y_down=y_down,
                     calibration=settings.calibration,
-                    strict_calibration=own,
+                    strict_calibration=strict_calibration,
                 )
             except ConfigurationError as exc:
                 refused = refused or exc
@@ -196,7 +196,7 @@ class FleetCamera(Camera[ValueT]):
     # ------------------------------------------------------------------ open and close
 
     def _release_unreferenced(self) -> bool:
-        # a shared bus refers to the camera until the camera is closed; an own bus ends with it
+        # True: close it; a shared bus refers to the camera until the camera is closed
         attributes = vars(self)
         opened = attributes.get("_opened", False) and attributes.get("_closed") is None
         return opened and not attributes.get("_shared", True)
@@ -205,12 +205,12 @@ class FleetCamera(Camera[ValueT]):
         if self._opened or self._closed is not None:
             raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
         try:
-            await self.follow(self.settings.connect_timeout)
+            await self.connect_to_agent(self.settings.connect_timeout)
             self._check_session()
             if self.settings.application is not None:
                 application = self.settings.application
                 await self._call_agent(
-                    "ensure", self.settings.switch_timeout, application=application
+                    "ensure_application", self.settings.switch_timeout, application=application
                 )
         except BaseException as exc:
             if isinstance(exc, LinkError):
@@ -219,12 +219,12 @@ class FleetCamera(Camera[ValueT]):
             raise
         return self
 
-    async def follow(self, timeout: float, *, session: bool = True) -> None:
+    async def connect_to_agent(self, timeout: float, *, wait_for_session: bool = True) -> None:
         """Subscribe to the camera's messages, even if no agent shares it yet.
 
         Args:
             timeout: seconds for connecting to the bus, and for an agent's first answer.
-            session: whether to wait also until the agent's first attempt of a session has ended.
+            wait_for_session: whether to wait also for the agent's first attempt of a session.
         """
         self._opened = True
         deadline = self._deadline(timeout)
@@ -235,16 +235,16 @@ class FleetCamera(Camera[ValueT]):
                 raise self._not_reached_error(str(exc)) from exc
         self._receiver.open()
         self._caller.open()
-        await self._wait_first_session(deadline, session=session)
+        await self._wait_first_session(deadline, wait_for_session=wait_for_session)
         if self._has_observers:
             self._on_listener_added(self._listeners.results)
 
-    async def _wait_first_session(self, deadline: float, *, session: bool) -> None:
+    async def _wait_first_session(self, deadline: float, *, wait_for_session: bool) -> None:
         """Wait for the agent's answer and its first attempt of a session; bounded."""
 
         def is_decided() -> bool:
-            met = self._caller.agent is not None
-            return self.ended or (met and not (session and self._is_first_attempt))
+            agent = self._caller.agent is not None
+            return self.ended or (agent and not (wait_for_session and self._first_attempt_pending))
 
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(deadline):
@@ -270,15 +270,16 @@ class FleetCamera(Camera[ValueT]):
             trouble = self._caller.no_agent_error or self._no_session_error
             waited = self.settings.connect_timeout
             fleet = self._program.keys.fleet
-            why = f"no agent of fleet {fleet} has this camera, or none answered within {waited:g} s"
+            lacking = f"no agent of fleet {fleet} has this camera, or none answered within"
+            reason = f"{lacking} {waited:g} s"
             raise self._not_reached_error(
-                why if trouble is None else str(trouble).removeprefix(f"{self.name}: ")
+                reason if trouble is None else str(trouble).removeprefix(f"{self.name}: ")
             ) from trouble
 
-    def _not_reached_error(self, why: str) -> ConnectFailedError:
+    def _not_reached_error(self, reason: str) -> ConnectFailedError:
         address = self.settings.address
-        text = f"{self.name}: {self.url}: {why}"
-        return ConnectFailedError(text, host=address.host, port=address.port, attempts=(why,))
+        text = f"{self.name}: {self.url}: {reason}"
+        return ConnectFailedError(text, host=address.host, port=address.port, attempts=(reason,))
 
     async def close(self) -> None:
         self._end_for_good(ConnectionClosedError(f"{self.name}: the connection is closed"))
@@ -309,7 +310,7 @@ class FleetCamera(Camera[ValueT]):
         loop = asyncio.get_running_loop()
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._change_queues.add(queue)
-        why: object = "none yet"
+        reason: object = "none yet"
         try:
             async with asyncio.timeout_at(deadline + reply_grace(timeout)):
                 while True:
@@ -325,7 +326,7 @@ class FleetCamera(Camera[ValueT]):
                     except ConnectionLostError:
                         continue
                     except ResponseTimeoutError as exc:  # or the message was lost on the way
-                        why = exc
+                        reason = exc
                         if left <= QUESTION_TIMEOUT:
                             raise TimeoutError from exc
                     else:
@@ -333,7 +334,7 @@ class FleetCamera(Camera[ValueT]):
         except TimeoutError as exc:
             raise ResponseTimeoutError(
                 f"{self.name}: no session within {timeout:g} s; the last error: "
-                f"{self._no_session_error or why}",
+                f"{self._no_session_error or reason}",
                 waited=timeout,
             ) from exc
         finally:
@@ -341,16 +342,16 @@ class FleetCamera(Camera[ValueT]):
 
     # ------------------------------------------------------------------ hooks
 
-    def _require_session(self) -> MetAgent:
+    def _require_session(self) -> CameraAgent:
         if self._closed is not None:
             raise self._closed.with_traceback(None)
         if self._layout_error is not None:
             raise self._layout_error
-        met = self._caller.require()
+        agent = self._caller.require()
         if not self._has_session:
             trouble = self._no_session_error or ConnectionLostError(f"{self.name}: not connected")
             raise trouble.with_traceback(None)
-        return met
+        return agent
 
     def _deadline(self, timeout: float) -> float:
         return asyncio.get_running_loop().time() + check_seconds(timeout, "timeout", self.name)
@@ -369,25 +370,26 @@ class FleetCamera(Camera[ValueT]):
         self._receiver.subscribe_results(since)
 
     def _end_of_streams(self) -> tuple[SmartCamError | None] | None:
+        # None: not ended; (None,): closed by this program; (error,): ended by the error
         if self._closed is None:
             return None
         return (None if isinstance(self._closed, ConnectionClosedError) else self._closed,)
 
     # ------------------------------------------------------------------ messages of the agent
 
-    def _on_met(self, met: MetAgent) -> None:
+    def _on_agent_found(self, agent: CameraAgent) -> None:
         """Take over the camera's state from an agent that has answered."""
         if self._closed is not None:
             return
-        hello = met.hello
+        hello = agent.hello
         self._caller.check_leases()
         known = self._agent_facts.get("capabilities")  # an agent's camera may have no session yet
         self._agent_facts = hello if known is None else {"capabilities": known, **hello}
         self._use_agents_layout(hello)
         # missed events are requested, and bring the state in their order
-        if not self._receiver.misses_states(met):
+        if not self._receiver.misses_states(agent):
             self._on_state({"kind": "Hello", **hello})
-        self._receiver.begin_agent(met)
+        self._receiver.begin_agent(agent)
         if self._listeners.wants_results:
             self._on_listener_added(self._listeners.results)
 
@@ -403,7 +405,7 @@ class FleetCamera(Camera[ValueT]):
         self.settings: CameraSettings = replace(settings, **changes)
         self._agents_layout = layout
         self._interpretations.clear()
-        self._has_met_agent, self._layout_error = True, None
+        self._has_agent_options, self._layout_error = True, None
         try:
             self._default = self._interpretation(self._default_spec, of_camera=True)
         except ConfigurationError as exc:
@@ -414,7 +416,7 @@ class FleetCamera(Camera[ValueT]):
         self._publish_reservation_lost(self._program.name, datetime.now(UTC))
 
     def _publish_reservation_lost(self, program: str, at: datetime) -> None:
-        self._listeners.publish(ReservationLost(camera=self.name, at=at, by=in_words(program)))
+        self._listeners.publish(ReservationLost(camera=self.name, at=at, program=in_words(program)))
 
     def agent_left(self, agent: str) -> None:
         """End the session of an agent that no longer shares the camera."""
@@ -456,23 +458,23 @@ class FleetCamera(Camera[ValueT]):
             queue.put_nowait(what)
 
     def _on_state(self, state: dict[str, Any]) -> None:
-        """Process an event of the camera; the message also has the camera's state at that time."""
+        """Process an event of the camera, with the camera's state after it."""
         if self._closed is not None:
             return
         if state["kind"] == "Status" and self._is_status_change_only(state):
-            self._take_status(_status(state["status"]), state)
+            self._take_status(_status_of_bits(state["status"]), state)
             return
         at = _time_of(state)
         linked = bool(state.get("connected"))
         if state["kind"] == "Removed":
-            self._caller.note_removal(str(state.get("why")))
+            self._caller.note_removal(str(state.get("reason")))
         elif state["kind"] == "NoticeReceived":
             self._publish_notice(state.get("event", {}), at)
         elif state["kind"] == "ReservationLost":
-            self._report_reservation_lost(str(state.get("by")), at)
-        if self._is_first_attempt and not state.get("trying"):
+            self._report_reservation_lost(str(state.get("program")), at)
+        if self._first_attempt_pending and not state.get("trying"):
             self._wake_waits(self._status or Status(0))
-        self._is_first_attempt = bool(state.get("trying"))
+        self._first_attempt_pending = bool(state.get("trying"))
         if not linked:
             error, event = self._read_session_error(state), state.get("event", {})
             self._lose(
@@ -494,14 +496,14 @@ class FleetCamera(Camera[ValueT]):
                 )
             )
         if status is not None and linked:
-            self._take_status(_status(int(status)), state)
+            self._take_status(_status_of_bits(int(status)), state)
 
     def _is_status_change_only(self, state: dict[str, Any]) -> bool:
         """Return True if an event changes nothing but the camera's status."""
         application = state.get("application")
         return (
             self._has_session
-            and not self._is_first_attempt
+            and not self._first_attempt_pending
             and "trying" not in state
             and state.get("connected") is True
             and state.get("status") is not None
@@ -579,11 +581,11 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def ended(self) -> bool:
-        """True if there will be no further session: closed, taken, or given up."""
+        """True if no further session follows: closed, taken by another client, or given up."""
         return self._closed is not None
 
     @property
-    def met(self) -> bool:
+    def has_agent(self) -> bool:
         """True if the camera's agent has answered, and is present."""
         return self._caller.agent is not None
 
@@ -651,7 +653,7 @@ class FleetCamera(Camera[ValueT]):
     async def _wait_received(self, states: int, results: int, deadline: float) -> None:
         """Wait for the messages that the agent sent before its reply."""
         if not self._receiver.has_received(states, results):
-            wait_until = min(deadline, asyncio.get_running_loop().time() + REACH_TIMEOUT)
+            wait_until = min(deadline, asyncio.get_running_loop().time() + CATCH_UP_TIMEOUT)
             await self._receiver.wait_received("states", states, wait_until)
             await self._receiver.wait_received("results", results, wait_until)
 
@@ -672,9 +674,9 @@ class FleetCamera(Camera[ValueT]):
                 request, application, expected, number, deadline, timeout
             )
             receiver.take_states(reply)
-            if not receiver.has_received(reply.states, reply.batch.following):
-                await self._wait_received(reply.states, reply.batch.following, deadline)
-            return receiver.trigger_results(own_trigger, reply.batch)
+            if not receiver.has_received(reply.next_state, reply.results.next_number):
+                await self._wait_received(reply.next_state, reply.results.next_number, deadline)
+            return receiver.trigger_results(own_trigger, reply.results)
         finally:
             del receiver.own_triggers[number]
 
@@ -710,19 +712,19 @@ class FleetCamera(Camera[ValueT]):
     async def _in_application(self, application: int) -> AsyncGenerator[Self]:
         limit = self.settings.switch_timeout
         number = self._program.next_call()
-        await self._call_agent("enter", limit, call=number, application=application)
+        await self._call_agent("enter_application", limit, call=number, application=application)
         before, self._expected_application = self._expected_application, application
         try:
             yield self
         except BaseException:
             self._expected_application = before
-            self._caller.notify("leave", {"entered": number, "wait": False})
+            self._caller.notify("leave_application", {"entered": number, "wait": False})
             raise
         self._expected_application = before
         if self.connected:
-            await self._call_agent("leave", limit, entered=number)
+            await self._call_agent("leave_application", limit, entered=number)
         else:  # the next session restores the application first
-            self._caller.notify("leave", {"entered": number, "wait": False})
+            self._caller.notify("leave_application", {"entered": number, "wait": False})
 
     @contextlib.asynccontextmanager
     async def _reserved(self, timeout: float) -> AsyncGenerator[Self]:
@@ -751,11 +753,11 @@ class FleetCamera(Camera[ValueT]):
             try:
                 reply = await caller.call("reserved", question_deadline, arguments)
             except ResponseTimeoutError as exc:
-                why: SmartCamError = exc
+                reason: SmartCamError = exc
                 if question_deadline < deadline:
                     continue  # the message was lost on the way
             except SmartCamError as exc:
-                why = exc
+                reason = exc
             else:
                 if reply.fields["answer"].get("reserved") is not True:
                     caller.lose_lease(reservation, "its agent reported it")
@@ -763,8 +765,8 @@ class FleetCamera(Camera[ValueT]):
                 return
             raise ReservationLostError(
                 f"{self.name}: whether the camera was reserved until the end of the block is "
-                f"unknown: {why}"
-            ) from why
+                f"unknown: {reason}"
+            ) from reason
 
     async def _start(self, timeout: float) -> None:
         await self._call_agent("start", timeout)
@@ -796,8 +798,8 @@ class FleetCamera(Camera[ValueT]):
         self._change_queues.add(queue)
         try:
             present = self.status
-            reply = await self._call_agent("refresh", timeout)
-            if reply.fields["answer"]["asked"]:  # an earlier status is not the current one
+            reply = await self._call_agent("refresh_status", timeout)
+            if reply.fields["answer"]["asked"]:  # the agent asked the camera; queued ones are old
                 present = self.status
                 while not queue.empty():
                     status = queue.get_nowait()
@@ -826,11 +828,11 @@ class FleetCamera(Camera[ValueT]):
         return (await self._call_agent("read_image", timeout)).blobs[0]
 
     @cached_property
-    def frame_caller(self) -> FrameCaller:
-        """Caller that asks the camera's agent for frames."""
-        from smartcam.fleet._frames.caller import FrameCaller
+    def frame_client(self) -> FrameClient:
+        """The object that asks the camera's agent for frames."""
+        from smartcam.fleet._frames.caller import FrameClient
 
-        return FrameCaller(self.name, self._caller)
+        return FrameClient(self.name, self._caller)
 
     @contextlib.asynccontextmanager
     async def _frames(self, wanted: StreamRequest) -> AsyncGenerator[FrameReader]:
@@ -854,25 +856,25 @@ class FleetCamera(Camera[ValueT]):
 
     def _frame_source(self, wanted: StreamRequest) -> FrameSource:
         from smartcam.fleet._frames.shared_driver import SharedFrameDriver
-        from smartcam.fleet._frames.stream_form import StreamForm
+        from smartcam.fleet._frames.stream_form import FleetStreamRequest
         from smartcam.frames import FrameAddress, FrameSource
 
-        request = StreamForm.checked(*wanted[:4], self.name, decode=wanted.decode)
-        driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, request)
+        request = FleetStreamRequest.checked(*wanted[:4], self.name, decode=wanted.decode)
+        driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_client, request)
         return FrameSource(driver, timeout=wanted.timeout, stall=None)
 
     async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         age = None if math.isinf(max_age) else max_age
-        return await self.frame_caller.get_frame(wanted, timeout, max_age=age)
+        return await self.frame_client.get_frame(wanted, timeout, max_age=age)
 
     async def _frame_after(
         self, moment: float | None, form: FrameRequest, timeout: float
     ) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         if moment is None:
-            return await self.frame_caller.get_frame(wanted, timeout, fresh=True)
-        return await self.frame_caller.get_frame(wanted, timeout, moment=moment)
+            return await self.frame_client.get_frame(wanted, timeout, fresh=True)
+        return await self.frame_client.get_frame(wanted, timeout, moment=moment)
 
     async def _get_clock(self, timeout: float) -> datetime:
         reply = await self._call_agent("get_clock", timeout)
@@ -891,7 +893,7 @@ class FleetCamera(Camera[ValueT]):
         await self._call_agent("reboot", None)
         # wait until this program knows that the session has ended
         with contextlib.suppress(TimeoutError, LinkError):
-            async with asyncio.timeout(REACH_TIMEOUT):
+            async with asyncio.timeout(CATCH_UP_TIMEOUT):
                 await self._wait_until(lambda: not self.connected)
 
     async def _take_back(self, timeout: float) -> None:
@@ -911,7 +913,7 @@ class FleetCamera(Camera[ValueT]):
         return reply.blobs[0] if reply.blobs else None
 
 
-_status = functools.lru_cache(maxsize=256)(Status)
+_status_of_bits = functools.lru_cache(maxsize=256)(Status)
 """Return the status with these bits; a look-up costs less than a new object."""
 
 

@@ -17,7 +17,7 @@ from smartcam.exceptions import ProtocolError
 from smartcam.fleet._agent.bundle import ResultBundle, decode_bundle
 from smartcam.fleet._agent.summary import ask_cameras
 from smartcam.fleet._bus.bus import Bus, Handle, never
-from smartcam.fleet._bus.wire import encode_runs
+from smartcam.fleet._bus.wire import encode_groups
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-NUMBERS_TIMEOUT = 0.5
-"""Seconds for an agent's answer with its next numbers; after that, the question is repeated."""
+NEXT_NUMBERS_TIMEOUT = 0.5
+"""Seconds for an agent's answer with the next result number of each of its cameras; after that, the
+question is repeated."""
 
 MAX_AGENTS_REMEMBERED = 1000
 """Largest number of agents whose next bundle number is remembered."""
@@ -54,11 +55,11 @@ class _KeyReceiver(Handle):
 
 
 class Exchange(Bus):
-    """The end of a bus that the cameras of one fleet share.
+    """A connection to a bus that the cameras of one fleet share.
 
     Args:
-        bus: end of the bus.
-        keys: function that returns the fleet's keys once the end is open.
+        bus: connection to the bus.
+        keys: function that returns the fleet's keys once the connection is open.
     """
 
     def __init__(self, bus: Bus, keys: Callable[[], Keys]) -> None:
@@ -69,7 +70,7 @@ class Exchange(Bus):
         self._common_handles: dict[str, Handle] = {}
         self._present: dict[str, set[str]] = {}  # present agents, by the camera's name
         # epoch and next expected number of each agent
-        self._bundles: dict[str, tuple[int, int]] = {}
+        self._next_bundles: dict[str, tuple[int, int]] = {}
         # functions that take the presences of all cameras
         self._presence_callbacks: list[Callable[[str, bool], None]] = []
         self._agents_with_gaps: set[str] = set()  # agents of which bundles may be missing
@@ -95,7 +96,7 @@ class Exchange(Bus):
             handle = bus.watch(keys.camera("*", "**"), self._on_presence)
         self._common_handles[kind] = handle
         for receivers in [*self._receivers.get(kind, {}).values()]:
-            # a message that arrives by both subscriptions is taken once, by its number
+            # a message may arrive by both subscriptions; its receiver drops one, by its number
             for receiver in receivers:
                 own_handle, receiver.handle = receiver.handle, None
                 if own_handle is not None:
@@ -103,7 +104,7 @@ class Exchange(Bus):
 
     def _unsubscribe_all(self, kind: str) -> None:
         self._common_handles.pop(kind).close()
-        self._bundles.clear()
+        self._next_bundles.clear()
         self._agents_with_gaps.clear()
 
     def _kind_of(self, key: str) -> str:
@@ -160,23 +161,23 @@ class Exchange(Bus):
             logger.warning("! %s", exc)
             return
         self._distribute_bundle(bundle)
-        known = self._bundles.get(agent)
-        self._bundles[agent] = bundle.epoch, bundle.following
+        known = self._next_bundles.get(agent)
+        self._next_bundles[agent] = bundle.epoch, bundle.next_number
         if known != (bundle.epoch, bundle.number):
             self._agents_with_gaps.add(agent)
-            self._find_gaps(agent)
-        if len(self._bundles) > MAX_AGENTS_REMEMBERED:
-            del self._bundles[next(iter(self._bundles))]
+            self._start_asking(agent)
+        if len(self._next_bundles) > MAX_AGENTS_REMEMBERED:
+            del self._next_bundles[next(iter(self._next_bundles))]
 
     def _distribute_bundle(self, bundle: ResultBundle) -> None:
         receivers, stem = self._receivers.get("results", {}), self._keys().results("")
-        for name, runs in bundle.parts:
+        for name, groups in bundle.parts:
             key = stem + name
             for receiver in tuple(receivers.get(key, ())):
-                receiver.call(key, runs)
+                receiver.call(key, groups)
 
-    def _find_gaps(self, agent: str) -> None:
-        """Start to ask for an agent's numbers, unless this is under way."""
+    def _start_asking(self, agent: str) -> None:
+        """Start to ask for an agent's next result numbers, unless this is under way."""
         asking = self._asking_tasks.get(agent)
         if asking is None or asking.done():
             self._asking_tasks[agent] = asyncio.get_running_loop().create_task(
@@ -193,22 +194,23 @@ class Exchange(Bus):
         keys, bus = self._keys(), self._bus
         while agent in self._agents_with_gaps:
             self._agents_with_gaps.discard(agent)
-            cameras = await ask_cameras(bus, keys, agent, "**", NUMBERS_TIMEOUT)
+            cameras = await ask_cameras(bus, keys, agent, "**", NEXT_NUMBERS_TIMEOUT)
             for camera in cameras:
                 receivers = self._receivers.get("results", {})
                 for receiver in tuple(receivers.get(keys.results(camera.summary.camera), ())):
-                    receiver.call(receiver.key, encode_runs(camera.epoch, camera.following, []))
-            if not cameras and await bus.present(keys.agent(agent), NUMBERS_TIMEOUT):
+                    # a message without results reports the next number
+                    receiver.call(receiver.key, encode_groups(camera.epoch, camera.next_result, []))
+            if not cameras and await bus.present_keys(keys.agent(agent), NEXT_NUMBERS_TIMEOUT):
                 self._agents_with_gaps.add(agent)
-                await asyncio.sleep(NUMBERS_TIMEOUT)
+                await asyncio.sleep(NEXT_NUMBERS_TIMEOUT)
 
     # ------------------------------------------------------------------ as a bus
 
     def subscribe(
-        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, low_priority: bool = False
     ) -> Handle:
         if "*" in pattern or self._kind_of(pattern) not in {"states", "results"}:
-            return self._bus.subscribe(pattern, on_message, patient=patient)
+            return self._bus.subscribe(pattern, on_message, low_priority=low_priority)
         return self._add_receiver(
             pattern, on_message, lambda: self._bus.subscribe(pattern, on_message)
         )
@@ -225,8 +227,8 @@ class Exchange(Bus):
         return receiver
 
     @property
-    def reached(self) -> bool:
-        return self._bus.reached
+    def is_connected(self) -> bool:
+        return self._bus.is_connected
 
     @property
     def waiting_bytes(self) -> int:
@@ -234,7 +236,7 @@ class Exchange(Bus):
 
     @property
     def identity(self) -> Identity | None:  # type: ignore[override]
-        """Identity in the certificate of the end."""
+        """Identity in the certificate of the connection."""
         return self._bus.identity
 
     async def open(self, timeout: float) -> Self:
@@ -278,15 +280,15 @@ class Exchange(Bus):
         pattern: str,
         answer: Callable[[BusQuestion], None],
         *,
-        patient: Callable[[str], bool] = never,
+        low_priority: Callable[[str], bool] = never,
     ) -> Handle:
-        return self._bus.answer(pattern, answer, patient=patient)
+        return self._bus.answer(pattern, answer, low_priority=low_priority)
 
     async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
         return await self._bus.ask(pattern, payload, timeout)
 
-    def be_present(self, key: str) -> Handle:
-        return self._bus.be_present(key)
+    def announce(self, key: str) -> Handle:
+        return self._bus.announce(key)
 
-    async def present(self, pattern: str, timeout: float) -> list[str]:
-        return await self._bus.present(pattern, timeout)
+    async def present_keys(self, pattern: str, timeout: float) -> list[str]:
+        return await self._bus.present_keys(pattern, timeout)

@@ -57,13 +57,12 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Bus, Handle
     from smartcam.models import Result, SubscriberStatistics
 
-MAX_CAMERAS_MET = 256
-"""Largest number of cameras of a fleet that are met when the fleet is opened. To meet a camera is
-to ask its agent for the camera's state. In a larger fleet each camera is met when it is first
-used."""
+MAX_CAMERAS_ASKED_AT_OPEN = 256
+"""Largest number of cameras of a fleet whose agents are asked for their state when the fleet is
+opened. In a larger fleet, the agent of a camera is asked when the camera is first used."""
 
 MAX_CAMERAS_AT_ONCE = 100
-"""Largest number of cameras that are met, or closed, at the same time."""
+"""Largest number of cameras whose agents are asked, or that are closed, at the same time."""
 
 MAX_CAMERAS_SUBSCRIBED = 64
 """Largest number of cameras that each have their own subscription. More cameras, if they are more
@@ -174,7 +173,7 @@ class FleetResults(Generic[ValueT]):
     def statistics(self) -> dict[str, SubscriberStatistics]:
         """Return the counters of each camera's queue."""
         return {
-            name: _sum_accounts([stream.statistics() for stream in streams])
+            name: _sum_counts([stream.statistics() for stream in streams])
             for name, streams in self._streams.items()
             if streams
         }
@@ -234,12 +233,12 @@ class FleetResults(Generic[ValueT]):
         self.close()
 
 
-def _sum_accounts(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
-    """Return the sum of the counters of a camera's queues, each of which replaced the last one."""
-    *_, last = accounts
+def _sum_counts(queues: list[SubscriberStatistics]) -> SubscriberStatistics:
+    """Return the sums of the counts of a camera's queues, which replaced each other in turn."""
+    *_, last = queues
     counts = ("offered", "taken", "dropped", "queued", "queued_bytes", "missed")
     return dataclasses.replace(
-        last, **{name: sum(getattr(account, name) for account in accounts) for name in counts}
+        last, **{name: sum(getattr(queue, name) for queue in queues) for name in counts}
     )
 
 
@@ -250,13 +249,13 @@ class Fleet:
     part of a name, ``**`` any number of parts.
 
     Args:
-        bus: end of the bus, for this fleet alone.
+        bus: connection to the bus, for this fleet alone.
         address: address of the fleet; None if it is in this process.
         fleet: name of the fleet; None for the only one on the bus.
         around: context manager that is entered before the fleet is opened, such as its agent.
         timeout: seconds of the timeout for connecting to the fleet.
         options: options of the cameras, as for :func:`smartcam.connect`.
-        guest: whether another object opens and closes the end of the bus.
+        bus_is_shared: whether another object opens and closes the connection to the bus.
     """
 
     def __init__(
@@ -268,12 +267,14 @@ class Fleet:
         timeout: float,
         options: Mapping[str, Any],
         *,
-        guest: bool = False,
+        bus_is_shared: bool = False,
     ) -> None:
         self._address = address
         self._exchange = Exchange(bus, lambda: self._program.keys)
         display_name = None if address is None else address.program
-        self._program = Program(self._exchange, fleet, guest=guest, display_name=display_name)
+        self._program = Program(
+            self._exchange, fleet, bus_is_shared=bus_is_shared, display_name=display_name
+        )
         self._around, self._timeout = around, timeout
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}
@@ -285,14 +286,14 @@ class Fleet:
         self._results: list[tuple[str, weakref.ref[FleetResults[Any]]]] = []
         self._stack = contextlib.AsyncExitStack()
         self._state: Literal["new", "open", "closed"] = "new"
-        self._meets_all_at_open = True  # False in a fleet of many cameras
-        self._meeting_slots = asyncio.Semaphore(MAX_CAMERAS_AT_ONCE)
+        self._asks_all_at_open = True  # False in a fleet of many cameras
+        self._asking_slots = asyncio.Semaphore(MAX_CAMERAS_AT_ONCE)
         self._make_camera("camera")  # raises for wrong options now
 
     # ------------------------------------------------------------------ open and close
 
     async def open(self) -> Self:
-        """Connect to the fleet, and meet its cameras.
+        """Connect to the fleet, and find its cameras.
 
         Raises:
             ConnectFailedError: no bus, or no agent with a camera, is found in time.
@@ -310,11 +311,12 @@ class Fleet:
             deadline = loop.time() + self._timeout
             await self._program.open(self._timeout)
             keys, bus = self._program.keys, self._program.bus
-            present = await bus.present(keys.camera("*", "**"), max(0.0, deadline - loop.time()))
-            self._meets_all_at_open = len(present) <= MAX_CAMERAS_MET
+            remaining = max(0.0, deadline - loop.time())
+            present = await bus.present_keys(keys.camera("*", "**"), remaining)
+            self._asks_all_at_open = len(present) <= MAX_CAMERAS_ASKED_AT_OPEN
             for key in present:
                 self._on_camera(key, True)
-            if self._meets_all_at_open:
+            if self._asks_all_at_open:
                 self._handles.append(bus.watch(keys.camera("*", "**"), self._on_camera))
             else:
                 self._exchange.watch_presences(self._on_camera)
@@ -322,7 +324,7 @@ class Fleet:
             self._handles.append(bus.watch(keys.agent("*"), self._on_agent))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout_at(deadline):
-                    await self._wait_met(self._opening_tasks.values())
+                    await self._wait_asked(self._opening_tasks.values())
         except BaseException:
             await self.close()
             raise
@@ -405,10 +407,10 @@ class Fleet:
         return url
 
     def _known_camera(self, name: str) -> FleetCamera[Any]:
-        """Return a camera; meet it first if it was not met before."""
+        """Return a camera; ask its agent first if that was not done before."""
         camera = self._cameras.get(name)
         if camera is None:
-            camera = self._meet_camera(name)
+            camera = self._ask_camera(name)
         return camera
 
     def agents(self, pattern: str = "**") -> list[str]:
@@ -450,33 +452,33 @@ class Fleet:
     def __len__(self) -> int:
         return sum(map(bool, self._agents.values()))
 
-    async def meet(self, pattern: str = "**") -> list[FleetCamera[Any]]:
+    async def find_cameras(self, pattern: str = "**") -> list[FleetCamera[Any]]:
         """Return the cameras of a pattern after their agents have answered, or timed out.
 
-        In a fleet of up to 256 cameras, all cameras are met when the fleet is opened; in a larger
-        fleet, each camera is met when it is first used. Commands to a camera wait until it is met;
-        properties return the state that is known so far.
+        In a fleet of up to 256 cameras, all agents are asked when the fleet is opened; in a larger
+        fleet, a camera's agent is asked when the camera is first used. Commands to a camera wait
+        for the answer; properties return the state that is known so far.
 
         Raises:
             ConfigurationError: the pattern is not valid.
             ConnectionClosedError: the fleet is not open.
 
-        Cancellation: safe; the cameras are still met.
+        Cancellation: safe; the answers still arrive.
         """
         cameras = self.cameras(pattern)
         self._require_open()
-        meeting = [
+        asking = [
             self._opening_tasks[camera.name]
             for camera in cameras
             if camera.name in self._opening_tasks
         ]
-        await self._wait_met(meeting)
+        await self._wait_asked(asking)
         self._require_open()
         return cameras
 
-    async def _wait_met(self, meeting: Iterable[asyncio.Task[None]]) -> None:
-        """Wait until cameras were met; a cancellation does not cancel the meeting."""
-        if tasks := {*meeting}:
+    async def _wait_asked(self, asking: Iterable[asyncio.Task[None]]) -> None:
+        """Wait until agents have answered; a cancellation does not cancel the tasks that ask."""
+        if tasks := {*asking}:
             await asyncio.wait(tasks)
 
     async def status(
@@ -528,8 +530,8 @@ class Fleet:
         pattern: str = "**",
         *,
         since: datetime | None = None,
-        failed: bool = False,
-        most: int = 100,
+        only_failed: bool = False,
+        max_rows: int = 100,
         timeout: float = STORE_TIMEOUT,
     ) -> list[ReportedStore]:
         """Return the answers of agents' stores of results, by agent and outlet.
@@ -537,8 +539,8 @@ class Fleet:
         Args:
             pattern: pattern of the cameras' names.
             since: time of the oldest rows to return, with its zone; None: all rows.
-            failed: whether rows are only errors, gaps, and results that did not pass.
-            most: largest number of rows of each store, which are the newest.
+            only_failed: whether rows are only errors, gaps, and results that did not pass.
+            max_rows: largest number of rows of each store, which are the newest.
             timeout: seconds for the answers of all agents; agents that do not answer are left out.
 
         Raises:
@@ -551,9 +553,9 @@ class Fleet:
         at = check_aware_datetime(since, "since", owner)
         request = StoredRequest(
             since=None if at is None else at.astimezone(UTC).isoformat(),
-            failed=check_flag(failed, "failed", owner),
+            only_failed=check_flag(only_failed, "only_failed", owner),
             camera=check_pattern(pattern),
-            most=check_integer(most, "most", 0, MAX_STORED_ROWS, owner),
+            max_rows=check_integer(max_rows, "max_rows", 0, MAX_STORED_ROWS, owner),
         )
         timeout = check_seconds(timeout, "timeout", owner)
         self._require_open()
@@ -569,7 +571,7 @@ class Fleet:
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[FleetEvent]:
-        """Subscribe to events of agents and cameras; the first events report those present now."""
+        """Subscribe to events of agents and cameras; the first ones report the shared cameras."""
         stream = Subscription[FleetEvent]("events", max_queue=max_queue, overflow=overflow)
         if self._state == "closed":
             stream.end(None)
@@ -617,9 +619,9 @@ class Fleet:
         self._on_agent(keys.agent(agent), True)  # the agent's event is before its cameras'
         sharing.add(agent)
         known = self._cameras.get(name)
-        wanted = self._meets_all_at_open or bool(self._matching_results(name))
+        wanted = self._asks_all_at_open or bool(self._matching_results(name))
         if (known is None and wanted) or (known is not None and known.ended):
-            self._meet_camera(name)
+            self._ask_camera(name)
         self._publish(CameraJoined, agent, name)
 
     def _remove_camera(self, agent: str, name: str) -> None:
@@ -639,7 +641,7 @@ class Fleet:
         settings = CameraSettings.of(self._address_of(name), {**self._options, **own_options})
         return FleetCamera[Any](settings, name, self._program, shared=True)
 
-    def _meet_camera(self, name: str) -> FleetCamera[Any]:
+    def _ask_camera(self, name: str) -> FleetCamera[Any]:
         previous = self._cameras.get(name)
         camera = self._cameras[name] = self._make_camera(name)
         for results in self._matching_results(name):
@@ -662,8 +664,8 @@ class Fleet:
     ) -> None:
         if previous is not None:
             await previous.close()
-        async with self._meeting_slots:
-            await camera.follow(self._timeout)
+        async with self._asking_slots:
+            await camera.connect_to_agent(self._timeout)
 
     # ------------------------------------------------------------------ several cameras
 
@@ -729,7 +731,7 @@ class Fleet:
     ) -> dict[str, Any]:
         pattern = check_pattern(pattern)
         self._require_open()
-        cameras = await self.meet(pattern)
+        cameras = await self.find_cameras(pattern)
         if not cameras:
             names = ", ".join(self.names()[:20]) or "none"
             raise ConfigurationError(f"no camera of the fleet is {pattern!r}; there are {names}")

@@ -1,4 +1,4 @@
-"""Define a program's end of the bus, which sends calls to agents and receives the replies."""
+"""Define a program's connection to the bus: it sends calls to agents, and receives replies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from smartcam.exceptions import (
     ProtocolError,
 )
 from smartcam.fleet._bus.keys import ANYONE, Keys
-from smartcam.fleet._bus.wire import BusMessage, TriggerReply, decode, decode_outcome, encode
+from smartcam.fleet._bus.wire import BusMessage, TriggerReply, decode, decode_trigger_reply, encode
 from smartcam.fleet._frames.collector import FrameCollector
 from smartcam.fleet._program.program_name import ProgramName
 
@@ -56,23 +56,23 @@ class Pending(NamedTuple):
 
     Attributes:
         camera: the camera that is called.
-        reply: the future of the reply.
+        reply_future: future of the reply.
         deadline: loop time at which the call fails without a reply.
     """
 
     camera: CalledCamera
-    reply: AnyFuture
+    reply_future: AnyFuture
     deadline: float
 
 
 class Program:
-    """One program's end of the bus.
+    """One program's connection to the bus.
 
     Args:
-        bus: the program's own end of the bus.
+        bus: the program's own connection to the bus.
         fleet: name of the fleet; None for the only fleet that has the camera.
         camera: name or pattern of the camera, to find the fleet.
-        guest: whether another object opens and closes the end.
+        bus_is_shared: whether another object opens and closes the connection.
         display_name: name of the program for people; None: the name of its script.
 
     Attributes:
@@ -88,13 +88,13 @@ class Program:
         fleet: str | None,
         camera: str = "**",
         *,
-        guest: bool = False,
+        bus_is_shared: bool = False,
         display_name: str | None = None,
     ) -> None:
         self.bus: Bus = bus
-        self._guest = guest
+        self._bus_is_shared = bus_is_shared
         self._fleet, self._camera = fleet, camera
-        self._called = display_name
+        self._display_name = display_name
         self._set_name(ProgramName.new(ANYONE, display_name))
         self._call_count = 0
         self._pending_calls: dict[int, Pending] = {}
@@ -113,15 +113,15 @@ class Program:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
         self._bell = make_doorbell(loop)
-        if not self._guest:
+        if not self._bus_is_shared:
             await self.bus.open(timeout)
         self.keys = Keys(self._fleet or await self._find_fleet(deadline, timeout))
         if self.bus.identity is not None:
-            display_name = self._called or self.bus.identity.name or None
+            display_name = self._display_name or self.bus.identity.name or None
             self._set_name(ProgramName.new(self.bus.identity.role, display_name))
         self._handles = [
             self.bus.subscribe(self.keys.reply(self.name), self._on_reply),
-            self.bus.be_present(self.keys.program(self.token)),
+            self.bus.announce(self.keys.program(self.token)),
         ]
         return self
 
@@ -152,7 +152,7 @@ class Program:
         if self._camera == "**":
             pattern = keys_of.agent("*")
         while (remaining := deadline - loop.time()) > 0:
-            keys = await self.bus.present(pattern, remaining)
+            keys = await self.bus.present_keys(pattern, remaining)
             fleets = sorted({key.split("/")[1] for key in keys})
             if len(fleets) == 1:
                 return fleets[0]
@@ -164,25 +164,26 @@ class Program:
             await asyncio.sleep(min(AGENT_SEARCH_INTERVAL, remaining))
         wanted, suggestion = "camera", ""
         if "*" not in self._camera:
-            keys = await self.bus.present(Keys("*").camera("*", "**"), SIMILAR_NAMES_TIMEOUT)
+            keys = await self.bus.present_keys(Keys("*").camera("*", "**"), SIMILAR_NAMES_TIMEOUT)
             suggestion = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
             wanted = f"camera {self._camera}"
         identity = self.bus.identity
         hidden = "" if identity is None else f"; or {identity} may not see it"
-        why = f"no agent there has a {wanted}: none came within {timeout:g} s{suggestion}{hidden}"
-        raise ConnectFailedError(why, attempts=(why,))
+        late = f"none came within {timeout:g} s{suggestion}{hidden}"
+        reason = f"no agent there has a {wanted}: {late}"
+        raise ConnectFailedError(reason, attempts=(reason,))
 
     async def close(self) -> None:
         """Leave the bus, and end running calls. Idempotent."""
         for pending in [*self._pending_calls.values()]:
-            if not pending.reply.done():
-                pending.reply.set_exception(ConnectionClosedError("closed"))
+            if not pending.reply_future.done():
+                pending.reply_future.set_exception(ConnectionClosedError("closed"))
         self._deadline_timer.cancel()
         handles, self._handles = self._handles, []
         self.frames.close()
         for handle in handles:
             handle.close()
-        if not self._guest:
+        if not self._bus_is_shared:
             await self.bus.close()
 
     def next_call(self) -> int:
@@ -242,10 +243,10 @@ class Program:
 
     def _on_reply(self, key: str, payload: bytes) -> None:
         try:
-            outcome = decode_outcome(payload, "a reply")
-            if outcome is not None:
-                message: Reply = outcome
-                number = outcome.call
+            trigger_reply = decode_trigger_reply(payload, "a reply")
+            if trigger_reply is not None:
+                message: Reply = trigger_reply
+                number = trigger_reply.call
             else:
                 message = decoded = decode(payload, "a reply")
                 number = decoded.fields["call"]
@@ -253,9 +254,9 @@ class Program:
         except (ProtocolError, KeyError, TypeError) as exc:
             logger.warning("%s ! a reply that cannot be read: %s", self.name, exc)
             return
-        if pending is None or pending.reply.done():
+        if pending is None or pending.reply_future.done():
             return
         if pending.camera.streams_results:
-            pending.reply.set_result(message)
+            pending.reply_future.set_result(message)
         else:
-            self._bell.set_future(pending.reply, message)
+            self._bell.set_future(pending.reply_future, message)

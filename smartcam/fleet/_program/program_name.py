@@ -1,8 +1,9 @@
 """A program's name, and the secret by which an agent recognizes the program.
 
-The name begins with the role in the program's certificate, and ends with a digest of the secret.
-The bus checks the role; an agent checks the digest. The name is public; the secret is sent only to
-agents. So no program can make or cancel calls, or announce its presence, as another program.
+The program is a process that uses a fleet. The name begins with the role in the program's
+certificate, and ends with a digest of the secret. The bus checks the role; an agent checks the
+digest. The name is public; the secret is sent only to agents. So no program can make or cancel
+calls, or announce its presence, as another program.
 """
 
 from __future__ import annotations

@@ -19,58 +19,59 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from smartcam._client._inside import Interpretation, Interpreted
-    from smartcam.fleet._bus.wire import ResultRun
+    from smartcam.fleet._bus.wire import ResultGroup
 
 
-def split_run(run: ResultRun) -> Iterator[ResultRun]:
-    """Yield each container of a run as a run of one container."""
-    for index in range(len(run.payloads)):
-        yield run._replace(number=run.number + index, payloads=run.payloads[index : index + 1])
+def split_group(group: ResultGroup) -> Iterator[ResultGroup]:
+    """Yield each container of a group as a group of one container."""
+    for index in range(len(group.payloads)):
+        payloads = group.payloads[index : index + 1]
+        yield group._replace(number=group.number + index, payloads=payloads)
 
 
-def interpret_run(
-    run: ResultRun, interpretation: Interpretation, camera: str, at: datetime | None = None
+def interpret_single(
+    group: ResultGroup, interpretation: Interpretation, camera: str, at: datetime | None = None
 ) -> Interpreted:
-    """Return the interpreted contents of a run that has one container.
+    """Return the interpreted contents of a group that has one container.
 
     Args:
-        run: run of one container.
+        group: group of one container.
         interpretation: interpretation of the container.
         camera: name of the camera.
-        at: time of receipt; None: compute it from the run.
+        at: time of receipt; None: take it from the group.
 
     Raises:
         InterpretationError: the container does not fit the interpretation.
     """
     cells = fault = None
-    if run.cells:
-        content: dict[str, Any] = json.loads(run.cells)
+    if group.cells:
+        content: dict[str, Any] = json.loads(group.cells)
         fault, cell_list = content.get("fault"), content.get("cells")
         cells = None if cell_list is None else tuple(cell_list)
-    (data,) = run.payloads
-    container = ResultContainer(application=run.application, data=data, cells=cells, fault=fault)
+    (data,) = group.payloads
+    container = ResultContainer(application=group.application, data=data, cells=cells, fault=fault)
     # calling __call__ by its name takes a quarter of the time of calling the object
     return interpretation.__call__(
-        container, run.endian, camera=camera, number=run.number, at=at or run.received_at
+        container, group.endian, camera=camera, number=group.number, at=at or group.received_at
     )
 
 
 def to_result(
-    run: ResultRun, camera: str, value: Any, sequence: int | None, at: datetime | None = None
+    group: ResultGroup, camera: str, value: Any, sequence: int | None, at: datetime | None = None
 ) -> Result[Any]:
-    """Return a result with this value for a run of one container; ``at``: time of receipt."""
-    latency = None if math.isnan(run.latency) else run.latency
-    number, triggered_at, received_at = run.number, run.trigger_time, at or run.received_at
+    """Return a result with this value for a group of one container; ``at``: time of receipt."""
+    latency = None if math.isnan(group.latency) else group.latency
+    number, triggered_at, received_at = group.number, group.trigger_time, at or group.received_at
     times = number, triggered_at, received_at, latency
-    fields = (camera, run.application, sequence, *times, run.payloads[0], value)
+    fields = (camera, group.application, sequence, *times, group.payloads[0], value)
     result: Result[Any] = new_tuple(Result, fields)
     return result
 
 
 def result_fields(
-    run: ResultRun, interpretation: Interpretation | None, camera: str
+    group: ResultGroup, interpretation: Interpretation | None, camera: str
 ) -> dict[str, Any]:
-    """Return the fields for JSON of a run that has one container.
+    """Return the fields for JSON of a group that has one container.
 
     The value is None if there is an error, or no interpretation; ``error`` is empty without error.
     """
@@ -78,7 +79,7 @@ def result_fields(
     outcome: dict[str, Any] = {"error": ""}
     if interpretation is not None:
         try:
-            value, sequence, _ = interpret_run(run, interpretation, camera)
+            value, sequence, _ = interpret_single(group, interpretation, camera)
             if localizations_of(value) is None:  # localizations can be encoded as they are
                 value = plain(value)
         except InterpretationError as error:
@@ -90,7 +91,7 @@ def result_fields(
                 None,
                 error_fields(InterpretationError(f"the value is no JSON: {exc!r:.200}")),
             )
-    return {**to_result(run, camera, value, sequence)._asdict(), **outcome}
+    return {**to_result(group, camera, value, sequence)._asdict(), **outcome}
 
 
 def error_fields(error: BaseException) -> dict[str, Any]:

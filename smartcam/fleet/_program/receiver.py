@@ -17,8 +17,8 @@ from smartcam.exceptions import (
     WrongApplicationError,
 )
 from smartcam.fleet._bus.log import Feed
-from smartcam.fleet._bus.wire import CURRENT, LATE, ResultRun, decode, decode_runs, decode_state
-from smartcam.fleet._program.reading import interpret_run, split_run, to_result
+from smartcam.fleet._bus.wire import CURRENT, LATE, ResultGroup, decode, decode_groups, decode_state
+from smartcam.fleet._program.reading import interpret_single, split_group, to_result
 from smartcam.models import Result
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from smartcam._client._inside import ClientCounters, Interpretation
     from smartcam.fleet._bus.bus import Handle
-    from smartcam.fleet._bus.wire import Batch, BusMessage, TriggerReply
-    from smartcam.fleet._program.caller import Caller, MetAgent
+    from smartcam.fleet._bus.wire import BusMessage, ResultsMessage, TriggerReply
+    from smartcam.fleet._program.caller import Caller, CameraAgent
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
@@ -98,13 +98,13 @@ class FleetListeners(Listeners):
             taken = [wait for wait in taken if wait not in later_waits]
         return taken
 
-    def report_missed(self, count: int, following: ResultRun | None) -> None:
-        """Report to the streams that ``count`` results before ``following`` are missed.
+    def report_missed(self, count: int, next_group: ResultGroup | None) -> None:
+        """Report to the streams that ``count`` results before ``next_group`` are missed.
 
         A stream that was started while these results came cannot know how many of them it should
         have got: it counts all of them.
         """
-        self.results.offered_at = math.inf if following is None else following.clock
+        self.results.offered_at = math.inf if next_group is None else next_group.clock
         for stream in self.results:
             stream.miss(count)
         self.results.offered_at = math.inf
@@ -127,7 +127,7 @@ class OwnTrigger:
 
 
 class Receiver:
-    """Receives the agent's messages, and makes results from runs.
+    """Receives the agent's messages, and makes results from groups of containers.
 
     Args:
         name: name of the camera in results.
@@ -159,8 +159,8 @@ class Receiver:
         self._states: Feed[StateMessage] = Feed(
             self._take_state, _ignore_missed, lambda: self._fetch_soon("states")
         )
-        self._results: Feed[ResultRun] = Feed(
-            self._pass_run,
+        self._results: Feed[ResultGroup] = Feed(
+            self._pass_group,
             listeners.report_missed,
             lambda: self._fetch_soon("results"),
             resumes_epochs=True,
@@ -189,21 +189,21 @@ class Receiver:
         await asyncio.gather(*tasks, return_exceptions=True)
         self._wake_waits(every_wait=True)
 
-    def misses_states(self, met: MetAgent) -> bool:
+    def misses_states(self, agent: CameraAgent) -> bool:
         """Return True if the agent is the same as before, and has sent states not received here."""
         feed = self._states
-        return feed.epoch == met.epoch and 0 < feed.expected < int(met.hello["states"])
+        return feed.epoch == agent.epoch and 0 < feed.expected < int(agent.hello["states"])
 
-    def begin_agent(self, met: MetAgent) -> None:
+    def begin_agent(self, agent: CameraAgent) -> None:
         """Expect the next messages of an agent, whose numbers are in its answer to the hello."""
-        hello = met.hello
+        hello = agent.hello
         self._program = int(hello.get("program", 0))
         states, results = int(hello["states"]), int(hello["results"])
-        self._states.begin(met.epoch, states, states)
+        self._states.begin(agent.epoch, states, states)
         if "results" not in self._handles:
             return
         if self._results.expected:  # of a restarted or new agent, all results are wanted
-            self._results.begin(met.epoch, int(hello.get("began", 1)), results)
+            self._results.begin(agent.epoch, int(hello.get("first_result", 1)), results)
         else:
             self._start_task("find", self._find_first_result())
 
@@ -243,13 +243,13 @@ class Receiver:
     async def _find_first_result(self) -> None:
         """Ask the agent for the number of the first result that came after the first listener."""
         while self._caller.agent is not None:
-            met = self._caller.agent
+            agent = self._caller.agent
             with contextlib.suppress(SmartCamError):
                 reply = await self._caller.call(
-                    "find", self._fetch_deadline(), {"since": self._results_since}
+                    "find_first_result", self._fetch_deadline(), {"since": self._results_since}
                 )
                 answer = reply.fields["answer"]
-                self._results.begin(met.epoch, int(answer["first"]), int(answer["following"]))
+                self._results.begin(agent.epoch, int(answer["first"]), int(answer["next_number"]))
                 self._wake_waits()
                 return
 
@@ -314,13 +314,14 @@ class Receiver:
                 continue
             try:
                 answer = reply.fields["answer"]
-                first, following = int(answer["first"]), int(answer["following"])
+                first, next_number = int(answer["first"]), int(answer["next_number"])
                 messages = _decode_messages(kind, reply)
             except (ProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! what was missing cannot be read: %s", self._name, exc)
-                first = following = feed.expected + 1  # skip the message, not to request it forever
+                # skip the message, not to request it forever
+                first = next_number = feed.expected + 1
                 messages = []
-            feed.fill(epoch, first, following, messages)
+            feed.fill(epoch, first, next_number, messages)
             self._wake_waits()
 
     def _fetch_deadline(self) -> float:
@@ -332,17 +333,17 @@ class Receiver:
         origin = f"the agent's message about {self._camera}"
         try:
             message = decode(payload, origin)
-            epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
+            epoch, next_number = int(message.fields["epoch"]), int(message.fields["next_number"])
             self._count_message(payload)
             known_count = 0  # states that came before, with replies
             if epoch == self.epoch:
-                known_count = max(0, self._states.expected - following + len(message.blobs))
+                known_count = max(0, self._states.expected - next_number + len(message.blobs))
             states = [read_state(blob) for blob in message.blobs[known_count:]]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
             logger.warning("%s ! %s: %s", self._name, origin, exc)
             return
         self._check_restart(epoch)
-        self._states.receive(epoch, following, states)
+        self._states.receive(epoch, next_number, states)
         self._wake_waits()
 
     def take_states(self, reply: TriggerReply) -> None:
@@ -354,12 +355,12 @@ class Receiver:
         except ValueError as exc:
             logger.warning("%s ! the states in a reply are not valid: %s", self._camera, exc)
             return
-        self._states.receive(reply.epoch, reply.states, states)
+        self._states.receive(reply.epoch, reply.next_state, states)
         self._wake_waits()
 
     def _on_result_message(self, key: str, payload: bytes) -> None:
         try:
-            batch = decode_runs(payload, f"results of {self._camera}")
+            message = decode_groups(payload, f"results of {self._camera}")
         except ProtocolError as exc:
             logger.warning("%s ! %s", self._name, exc)
             return
@@ -368,15 +369,15 @@ class Receiver:
         if not (listeners.wants_results or listeners.has_result_observer):
             self._unsubscribe_results()
             return
-        self._check_restart(batch.epoch)
-        self._results.receive(batch.epoch, batch.following, batch.runs)
+        self._check_restart(message.epoch)
+        self._results.receive(message.epoch, message.next_number, message.groups)
         self._wake_waits()
 
     def _check_restart(self, epoch: int) -> None:
         """Drop the agent if it was restarted, which its presence on the bus may not show."""
-        met = self._caller.agent
-        if met is not None and self._caller.has_restarted(epoch):
-            self._caller.lose_agent(f"the agent {met.name} was restarted")
+        agent = self._caller.agent
+        if agent is not None and self._caller.has_restarted(epoch):
+            self._caller.lose_agent(f"the agent {agent.name} was restarted")
 
     def _count_message(self, payload: bytes) -> None:
         counters = self._caller.counters
@@ -388,7 +389,7 @@ class Receiver:
 
     # ------------------------------------------------------------------ results
 
-    def trigger_results(self, own_trigger: OwnTrigger, batch: Batch) -> list[Result]:
+    def trigger_results(self, own_trigger: OwnTrigger, message: ResultsMessage) -> list[Result]:
         """Return the results in the reply to an own trigger.
 
         Raises:
@@ -396,8 +397,8 @@ class Receiver:
         """
         results: list[Result] = []
         error, latency = None, math.nan
-        for run in batch.runs:
-            outcome, latency = self._trigger_outcome(own_trigger, run), run.latency
+        for group in message.groups:
+            outcome, latency = self._trigger_outcome(own_trigger, group), group.latency
             if not isinstance(outcome, InterpretationError):
                 results.append(outcome)
             elif error is None:
@@ -409,23 +410,23 @@ class Receiver:
         return results
 
     def _trigger_outcome(
-        self, own_trigger: OwnTrigger, run: ResultRun
+        self, own_trigger: OwnTrigger, group: ResultGroup
     ) -> Result | InterpretationError:
         """Return a trigger's result, or its error.
 
         A result can arrive twice: in the reply, and for all programs. It is counted once.
         """
-        known = own_trigger.outcomes.get(run.number)
+        known = own_trigger.outcomes.get(group.number)
         if known is not None:
             return known
         counters = self._counters
         try:
-            if own_trigger.expected is not None and run.application != own_trigger.expected:
+            if own_trigger.expected is not None and group.application != own_trigger.expected:
                 counters.count("wrong_application")
-                raise self._wrong_application_error(run, own_trigger.expected)
+                raise self._wrong_application_error(group, own_trigger.expected)
             try:
                 outcome: Result | InterpretationError = self._interpret(
-                    run, own_trigger.interpretation
+                    group, own_trigger.interpretation
                 )
             except InterpretationError:
                 counters.count("uninterpretable")
@@ -433,31 +434,31 @@ class Receiver:
             counters.count("triggered")
         except InterpretationError as error:
             outcome = error
-        own_trigger.outcomes[run.number] = outcome
+        own_trigger.outcomes[group.number] = outcome
         return outcome
 
-    def _pass_run(self, run: ResultRun) -> None:
+    def _pass_group(self, group: ResultGroup) -> None:
         """Pass results to the listeners that came before these results."""
         listeners = self._listeners
-        listeners.results.offered_at = run.clock
+        listeners.results.offered_at = group.clock
         try:
             now = asyncio.get_running_loop().time()
             own_trigger = (
-                self.own_triggers.get(run.call)
-                if run.owner and run.owner == self._program
+                self.own_triggers.get(group.call)
+                if group.owner and group.owner == self._program
                 else None
             )
             if own_trigger is not None:
-                self._offer(run, self._trigger_outcome(own_trigger, run), now, owned=True)
+                self._offer(group, self._trigger_outcome(own_trigger, group), now, owned=True)
                 return
             expected = self._expected()
-            if expected is not None and run.application != expected:
-                self._counters.count("wrong_application", len(run.payloads))
+            if expected is not None and group.application != expected:
+                self._counters.count("wrong_application", len(group.payloads))
                 return
-            if listeners.results_only_streamed and self._pass_burst(run, now):
+            if listeners.results_only_streamed and self._pass_burst(group, now):
                 return
-            for single in split_run(run):
-                fate = "late" if run.flags & LATE else "streamed"
+            for single in split_group(group):
+                fate = "late" if group.flags & LATE else "streamed"
                 try:
                     outcome: Result | InterpretationError = self._interpret(
                         single, self._interpretation()
@@ -470,63 +471,63 @@ class Receiver:
             listeners.results.offered_at = math.inf
 
     def _offer(
-        self, run: ResultRun, outcome: Result | InterpretationError, now: float, *, owned: bool
+        self, group: ResultGroup, outcome: Result | InterpretationError, now: float, *, owned: bool
     ) -> None:
-        current, listeners = bool(run.flags & CURRENT), self._listeners
+        current, listeners = bool(group.flags & CURRENT), self._listeners
         if isinstance(outcome, InterpretationError):
-            size = len(run.payloads[0])
+            size = len(group.payloads[0])
             listeners.offer_error(outcome, now, size, current=current, reported_by_caller=owned)
         else:
-            listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
+            listeners.offer_result(outcome, now, current=current, late=bool(group.flags & LATE))
 
-    def _pass_burst(self, run: ResultRun, now: float) -> bool:
-        """Pass all results of a run to streams at once; return whether that was possible."""
-        if run.cells or not run.flags & CURRENT:
+    def _pass_burst(self, group: ResultGroup, now: float) -> bool:
+        """Pass all results of a group to streams at once; return whether that was possible."""
+        if group.cells or not group.flags & CURRENT:
             return False
         interpreted = self._interpretation().burst(
-            run.application,
-            run.payloads,
-            run.endian,
+            group.application,
+            group.payloads,
+            group.endian,
             camera=self._name,
-            number=run.number,
-            at=run.received_at,
+            number=group.number,
+            at=group.received_at,
         )
         if interpreted is None:
             return False
         values, empty_slots = interpreted
-        count, name, at, trigger = len(values), self._name, run.received_at, run.trigger_time
-        latency = None if math.isnan(run.latency) else run.latency
+        count, name, at, trigger = len(values), self._name, group.received_at, group.trigger_time
+        latency = None if math.isnan(group.latency) else group.latency
         results = [
-            Result(name, run.application, None, number, trigger, at, latency, raw, value)
+            Result(name, group.application, None, number, trigger, at, latency, raw, value)
             for number, raw, value in zip(
-                range(run.number, run.next), run.payloads, values, strict=True
+                range(group.number, group.next), group.payloads, values, strict=True
             )
         ]
         self._counters.add_empty_slots(empty_slots)
         self._counters.count("streamed", count)
-        self._listeners.offer_burst(results, now, run.size)
+        self._listeners.offer_burst(results, now, group.size)
         return True
 
-    def _interpret(self, run: ResultRun, interpretation: Interpretation) -> Result:
-        at = run.received_at
-        value, sequence, empty_slots = interpret_run(run, interpretation, self._name, at)
+    def _interpret(self, group: ResultGroup, interpretation: Interpretation) -> Result:
+        at = group.received_at
+        value, sequence, empty_slots = interpret_single(group, interpretation, self._name, at)
         if empty_slots:
             self._counters.add_empty_slots(empty_slots)
-        return to_result(run, self._name, value, sequence, at)
+        return to_result(group, self._name, value, sequence, at)
 
-    def _wrong_application_error(self, run: ResultRun, expected: int) -> WrongApplicationError:
+    def _wrong_application_error(self, group: ResultGroup, expected: int) -> WrongApplicationError:
         return WrongApplicationError(
-            f"{self._name}: a result of application {run.application} came, "
+            f"{self._name}: a result of application {group.application} came, "
             f"application {expected} was expected",
             expected=expected,
-            got=run.application,
+            got=group.application,
         )
 
 
 def _decode_messages(kind: str, reply: BusMessage) -> list[Any]:
     if kind == "states":
         return [read_state(blob) for blob in reply.blobs]
-    return decode_runs(reply.blobs[0], "results that were asked for").runs
+    return decode_groups(reply.blobs[0], "results that were asked for").groups
 
 
 def _ignore_missed(_count: int, _following: StateMessage | None) -> None:

@@ -1,6 +1,6 @@
-"""Define the rights of each role, and convert them to rules for Zenoh (the bus's *engine*).
+"""Define the rights of each role, and convert them to rules for Zenoh.
 
-A program's role is the common name in its certificate. The engine allows only what :data:`RIGHTS`
+A program's role is the common name in its certificate. Zenoh allows only what :data:`RIGHTS`
 list; ``docs/access.md`` is generated from this list.
 """
 
@@ -17,10 +17,10 @@ from smartcam.fleet._security.certificates import AGENT, OPERATOR, ROLES, ROUTER
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-Does = Literal["put", "subscribe", "query", "answer", "present", "watch"]
+Use = Literal["put", "subscribe", "query", "answer", "present", "watch"]
 Flow = Literal["ingress", "egress"]
 
-MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
+MESSAGES: dict[Use, tuple[tuple[str, Flow], ...]] = {
     "put": (("put", "ingress"), ("declare_subscriber", "egress")),
     "subscribe": (("declare_subscriber", "ingress"), ("put", "egress")),
     "query": (("query", "ingress"), ("reply", "egress"), ("declare_queryable", "egress")),
@@ -32,8 +32,8 @@ MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
         ("liveliness_token", "egress"),
     ),
 }
-"""Zenoh's messages for each kind of use, and their direction; ``ingress``: from a program to the
-engine."""
+"""Zenoh's messages for each kind of use, and their direction; ``ingress``: from a program to
+Zenoh."""
 
 
 class Right(NamedTuple):
@@ -41,19 +41,19 @@ class Right(NamedTuple):
 
     Attributes:
         what: the right in words.
-        does: kind of use that the right allows.
+        use: kind of use that the right allows.
         keys: patterns of the keys that may be used.
         roles: roles that have the right.
     """
 
     what: str
-    does: Does
+    use: Use
     keys: tuple[str, ...]
     roles: tuple[str, ...]
 
 
-_ANY = Keys("*")  # keys of any fleet; an authority is for one plant, not for one fleet
-_READ_ONLY_SERVICES = tuple(name for name, service in SERVICES.items() if not service.command)
+_ANY = Keys("*")  # keys of any fleet: all fleets of a plant have one certificate authority
+_READ_ONLY_SERVICES = tuple(name for name, service in SERVICES.items() if not service.is_command)
 _ALL_PROGRAMS, _OPERATORS, _AGENTS = (VIEWER, OPERATOR, AGENT), (OPERATOR,), (AGENT,)
 
 RIGHTS: tuple[Right, ...] = (
@@ -88,7 +88,7 @@ RIGHTS: tuple[Right, ...] = (
     Right("get results in bundles", "subscribe", (_ANY.bundle("*"),), _ALL_PROGRAMS),
     Right("request the state of all cameras", "query", (_ANY.summary("*"),), _ALL_PROGRAMS),
     Right("JSON: list the cameras", "query", (_ANY.listing("**"),), _ALL_PROGRAMS),
-    Right("JSON: request the outlets' accounts", "query", (_ANY.outlets("*", "*"),), _ALL_PROGRAMS),
+    Right("JSON: request the outlets' counts", "query", (_ANY.outlets("*", "*"),), _ALL_PROGRAMS),
     Right(
         "JSON: get topics",
         "subscribe",
@@ -114,7 +114,7 @@ RIGHTS: tuple[Right, ...] = (
     Right("publish results and states", "put", (_ANY.results("**"), _ANY.states("**")), _AGENTS),
     Right("publish results in bundles", "put", (_ANY.bundle("*"),), _AGENTS),
     Right("report the state of all its cameras", "answer", (_ANY.summary("*"),), _AGENTS),
-    Right("JSON: report its outlets' accounts", "answer", (_ANY.outlets("*", "*"),), _AGENTS),
+    Right("JSON: report its outlets' counts", "answer", (_ANY.outlets("*", "*"),), _AGENTS),
     Right("JSON: publish topics", "put", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _AGENTS),
     Right(
         "JSON: list, serve",
@@ -132,15 +132,15 @@ def ros_rights(domain: int) -> tuple[Right, ...]:
     Keys do not show whether a node only reads. So with these rights a node could call any service.
     """
     keys = (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**")
-    return tuple(Right("ROS 2", does, keys, (OPERATOR, AGENT)) for does in MESSAGES)
+    return tuple(Right("ROS 2", use, keys, (OPERATOR, AGENT)) for use in MESSAGES)
 
 
 _EVERYTHING = ("**", "**/@adv/**", "@ros2_lv/**")
-_ROUTER_RIGHTS = tuple(Right("pass on", does, _EVERYTHING, (ROUTER,)) for does in MESSAGES)
+_ROUTER_RIGHTS = tuple(Right("pass on", use, _EVERYTHING, (ROUTER,)) for use in MESSAGES)
 
 
 def access_control(domain: int | None = None) -> dict[str, Any]:
-    """Return the rules in the form of the engine's ``access_control``.
+    """Return the rules in the form of Zenoh's ``access_control``.
 
     Args:
         domain: domain of ROS 2 on the same bus; None without ROS.
@@ -179,5 +179,5 @@ def access_control(domain: int | None = None) -> dict[str, Any]:
 
 def _messages_of(right: Right) -> Iterator[tuple[str, str, Flow]]:
     for role in right.roles:
-        for message, flow in MESSAGES[right.does]:
+        for message, flow in MESSAGES[right.use]:
             yield role, message, flow

@@ -56,7 +56,7 @@ class MadeCertificate(NamedTuple):
         name: name in the certificate.
         folder: folder of the certificate.
         done: ``made``, ``renewed`` or ``kept``.
-        ends: end of the certificate, UTC.
+        expires_at: time at which the certificate expires, UTC.
         use: lines for fleet.yaml, or the URL to use.
     """
 
@@ -64,7 +64,7 @@ class MadeCertificate(NamedTuple):
     name: str
     folder: str
     done: str
-    ends: datetime
+    expires_at: datetime
     use: str
 
 
@@ -75,7 +75,7 @@ def make_certificates(
     hosts: Iterable[str] = (),
     lifetime: timedelta = LIFETIME,
 ) -> list[MadeCertificate]:
-    """Make a plant's missing certificates, and renew certificates that end soon; blocks.
+    """Make a plant's missing certificates, and renew those that expire soon. This call blocks.
 
     Each certificate has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text
     on its use. The first call makes the authority, in ``authority``. A renewed certificate keeps
@@ -155,11 +155,11 @@ class _Authority:
         return cls(folder, certificate, _load_or_make_key(own_folder))
 
     @staticmethod
-    def _create(place: Path) -> None:
+    def _create(folder: Path) -> None:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
 
-        key = _load_or_make_key(place)
+        key = _load_or_make_key(folder)
         name = _subject("smartcam plant", "")
         certificate = (
             _builder(name, name, key.public_key(), datetime.now(UTC) + AUTHORITY_LIFETIME)
@@ -167,15 +167,15 @@ class _Authority:
             .add_extension(_key_usage(signs=True), critical=True)
             .sign(key, hashes.SHA256())
         )
-        _write(place / CA_FILE, _pem(certificate))
+        _write(folder / CA_FILE, _pem(certificate))
 
-    def read_role(self, place: Path) -> str:
+    def read_role(self, folder: Path) -> str:
         """Return the role in the certificate of a folder."""
-        identity = read_identity(place)
+        identity = read_identity(folder)
         if identity.role not in ROLES:
             raise ConfigurationError(
-                f"certificates: {place} has one with the role {identity.role!r:.40}: expected one "
-                f"of {', '.join(ROLES)}"
+                f"certificates: {folder} has a certificate with the role "
+                f"{identity.role!r:.40}: expected one of {', '.join(ROLES)}"
             )
         return identity.role
 
@@ -183,8 +183,8 @@ class _Authority:
         self, role: str, name: str, hosts: list[str], lifetime: timedelta
     ) -> MadeCertificate:
         """Make the certificate of a name, or renew it, if needed; return the outcome."""
-        place = self._folder / name
-        certificate = self._read_certificate(place)
+        folder = self._folder / name
+        certificate = self._read_certificate(folder)
         done = "kept"
         if role in LISTENING_ROLES:
             old_hosts = [] if certificate is None else _hosts_of(certificate)
@@ -193,47 +193,47 @@ class _Authority:
             lacks_hosts = bool({*hosts} - {*old_hosts})
         else:
             hosts, lacks_hosts = [], False
-        if certificate is None or lacks_hosts or _ends_soon(certificate):
+        if certificate is None or lacks_hosts or _expires_soon(certificate):
             done = "made" if certificate is None else "renewed"
-            certificate = self._sign(role, name, hosts, lifetime, place)
-        use = _usage_text(role, name, place, hosts)
-        if role == ROUTER and not (place / ROUTER_FILE).exists():
-            _write(place / ROUTER_FILE, _router_config(place))
-        if not (place / HOW_TO_USE).exists():
-            _write(place / HOW_TO_USE, use.encode())
-        return MadeCertificate(role, name, str(place), done, certificate.not_valid_after_utc, use)
+            certificate = self._sign(role, name, hosts, lifetime, folder)
+        use = _usage_text(role, name, folder, hosts)
+        if role == ROUTER and not (folder / ROUTER_FILE).exists():
+            _write(folder / ROUTER_FILE, _router_config(folder))
+        if not (folder / HOW_TO_USE).exists():
+            _write(folder / HOW_TO_USE, use.encode())
+        return MadeCertificate(role, name, str(folder), done, certificate.not_valid_after_utc, use)
 
-    def _read_certificate(self, place: Path) -> Any:
+    def _read_certificate(self, folder: Path) -> Any:
         from cryptography import x509
 
-        if not (place / CERT_FILE).is_file():
+        if not (folder / CERT_FILE).is_file():
             return None
-        certificate = x509.load_pem_x509_certificate((place / CERT_FILE).read_bytes())
+        certificate = x509.load_pem_x509_certificate((folder / CERT_FILE).read_bytes())
         try:
             certificate.verify_directly_issued_by(self._certificate)
         except Exception as exc:  # InvalidSignature, ValueError, TypeError: another authority's
             raise ConfigurationError(
-                f"certificates: {place / CERT_FILE} is of another authority than "
-                f"{self._folder / AUTHORITY}: expected one of it, or none"
+                f"certificates: {folder / CERT_FILE} is of another authority than "
+                f"{self._folder / AUTHORITY}: expected one of this authority, or no file"
             ) from exc
         return certificate
 
     def _sign(
-        self, role: str, name: str, hosts: list[str], lifetime: timedelta, place: Path
+        self, role: str, name: str, hosts: list[str], lifetime: timedelta, folder: Path
     ) -> Any:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
         from cryptography.x509.oid import ExtendedKeyUsageOID
 
-        key = _load_or_make_key(place)
-        ends = min(datetime.now(UTC) + lifetime, self._certificate.not_valid_after_utc)
+        key = _load_or_make_key(folder)
+        expires_at = min(datetime.now(UTC) + lifetime, self._certificate.not_valid_after_utc)
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
         if role in LISTENING_ROLES:  # other certificates cannot serve as an agent's
             uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
         identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
         subject, issuer = _subject(role, name), self._certificate.subject
         builder = (
-            _builder(subject, issuer, key.public_key(), ends)
+            _builder(subject, issuer, key.public_key(), expires_at)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_key_usage(signs=False), critical=True)
             .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
@@ -243,20 +243,20 @@ class _Authority:
             names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
             builder = builder.add_extension(names, critical=False)
         certificate = builder.sign(self._key, hashes.SHA256())
-        _write(place / CA_FILE, _pem(self._certificate))
-        _write(place / CERT_FILE, _pem(certificate))
+        _write(folder / CA_FILE, _pem(self._certificate))
+        _write(folder / CERT_FILE, _pem(certificate))
         return certificate
 
 
-def _load_or_make_key(place: Path) -> Any:
+def _load_or_make_key(folder: Path) -> Any:
     """Return the key in a folder; make a new key if there is none."""
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    path = place / KEY_FILE
+    path = folder / KEY_FILE
     if not path.is_file():
         key = ec.generate_private_key(ec.SECP256R1())
-        _write_key(place, key)
+        _write_key(folder, key)
         return key
     try:
         return serialization.load_pem_private_key(path.read_bytes(), None)
@@ -273,7 +273,7 @@ def _subject(common: str, unit: str) -> Any:
     return x509.Name(attributes)
 
 
-def _builder(subject: Any, issuer: Any, key: Any, ends: datetime) -> Any:
+def _builder(subject: Any, issuer: Any, key: Any, expires_at: datetime) -> Any:
     from cryptography import x509
 
     return (
@@ -283,7 +283,7 @@ def _builder(subject: Any, issuer: Any, key: Any, ends: datetime) -> Any:
         .public_key(key)
         .serial_number(x509.random_serial_number())
         .not_valid_before(datetime.now(UTC) - START_MARGIN)
-        .not_valid_after(ends)
+        .not_valid_after(expires_at)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
 
@@ -322,10 +322,10 @@ def _hosts_of(certificate: Any) -> list[str]:
     return [str(name.value) for name in extension.value]
 
 
-def _ends_soon(certificate: Any) -> bool:
-    ends, begins = certificate.not_valid_after_utc, certificate.not_valid_before_utc
-    lifetime = ends - begins - START_MARGIN
-    return bool(ends - datetime.now(UTC) <= min(RENEWAL_TIME, lifetime / 3))
+def _expires_soon(certificate: Any) -> bool:
+    expires_at, begins = certificate.not_valid_after_utc, certificate.not_valid_before_utc
+    lifetime = expires_at - begins - START_MARGIN
+    return bool(expires_at - datetime.now(UTC) <= min(RENEWAL_TIME, lifetime / 3))
 
 
 def _pem(certificate: Any) -> bytes:
@@ -343,7 +343,7 @@ def _write(path: Path, body: bytes) -> None:
         ) from exc
 
 
-def _write_key(place: Path, key: Any) -> None:
+def _write_key(folder: Path, key: Any) -> None:
     """Write a new key to a file that only its owner can ever read."""
     from cryptography.hazmat.primitives import serialization
 
@@ -353,41 +353,41 @@ def _write_key(place: Path, key: Any) -> None:
         serialization.NoEncryption(),
     )
     try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-        with os.fdopen(os.open(place / KEY_FILE, flags, 0o600), "wb") as file:
+        with os.fdopen(os.open(folder / KEY_FILE, flags, 0o600), "wb") as file:
             file.write(body)
             file.flush()
             os.fsync(file.fileno())
     except OSError as exc:
         raise ConfigurationError(
-            f"certificates: {place / KEY_FILE} cannot be written: {exc.strerror}"
+            f"certificates: {folder / KEY_FILE} cannot be written: {exc.strerror}"
         ) from exc
 
 
-def _usage_text(role: str, name: str, place: Path, hosts: list[str]) -> str:
+def _usage_text(role: str, name: str, folder: Path, hosts: list[str]) -> str:
     """Return a text on how to use a certificate."""
     host = next((host for host in reversed(hosts) if host not in LOCAL_HOSTS), "HOST")
     if role == ROUTER:
-        return f"zenohd --config {place / ROUTER_FILE}\n"
+        return f"zenohd --config {folder / ROUTER_FILE}\n"
     if role == AGENT:
         return (
             "# in fleet.yaml\n"
             f"agent: {name}\n"
             f"listen: tls/0.0.0.0:{DEFAULT_PORT}  # or connect: tls/HOST:{DEFAULT_PORT}\n"
-            f"certificates: {place}  # this folder, where it is on the agent's host\n"
+            f"certificates: {folder}  # this folder, where it is on the agent's host\n"
             "access: roles\n"
             f"# programs find it at {host}, port {DEFAULT_PORT}\n"
         )
     return (
-        f"fleet+tls://HOST:{DEFAULT_PORT}/CAMERA?certificates={place}\n"
-        f"# or SMARTCAM_FLEET_CERTIFICATES={place}\n"
+        f"fleet+tls://HOST:{DEFAULT_PORT}/CAMERA?certificates={folder}\n"
+        f"# or SMARTCAM_FLEET_CERTIFICATES={folder}\n"
     )
 
 
-def _router_config(place: Path) -> bytes:
+def _router_config(folder: Path) -> bytes:
     """Return a complete configuration of Zenoh's own router."""
-    link = BusLink((f"tls/0.0.0.0:{DEFAULT_PORT}",), (), str(place.absolute()))
+    link = BusLink((f"tls/0.0.0.0:{DEFAULT_PORT}",), (), str(folder.absolute()))
     config: dict[str, Any] = {"access_control": access_control()}
     for path, value in link.settings(10.0).items():
         section = config

@@ -1,4 +1,4 @@
-"""Read certificates (owner, role, end), and find out why a TLS handshake failed."""
+"""Read certificates (owner, role, expiry), and find out why a TLS handshake failed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DIAGNOSIS_TIMEOUT = 1.0
 RENEW = "smartcam fleet certificates DIR makes a new one"
 
 VERIFY_TEXTS: dict[int, str] = {
-    9: "its certificate counts from a later time than now: look at the clocks",
+    9: "its certificate is not valid yet: check the clocks of both computers",
     10: "its certificate has expired",
     18: "its certificate is of another authority than ca.pem",
     19: "its certificate is of another authority than ca.pem",
@@ -69,16 +69,16 @@ class Identity(NamedTuple):
         folder: folder of the certificate.
         role: common name in the certificate.
         name: organisational unit in the certificate; empty if there is none.
-        ends: end of the certificate, UTC.
-        authority_ends: end of its authority's certificate, UTC.
+        expires_at: time at which the certificate expires, UTC.
+        authority_expires_at: time at which its authority's certificate expires, UTC.
         digest: digest of the contents of all three files.
     """
 
     folder: Path
     role: str
     name: str
-    ends: datetime
-    authority_ends: datetime
+    expires_at: datetime
+    authority_expires_at: datetime
     digest: bytes
 
     def __str__(self) -> str:
@@ -88,16 +88,16 @@ class Identity(NamedTuple):
     def expired_text(self) -> str:
         """Text which says that a certificate has expired; empty if none has."""
         now = datetime.now(UTC)
-        for certificate, ends in self._certificate_ends:
-            if now >= ends:
-                return f"{certificate} has expired on {_day(ends)}; {RENEW}"
+        for certificate, expires_at in self._expiries:
+            if now >= expires_at:
+                return f"{certificate} has expired on {_day(expires_at)}; {RENEW}"
         return ""
 
     @property
     def warning(self) -> str:
         """Text which says that a certificate ends soon, or has expired; empty otherwise."""
         return self.expired_text or expiry_warning(
-            *min(self._certificate_ends, key=lambda ending: ending[1])
+            *min(self._expiries, key=lambda ending: ending[1])
         )
 
     @property
@@ -117,20 +117,20 @@ class Identity(NamedTuple):
 
     @property
     def _time_left(self) -> timedelta:
-        return min(self.ends, self.authority_ends) - datetime.now(UTC)
+        return min(self.expires_at, self.authority_expires_at) - datetime.now(UTC)
 
     @property
-    def _certificate_ends(self) -> tuple[tuple[str, datetime], ...]:
+    def _expiries(self) -> tuple[tuple[str, datetime], ...]:
         own_text = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
         authority_text = f"that of its authority ({self.folder / CERTIFICATE_FILES[0]})"
-        return (own_text, self.ends), (authority_text, self.authority_ends)
+        return (own_text, self.expires_at), (authority_text, self.authority_expires_at)
 
 
-def expiry_warning(certificate: str, ends: datetime | None) -> str:
+def expiry_warning(certificate: str, expires_at: datetime | None) -> str:
     """Return a text which says that a certificate ends soon; empty if it does not."""
-    if ends is None or (remaining := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
+    if expires_at is None or (remaining := expires_at - datetime.now(UTC)) > WARN_BEFORE[0]:
         return ""
-    return f"{certificate} ends on {_day(ends)}, in {_span(remaining)}; {RENEW}"
+    return f"{certificate} ends on {_day(expires_at)}, in {_span(remaining)}; {RENEW}"
 
 
 def may_command(role: str) -> bool:
@@ -213,7 +213,7 @@ def tls_context(folder: Path) -> ssl.SSLContext:
     """
     ca, cert, key = (folder / name for name in CERTIFICATE_FILES)
     context = ssl.create_default_context(cafile=str(ca))
-    context.verify_flags &= ~ssl.VERIFY_X509_STRICT  # the engine is not stricter
+    context.verify_flags &= ~ssl.VERIFY_X509_STRICT  # nor is Zenoh's TLS strict
     context.load_cert_chain(cert, key, password="")  # without a password, OpenSSL would ask for one
     return context
 
@@ -223,42 +223,42 @@ class Handshake(NamedTuple):
 
     Attributes:
         trouble: reason why the handshake failed; empty if it succeeded.
-        ends: end of the other side's certificate, UTC; None if it sent none.
+        expires_at: time at which the other side's certificate expires, UTC; None if it sent none.
     """
 
     trouble: str
-    ends: datetime | None
+    expires_at: datetime | None
 
 
 async def shake_hands(
-    host: str, port: int, folder: Path, within: float = DIAGNOSIS_TIMEOUT
+    host: str, port: int, folder: Path, timeout: float = DIAGNOSIS_TIMEOUT
 ) -> Handshake:
-    """Try a handshake for at most ``within`` seconds, and return its outcome."""
+    """Try a handshake for at most ``timeout`` seconds, and return its outcome."""
     loop = asyncio.get_running_loop()
     writer: asyncio.StreamWriter | None = None
-    ends: datetime | None = None
+    expires_at: datetime | None = None
     try:
-        async with asyncio.timeout(within):
+        async with asyncio.timeout(timeout):
             context = await loop.run_in_executor(None, tls_context, folder)
             reader, writer = await asyncio.open_connection(host, port, ssl=context)
             peer: Any = writer.get_extra_info("peercert") or {}
             if "notAfter" in peer:
-                ends = datetime.fromtimestamp(ssl.cert_time_to_seconds(peer["notAfter"]), UTC)
+                expires_at = datetime.fromtimestamp(ssl.cert_time_to_seconds(peer["notAfter"]), UTC)
             await reader.read(1)  # an endpoint that refuses the certificate reports it now
     except TimeoutError:  # an endpoint that waits for data has accepted it
-        return Handshake(SILENT if writer is None else "", ends)
+        return Handshake(SILENT if writer is None else "", expires_at)
     except ssl.SSLCertVerificationError as exc:
         why = VERIFY_TEXTS.get(
             exc.verify_code, f"its certificate is not good: {exc.verify_message}"
         )
-        return Handshake(why.format(host=host), ends)
+        return Handshake(why.format(host=host), expires_at)
     except ssl.SSLError as exc:
         reason = exc.reason or str(exc)
         texts = (text for end, text in REASON_TEXTS.items() if reason.endswith(end))
-        return Handshake(next(texts, f"TLS: {reason}"), ends)
+        return Handshake(next(texts, f"TLS: {reason}"), expires_at)
     except OSError as exc:
-        return Handshake(os.strerror(exc.errno) if exc.errno else str(exc), ends)
+        return Handshake(os.strerror(exc.errno) if exc.errno else str(exc), expires_at)
     finally:
         if writer is not None:
             writer.transport.abort()
-    return Handshake("", ends)
+    return Handshake("", expires_at)

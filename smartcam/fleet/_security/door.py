@@ -1,7 +1,7 @@
-"""Filter connections to an agent's port, since the engine accepts every connection.
+"""Filter connections to an agent's port, since Zenoh accepts every connection.
 
-Zenoh (the *engine*) does not bound connections: a silent connection stays for 10 s, and after each
-failed handshake the engine accepts no connection for 0.1 s. So a packet filter on the listening
+Zenoh does not bound connections: a silent connection stays for 10 s, and after each
+failed handshake Zenoh accepts no connection for 0.1 s. So a packet filter on the listening
 socket makes the system drop requests for a new connection:
 
 - from an address with many half-open connections, that is, connections whose handshake is not
@@ -56,7 +56,7 @@ MAX_CALM_GROWTH = 8
 """Largest growth of used descriptors since the last check that counts as calm."""
 
 CHECKS_PER_SEARCH = 50
-"""Number of checks after which the engine's listening sockets are checked, too. Renewed
+"""Number of checks after which Zenoh's listening sockets are checked, too. Renewed
 certificates change them."""
 
 RESERVED_DESCRIPTORS: Final = 256
@@ -73,7 +73,7 @@ MAX_BLOCKED_ADDRESSES: Final = 256
 """Largest number of blocked addresses; those with the most half-open connections are blocked."""
 
 BACKLOG: Final = 64
-"""Number of connections that the system keeps for the engine. The filter cannot drop these."""
+"""Number of connections that the system keeps for Zenoh. The filter cannot drop these."""
 
 MAX_DESCRIPTORS: Final = 65_536
 """Limit of file descriptors that an agent requests from the system, which may allow fewer."""
@@ -147,11 +147,11 @@ def raise_descriptor_limit() -> None:
 
 
 class ConnectionFilter:
-    """Filters connections to the ports of this process' engine; only on Linux.
+    """Filters connections to the ports of this process' Zenoh; only on Linux.
 
     Args:
-        ports: ports at which the engine listens.
-        links: function that returns the addresses of accepted links, such as ``("10.1.0.5",
+        ports: ports at which Zenoh listens.
+        links: function that returns the addresses with a complete handshake, such as ``("10.1.0.5",
             40123)``; None if they are not known.
 
     Attributes:
@@ -191,25 +191,25 @@ class ConnectionFilter:
             self._set_filters()
 
     def _check_descriptors(self) -> None:
-        most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        lowest, previous = _lowest_free(most), self._last_lowest
+        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        lowest, previous = _lowest_free(limit), self._last_lowest
         self._last_lowest = lowest
         is_calm = not self.refuses_all and lowest <= previous + MAX_CALM_GROWTH
         delay = CALM_CHECK_INTERVAL if is_calm else DESCRIPTOR_CHECK_INTERVAL
         self._timer = asyncio.get_running_loop().call_later(delay, self._check_descriptors)
         self._check_count += 1
         if self._check_count % CHECKS_PER_SEARCH == 0 and not self._are_listeners_unchanged():
-            self._renew_listeners()  # the engine has opened new sockets
-        if most == resource.RLIM_INFINITY:
+            self._renew_listeners()  # Zenoh has opened new sockets
+        if limit == resource.RLIM_INFINITY:
             return
-        free_count = most - lowest
-        reserve = min(RESERVED_DESCRIPTORS, most // 4)
+        free_count = limit - lowest
+        reserve = min(RESERVED_DESCRIPTORS, limit // 4)
         if not self.refuses_all and free_count <= reserve:
             self.refuses_all = True
             self._set_filters()
             logger.warning(
-                "! the port of the fleet accepts no connection: %d file descriptors are left, %d "
-                "of them for cameras and health",
+                "! the port of the fleet accepts no connection: only %d file descriptors are left, "
+                "%d are reserved for cameras and health",
                 free_count,
                 reserve,
             )
@@ -221,7 +221,7 @@ class ConnectionFilter:
     # ------------------------------------------------------------------ connections
 
     def _watch_connections(self) -> None:
-        """Call :meth:`_on_connection` at each new connection; the engine's threads accept it."""
+        """Call :meth:`_on_connection` at each new connection; Zenoh's threads accept it."""
         self._stop_watching()
         self._connection_epoll = select.epoll()
         for number in self._listeners:
@@ -279,14 +279,14 @@ class ConnectionFilter:
         self._set_filters()
 
     def _peer_addresses(self) -> set[HostPort]:
-        """Return the other ends of all connections of the ports."""
-        ends: set[HostPort] = set()
+        """Return the addresses of the other sides of all connections of the ports."""
+        addresses: set[HostPort] = set()
         for sock in _sockets():
             with contextlib.suppress(OSError, IndexError):  # not a connection, or ended
                 if sock.getsockname()[1] in self._ports and not _is_listening(sock):
                     host, port, *_ = sock.getpeername()
-                    ends.add((plain_host(host), port))
-        return ends
+                    addresses.add((plain_host(host), port))
+        return addresses
 
     # ------------------------------------------------------------------ filters
 
@@ -310,20 +310,20 @@ class ConnectionFilter:
             except OSError:
                 return False
             try:
-                if not self._is_engine_listener(listener):
+                if not self._is_zenoh_listener(listener):
                     return False
             finally:
                 listener.detach()
         return bool(self._listeners)
 
     def _set_filter(self, number: int) -> bool:
-        """Set the filter of one listening socket; return False if it is not the engine's."""
+        """Set the filter of one listening socket; return False if it is not Zenoh's."""
         try:
             listener = socket.socket(fileno=number)
         except OSError:
             return False
         try:
-            if not self._is_engine_listener(listener):
+            if not self._is_zenoh_listener(listener):
                 return False
             steps = packet_filter(refuse_all=self.refuses_all, blocked=sorted(self.blocked))
             if steps == [_PASS]:
@@ -339,16 +339,16 @@ class ConnectionFilter:
             listener.detach()
 
     def _find_listeners(self) -> list[int]:
-        """Return the descriptors of the engine's listening sockets."""
+        """Return the descriptors of Zenoh's listening sockets."""
         numbers: list[int] = []
         for sock in _sockets():
             with contextlib.suppress(OSError):
-                if self._is_engine_listener(sock):
+                if self._is_zenoh_listener(sock):
                     sock.listen(BACKLOG)
                     numbers.append(sock.fileno())
         return numbers
 
-    def _is_engine_listener(self, sock: socket.socket) -> bool:
+    def _is_zenoh_listener(self, sock: socket.socket) -> bool:
         return _is_listening(sock) and sock.getsockname()[1] in self._ports
 
 
@@ -390,11 +390,11 @@ def _sockets() -> Iterator[socket.socket]:
             sock.detach()
 
 
-def _lowest_free(most: int) -> int:
-    """Return the lowest free descriptor; ``most`` if none is free."""
+def _lowest_free(limit: int) -> int:
+    """Return the lowest free descriptor; ``limit`` if none is free."""
     try:
         number = os.dup(0)
     except OSError as exc:
-        return most if exc.errno == errno.EMFILE else 0
+        return limit if exc.errno == errno.EMFILE else 0
     os.close(number)
     return number

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from contextlib import AbstractAsyncContextManager
 
-    from smartcam.fleet._bus.zenoh import ZenohEnd
+    from smartcam.fleet._bus.zenoh import ZenohConnection
     from smartcam.fleet._security.certificates import Identity
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -32,28 +32,29 @@ RETRY_DELAY = 1.0
 
 
 class CertificateWatch:
-    """Opens an agent's end of the bus again when its certificates have changed.
+    """Opens an agent's connection to the bus again when its certificates have changed.
 
-    This is needed only for an end that listens: its engine reads the files only at the start. For
-    an end that only connects, the engine reads the files at each connection.
+    This is needed only for a connection that listens: Zenoh reads the files only at the start.
+    If it only connects to others, Zenoh reads the files at each connection.
 
     Args:
-        end: the agent's end of the bus, open.
-        listens: whether the end listens.
+        connection: the agent's connection to the bus, open.
+        listens: whether the connection listens.
         busy: function that returns whether a command runs.
-        without_nodes: context manager that closes the nodes of ROS while the end is opened again.
+        without_nodes: context manager that closes the nodes of ROS while the connection is opened
+            again.
     """
 
     def __init__(
         self,
-        end: ZenohEnd,
+        connection: ZenohConnection,
         *,
         listens: bool,
         busy: Callable[[], bool],
         without_nodes: Callable[[], AbstractAsyncContextManager[None]] = contextlib.nullcontext,
     ) -> None:
-        self._end, self._listens, self._busy, self._without_nodes = (
-            end,
+        self._connection, self._listens, self._busy, self._without_nodes = (
+            connection,
             listens,
             busy,
             without_nodes,
@@ -62,7 +63,7 @@ class CertificateWatch:
 
     async def run(self) -> None:
         """Check the files periodically, forever."""
-        identity = self._end.identity
+        identity = self._connection.identity
         while True:
             await asyncio.sleep(CHECK_INTERVAL)
             try:
@@ -76,17 +77,18 @@ class CertificateWatch:
         if identity is not None and known is not None and identity.digest != known.digest:
             if self._listens:
                 await self._reopen()
-            text = "certificates ! those of %s were renewed: until %s"
-            logger.info(text, identity, identity.ends)
+            text = "certificates of %s were renewed; they expire at %s"
+            logger.info(text, identity, identity.expires_at)
         return identity or known
 
     async def _check_files(self) -> Identity | None:
         """Return the identity in the files; None if they are not valid, which is logged once."""
         try:
-            identity = await self._end.check_certificates()
+            identity = await self._connection.check_certificates()
         except SmartCamError as exc:
             if str(exc) != self._logged_error:
-                logger.error("certificates ! not taken; all goes on as it was: %s", exc)  # noqa: TRY400 - the text says it
+                text = "certificates ! the new files are not valid, the old ones stay in use: %s"
+                logger.error(text, exc)  # noqa: TRY400 - the text says it
             self._logged_error = str(exc)
             return None
         self._logged_error = ""
@@ -100,7 +102,7 @@ class CertificateWatch:
         async with self._without_nodes():
             while True:
                 try:
-                    await self._end.reopen(REOPEN_TIMEOUT)
+                    await self._connection.reopen(REOPEN_TIMEOUT)
                 except ConnectFailedError as exc:
                     logger.error("certificates ! %s; it is tried again", exc)  # noqa: TRY400
                     await asyncio.sleep(RETRY_DELAY)

@@ -90,21 +90,21 @@ class FleetPictures:
         """Record as long as the agent has the camera and the camera has pictures."""
         delays, logged = RETRY.delays(), ""
         while True:
-            host = self._server.hosts.get(recording.camera)
-            if host is None or host.frames.closed or host.frames.make is None:
+            camera = self._server.shared_cameras.get(recording.camera)
+            if camera is None or camera.frames.closed or camera.frames.make is None:
                 return
-            if host.frames.reports_pictures:
+            if camera.frames.reports_pictures:
                 return
             reason = "they ended"
             try:
-                if await self._receive(recording, await host.frames.source()):
+                if await self._receive(recording, await camera.frames.source()):
                     delays, logged = RETRY.delays(), ""
             except (SmartCamError, OSError) as exc:
                 reason = str(exc)
             except Exception as exc:  # a driver may be a plug-in's
                 logger.exception("%s ! its pictures are not recorded", recording.camera)
                 reason = repr(exc)
-            if reason != logged and not host.frames.closed:
+            if reason != logged and not camera.frames.closed:
                 logged = reason
                 self._report(recording, reason)
             await asyncio.sleep(next(delays))

@@ -109,7 +109,7 @@ class FleetRecorder(Server):
         """
         if self._observer is not None:
             return
-        if self._server.hosts:
+        if self._server.shared_cameras:
             raise ConfigurationError(
                 f"recordings {self.path}: start the recorder before the server"
             )
@@ -128,7 +128,7 @@ class FleetRecorder(Server):
             self._writer = None
             await _run_to_end(writer.stop)
             raise
-        observer_class = _SessionAndFrameObserver if section.frames else _SessionObserver
+        observer_class = _SessionAndFrameObserver if section.messages else _SessionObserver
         self._pictures = self._new_pictures(writer)
         self._observer = observer_class(self._server, section, writer, self._pictures)
         self._server.observers.append(self._observer)
@@ -236,18 +236,18 @@ class _SessionObserver(Observer):
             self._writer.put(recording, recorded, len(text))
 
     def _endian(self, camera: str) -> int | None:
-        host = self._server.hosts.get(camera)
-        return None if host is None else host.camera.endian
+        shared = self._server.shared_cameras.get(camera)
+        return None if shared is None else shared.client.endian
 
     def _recording_of(self, camera: str) -> CameraRecording | None:
-        if camera not in self._recordings and camera in self._server.hosts:
+        if camera not in self._recordings and camera in self._server.shared_cameras:
             self._recordings[camera] = self._new_recording(camera)
         return self._recordings.get(camera)
 
     def _new_recording(self, camera: str) -> CameraRecording | None:
         if not self._section.chooses(camera):
             return None
-        settings = self._server.hosts[camera].settings
+        settings = self._server.shared_cameras[camera].settings
         spec, y_down, lenient = settings.interpret_as, settings.y_down, settings.lenient
         maker = _ItemMaker(camera, spec, y_down, lenient)
         recording = self._writer.new_recording(camera, maker.items)
@@ -257,7 +257,7 @@ class _SessionObserver(Observer):
             "application": settings.application,
             "y_down": y_down or None,
             "lenient": lenient or None,
-            "frames": None if self._section.frames else "no",
+            "frames": None if self._section.messages else "no",
         }
         metadata = {name: str(value) for name, value in given.items() if value is not None}
         self._writer.describe(recording, metadata)

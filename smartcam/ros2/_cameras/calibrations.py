@@ -91,7 +91,7 @@ class CalibrationServices:
     def __init__(self, camera: Camera[Any], calibrations: ThesisCalibration | None) -> None:
         self._camera = camera
         self.name: str = camera.name
-        self.calibrations: ThesisCalibration | None = calibrations
+        self.thesis_calibration: ThesisCalibration | None = calibrations
 
     def camera(self, timeout: float) -> RosCalibrationCamera:
         """Return the camera, for one call."""

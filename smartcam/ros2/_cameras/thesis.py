@@ -85,15 +85,15 @@ class RosThesisCamera:
         return self._camera.active_application
 
     @property
-    def reading(self) -> Interpretation:
+    def interpretation(self) -> Interpretation:
         """Interpretation of the results."""
         return interpretation_of(self._camera)
 
-    def check_reading(self, spec: str) -> None:
+    def check_interpretation(self, spec: str) -> None:
         """Raise ConfigurationError if results cannot be interpreted by ``spec``."""
         self._camera._interpretation(spec)  # noqa: SLF001 - smartcam's own
 
-    def read_as(self, spec: str | None) -> None:
+    def interpret_as(self, spec: str | None) -> None:
         """Interpret results by ``spec`` from now on; None: by the settings."""
         self._camera._set_interpreter(spec)  # noqa: SLF001 - smartcam's own
 
@@ -131,7 +131,7 @@ class RosThesisCamera:
         if self._state == "inactive":
             await self._lifecycle.cleanup()
 
-    async def have_session(self) -> None:
+    async def require_session(self) -> None:
         """Configure the node if it is not."""
         if self._state not in {"inactive", "active"}:
             await self._lifecycle.configure()
@@ -151,7 +151,7 @@ class RosThesisCamera:
 
     async def close(self) -> None:
         """Stop publishing the status, and interpret results by the settings. Idempotent."""
-        self.read_as(None)
+        self.interpret_as(None)
         await self._status.close()
 
     @property

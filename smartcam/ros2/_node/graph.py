@@ -47,7 +47,7 @@ class RosGraph:
 
     def open(self, session: ZenohSession) -> None:
         """Subscribe to the tokens."""
-        put = session.engine.SampleKind.PUT
+        put = session.zenoh.SampleKind.PUT
 
         def on_sample(sample: Any) -> None:
             session.call_in_loop(

@@ -225,7 +225,7 @@ class RosClient(RosEndpoint):
         self._querier: Any = None
 
         def declare(session: Any) -> Any:
-            zenoh = context.zenoh.engine
+            zenoh = context.zenoh.zenoh
             self._querier = session.declare_querier(
                 entity.key,
                 target=zenoh.QueryTarget.ALL_COMPLETE,

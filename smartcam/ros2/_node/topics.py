@@ -142,7 +142,7 @@ class RosPublisher(RosEndpoint):
         self._declare_token()
 
     def _declare_publisher(self, session: Any) -> Any:
-        zenoh, qos = self._context.zenoh.engine, self.entity.qos
+        zenoh, qos = self._context.zenoh.zenoh, self.entity.qos
         drop = zenoh.CongestionControl.DROP
         block = zenoh.CongestionControl.BLOCK
         is_blocking = qos.latched or (qos.depth is None and qos.reliable)
@@ -276,7 +276,7 @@ class RosPublisher(RosEndpoint):
         attachment = self._attachment()
         if len(data) > MAX_DIRECT_BYTES:
             if self._newest_publisher is None:
-                zenoh = self._context.zenoh.engine
+                zenoh = self._context.zenoh.zenoh
                 self._newest_publisher = self._context.zenoh.session.declare_publisher(
                     self.entity.key,
                     congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
@@ -307,7 +307,7 @@ class RosPublisher(RosEndpoint):
 
     def _blocking_publisher(self) -> Any:
         """Return the publisher that waits for room; for long messages it has a lower priority."""
-        zenoh, thread_name = self._context.zenoh.engine, self._thread_name
+        zenoh, thread_name = self._context.zenoh.zenoh, self._thread_name
         if self.entity.qos.latched:
             return self._publisher  # a latched topic's publisher has to keep the messages
         if thread_name not in self._blocking_publishers:

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from smartcam.exceptions import ReservationLostError
-from tests.fleet.inside import Caller, CallNumbers, Gate, GateRequest, Lease, MetAgent
+from tests.fleet.inside import Caller, CallNumbers, CameraAgent, Gate, GateRequest, Lease
 
 Move = tuple[Any, ...]
 Wrong = Literal["between", "behind", "twice"]
@@ -117,7 +117,7 @@ _CALLER = Caller("cam", "cam", None, None, lambda _: None, lambda _: None)  # ty
 def caller(program: Program) -> Caller:
     """Return the library's side of a program."""
     _CALLER.leases = program.leases
-    _CALLER.agent = None if program.met is None else MetAgent("agent", program.met, {})
+    _CALLER.agent = None if program.met is None else CameraAgent("agent", program.met, {})
     return _CALLER
 
 

@@ -1,4 +1,4 @@
-"""Serve programs without smartcam: list an agent's cameras, and carry out services.
+"""Serve programs that do not use smartcam: list an agent's cameras, and carry out services.
 
 An agent answers every question, except questions about another agent's cameras. Each service runs
 in a task of the agent. The task is cancelled after the service's timeout, or when the agent ends.
@@ -24,14 +24,14 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     SmartCamError,
 )
+from smartcam.fleet._agent.client import Owner
 from smartcam.fleet._agent.pulse import Pulse
-from smartcam.fleet._agent.shared import Owner
 from smartcam.fleet._bus.address import check_name
 from smartcam.fleet._bus.bus import always
 from smartcam.fleet._bus.errors import late_call_error
 from smartcam.fleet._bus.keys import patterns_overlap
 from smartcam.fleet._json.calibrations import CALIBRATIONS
-from smartcam.fleet._json.services import SERVICES, UNKNOWN, PlainRequest, Service, Work
+from smartcam.fleet._json.services import SERVICES, UNKNOWN, JsonRequest, Service, Work
 from smartcam.fleet._json.thesis import SETUP, STOP, new_camera
 from smartcam.fleet._json.thesis import THESIS as CAMERA_SERVICES
 from smartcam.fleet._json.topics import Topics, as_json
@@ -41,7 +41,7 @@ from smartcam.settings import validated
 if TYPE_CHECKING:
     from smartcam.calibration._inside import CalibrationsByCamera
     from smartcam.fleet._agent.agent import Agent
-    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._agent.shared_camera import SharedCamera
     from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
     from smartcam.fleet._bus.keys import Keys
 
@@ -78,8 +78,8 @@ PRESENCE_TIMEOUT = 2.0
 """Seconds for the answer to a question about presences on the bus."""
 
 
-class _ServiceQuestion(NamedTuple):
-    """A decoded question for a service.
+class _ServiceQuery(NamedTuple):
+    """A decoded question for a service: which camera, which service, which fields.
 
     Attributes:
         camera: name of the camera of the service.
@@ -100,7 +100,7 @@ class _ServiceQuestion(NamedTuple):
     @property
     def is_for_operators(self) -> bool:
         """True if only operators may use the service; False if viewers may, too."""
-        return self.service.command or self.name not in SERVICES
+        return self.service.is_command or self.name not in SERVICES
 
     def request(self) -> Any:
         """Return the request.
@@ -117,14 +117,14 @@ class _ServiceQuestion(NamedTuple):
         """Return the answer for an error."""
         return {**error_fields(error), **self.service.empty_fields}
 
-    def call_key(self, request: PlainRequest) -> object:
+    def call_key(self, request: JsonRequest) -> object:
         """Return a key of the call, which is equal for a repetition of the same call."""
         without_limits = request.model_copy(update={"timeout": None, "epoch": None})
         return self.camera, self.service, without_limits
 
 
 @dataclass(eq=False)
-class _PlainCall:
+class _JsonCall:
     """A running or remembered call.
 
     Attributes:
@@ -142,14 +142,14 @@ class _KnownAnswers:
     """Running and remembered calls that have an id: either the commands, or the questions."""
 
     def __init__(self) -> None:
-        self._calls: dict[tuple[str, str], _PlainCall] = {}  # oldest first
+        self._calls: dict[tuple[str, str], _JsonCall] = {}  # oldest first
         self._bytes = 0
 
-    def find_call(self, request: PlainRequest) -> _PlainCall | None:
+    def find_call(self, request: JsonRequest) -> _JsonCall | None:
         """Return the call with a request's id."""
         return self._calls.get((request.program, str(request.id)))
 
-    def add_call(self, request: PlainRequest, call: _PlainCall) -> None:
+    def add_call(self, request: JsonRequest, call: _JsonCall) -> None:
         """Remember a running call."""
         self._calls[request.program, str(request.id)] = call
 
@@ -168,13 +168,13 @@ class _KnownAnswers:
                 del self._calls[key]
 
 
-class PlainServices:
-    """The services of an agent for programs without smartcam.
+class JsonServices:
+    """The services of an agent for programs that do not use smartcam, in JSON.
 
     Args:
         agent: the agent.
         keys: keys of the fleet.
-        bus: the agent's end of the bus.
+        bus: the agent's connection to the bus.
         calibrations: calibrations of the agent's cameras; None if there is no folder for them.
 
     Attributes:
@@ -197,7 +197,7 @@ class PlainServices:
             is_for_operators: _KnownAnswers() for is_for_operators in (True, False)
         }
         self._added_cameras: dict[
-            str, PlainRequest
+            str, JsonRequest
         ] = {}  # requests of the Setups that added cameras
 
     def open(self) -> None:
@@ -206,8 +206,8 @@ class PlainServices:
         self.topics.open()
         self._pulse.open()
         self._handles = [
-            answer(keys.listing("**"), self._on_listing, patient=always),
-            answer(keys.service("*", "**"), self._on_service, patient=_is_read_only),
+            answer(keys.listing("**"), self._on_listing, low_priority=always),
+            answer(keys.service("*", "**"), self._on_service, low_priority=_is_read_only),
             answer(keys.thesis("*"), self._on_thesis),
         ]
 
@@ -227,10 +227,10 @@ class PlainServices:
     # ------------------------------------------------------------------ questions
 
     def _on_listing(self, question: BusQuestion) -> None:
-        for name, host in self._agent.hosts.items():
+        for name, camera in self._agent.shared_cameras.items():
             key = self._keys.listing(name)
             if patterns_overlap(question.key, key):
-                question.reply(key, as_json(host.topics.listing()))
+                question.reply(key, as_json(camera.topics.listing()))
         question.close()
 
     def _on_service(self, question: BusQuestion) -> None:
@@ -248,7 +248,7 @@ class PlainServices:
             )
         max_wait = self._pulse.max_wait()
         self._accept_question(
-            question, _ServiceQuestion(camera, name, service, fields, error, max_wait)
+            question, _ServiceQuery(camera, name, service, fields, error, max_wait)
         )
 
     def _on_thesis(self, question: BusQuestion) -> None:
@@ -269,11 +269,11 @@ class PlainServices:
                 f"{name}: expected camera_name, the name of a camera, got {camera!r:.80}"
             )
         if error is not None and (not isinstance(camera, str) or not camera):
-            _reply(question, _ServiceQuestion("", name, service, fields, error).error_answer(error))
+            _reply(question, _ServiceQuery("", name, service, fields, error).error_answer(error))
             return
         max_wait = self._pulse.max_wait()
         self._accept_question(
-            question, _ServiceQuestion(str(camera), name, service, fields, error, max_wait)
+            question, _ServiceQuery(str(camera), name, service, fields, error, max_wait)
         )
 
     def _refuse_pattern(self, question: BusQuestion) -> None:
@@ -284,35 +284,35 @@ class PlainServices:
         )
         _reply(question, error_fields(error))
 
-    def _accept_question(self, question: BusQuestion, order: _ServiceQuestion) -> None:
-        if order.camera in self._agent.hosts:
-            self._start_call(question, order)
+    def _accept_question(self, question: BusQuestion, query: _ServiceQuery) -> None:
+        if query.camera in self._agent.shared_cameras:
+            self._start_call(question, query)
             return
         try:
-            check_name(order.camera)
+            check_name(query.camera)
         except ConfigurationError as error:
-            _reply(question, order.error_answer(error))  # every agent gives the same answer
+            _reply(question, query.error_answer(error))  # every agent gives the same answer
             return
-        if self._refuse_if_full(question, order):
+        if self._refuse_if_full(question, query):
             return
-        self._start_task(self._answer_unknown_camera(question, order), order)
+        self._start_task(self._answer_unknown_camera(question, query), query)
 
-    def _refuse_if_full(self, question: BusQuestion, order: _ServiceQuestion) -> bool:
+    def _refuse_if_full(self, question: BusQuestion, query: _ServiceQuery) -> bool:
         """Refuse a question if too many are running for its camera; return whether it was refused.
 
         All unknown cameras are counted together.
         """
-        is_full = self._running_counts[self._count_key(order)] >= MAX_CONCURRENT_CALLS
+        is_full = self._running_counts[self._count_key(query)] >= MAX_CONCURRENT_CALLS
         if is_full:
-            kind = "commands" if order.is_for_operators else "questions"
+            kind = "commands" if query.is_for_operators else "questions"
             running = f"{MAX_CONCURRENT_CALLS} {kind} are under way"
-            text = f"{order.camera}: {running}; {order.name} was not done"
-            _reply(question, order.error_answer(LocalProtocolError(text)))
+            text = f"{query.camera}: {running}; {query.name} was not done"
+            _reply(question, query.error_answer(LocalProtocolError(text)))
         return is_full
 
-    def _start_task(self, work: Any, order: _ServiceQuestion) -> None:
+    def _start_task(self, work: Any, query: _ServiceQuery) -> None:
         """Run work for a camera in a counted task."""
-        key, counts = self._count_key(order), self._running_counts
+        key, counts = self._count_key(query), self._running_counts
         counts[key] += 1
 
         def on_done(_: object) -> None:
@@ -320,39 +320,40 @@ class PlainServices:
             if not counts[key]:
                 del counts[key]
 
-        task = self._agent.start_task(work, f"smartcam.fleet.{order.camera}.{order.name}")
+        task = self._agent.start_task(work, f"smartcam.fleet.{query.camera}.{query.name}")
         task.add_done_callback(on_done)
 
-    def _count_key(self, order: _ServiceQuestion) -> tuple[str, bool]:
-        camera = order.camera if order.camera in self._agent.hosts else ""
-        return camera, order.is_for_operators
+    def _count_key(self, query: _ServiceQuery) -> tuple[str, bool]:
+        camera = query.camera if query.camera in self._agent.shared_cameras else ""
+        return camera, query.is_for_operators
 
     # ------------------------------------------------------------------ other cameras
 
-    async def _answer_unknown_camera(self, question: BusQuestion, order: _ServiceQuestion) -> None:
+    async def _answer_unknown_camera(self, question: BusQuestion, query: _ServiceQuery) -> None:
         """Answer a question for a camera that no agent has, if this agent's name sorts first."""
         try:
-            answers = await self._answers_for_all(order.camera)
+            answers = await self._must_answer(query.camera)
         except BaseException:
             question.close()
             raise
         if not answers:
             question.close()
-        elif order.camera in self._agent.hosts or order.service is SETUP:
-            self._start_call(question, order)
+        elif query.camera in self._agent.shared_cameras or query.service is SETUP:
+            self._start_call(question, query)
         else:
             error = ConfigurationError(
-                f"the fleet {self._keys.fleet} has no camera {order.camera!r}"
-                f"{did_you_mean(order.camera, self._agent.hosts)}; {order.name} was not done"
+                f"the fleet {self._keys.fleet} has no camera {query.camera!r}"
+                f"{did_you_mean(query.camera, self._agent.shared_cameras)}; {query.name} was not "
+                "done"
             )
-            _reply(question, order.error_answer(error))
+            _reply(question, query.error_answer(error))
 
-    async def _answers_for_all(self, camera: str) -> bool:
+    async def _must_answer(self, camera: str) -> bool:
         """Return True if no other agent has the camera, and this agent's name sorts first."""
         keys, bus = self._keys, self._bus
         having, present = await asyncio.gather(
-            bus.present(keys.camera("*", camera), PRESENCE_TIMEOUT),
-            bus.present(keys.agent("*"), PRESENCE_TIMEOUT),
+            bus.present_keys(keys.camera("*", camera), PRESENCE_TIMEOUT),
+            bus.present_keys(keys.agent("*"), PRESENCE_TIMEOUT),
         )
         owners = {keys.tail(key, "presence/camera")[0] for key in having} - {self._agent.name}
         agents = {keys.tail(key, "presence/agent")[0] for key in present} | {self._agent.name}
@@ -360,63 +361,61 @@ class PlainServices:
 
     # ------------------------------------------------------------------ calls
 
-    def _start_call(self, question: BusQuestion, order: _ServiceQuestion) -> None:
+    def _start_call(self, question: BusQuestion, query: _ServiceQuery) -> None:
         """Start a call, unless it is a repetition."""
         try:
-            request = order.request()
+            request = query.request()
             if request.epoch not in {None, str(self._agent.epoch)}:
                 raise ConnectionLostError(
-                    f"{order.camera}: the agent {self._agent.name} was restarted since; "
-                    f"{order.name} was not done by this one"
+                    f"{query.camera}: the agent {self._agent.name} was restarted since; "
+                    f"{query.name} was not done by this one"
                 )
-            call = None if request.id is None else self._known_call(order, request)
+            call = None if request.id is None else self._known_call(query, request)
             if (
                 call is not None
                 and call.answer is None
                 and len(call.waiting) >= MAX_WAITING_REPEATS
             ):
-                raise LocalProtocolError(f"{order.camera}: {order.name} is under way already")
+                raise LocalProtocolError(f"{query.camera}: {query.name} is under way already")
         except SmartCamError as error:
-            _reply(question, order.error_answer(error))
+            _reply(question, query.error_answer(error))
             return
         if call is None:
-            if not self._refuse_if_full(question, order):
-                call = _PlainCall(order.call_key(request), [question])
+            if not self._refuse_if_full(question, query):
+                call = _JsonCall(query.call_key(request), [question])
                 if request.id is not None:
-                    self._known_answers[order.is_for_operators].add_call(request, call)
-                self._start_task(self._carry_out(order, request, call), order)
+                    self._known_answers[query.is_for_operators].add_call(request, call)
+                self._start_task(self._carry_out(query, request, call), query)
         elif call.answer is None:
             call.waiting.append(question)
         else:
             question.reply(question.key, call.answer)
             question.close()
 
-    def _known_call(self, order: _ServiceQuestion, request: PlainRequest) -> _PlainCall | None:
-        known = self._known_answers[order.is_for_operators].find_call(request)
-        if known is not None and known.key != order.call_key(request):
+    def _known_call(self, query: _ServiceQuery, request: JsonRequest) -> _JsonCall | None:
+        known = self._known_answers[query.is_for_operators].find_call(request)
+        if known is not None and known.key != query.call_key(request):
             raise LocalProtocolError(
-                f"{order.camera}: id {request.id!r} was another call's; {order.name} was not done"
+                f"{query.camera}: id {request.id!r} was another call's; {query.name} was not done"
             )
         return known
 
-    async def _carry_out(
-        self, order: _ServiceQuestion, request: PlainRequest, call: _PlainCall
-    ) -> None:
+    async def _carry_out(self, query: _ServiceQuery, request: JsonRequest, call: _JsonCall) -> None:
         """Carry out a call, and answer all its questions."""
-        name = order.name
+        name = query.name
         answer: dict[str, Any] = {}
         try:
-            answer = {"error": "", **await self._carry_out_in_time(order, request)}
+            answer = {"error": "", **await self._carry_out_in_time(query, request)}
         except asyncio.CancelledError:
             error = ConnectionClosedError(
-                f"{order.camera}: the agent ends; whether {name} was done is unknown"
+                f"{query.camera}: the agent ends; whether {name} was done is unknown"
             )
-            answer = order.error_answer(error)
+            answer = query.error_answer(error)
             raise
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
-                logger.exception("%s ! %s failed", order.camera, name)
-            answer = order.error_answer(exc)
+                logger.exception("%s ! %s failed", query.camera, name)
+            answer = query.error_answer(exc)
         finally:
             call.answer = as_json(answer)
             waiting, call.waiting = call.waiting, []
@@ -424,118 +423,120 @@ class PlainServices:
                 question.reply(question.key, call.answer)
                 question.close()
             if request.id is not None:
-                self._known_answers[order.is_for_operators].count_answer(call.answer)
+                self._known_answers[query.is_for_operators].count_answer(call.answer)
 
     async def _carry_out_in_time(
-        self, order: _ServiceQuestion, request: PlainRequest
+        self, query: _ServiceQuery, request: JsonRequest
     ) -> dict[str, Any]:
         """Carry out a call within its timeout.
 
         Raises:
             SmartCamError: the call failed, or did not end in time; then its outcome is unknown.
         """
-        service = order.service
+        service = query.service
         full_timeout = timeout = request.timeout or service.timeout
         if request.deadline is not None:
             timeout = min(timeout, request.deadline - time.time())
             if timeout <= 0:
-                text = f"{order.camera}: {order.name} came after its deadline; it was not done"
-                raise late_call_error(order.name, text)
-        elif order.max_wait:
-            timeout -= order.max_wait
+                text = f"{query.camera}: {query.name} came after its deadline; it was not done"
+                raise late_call_error(query.name, text)
+        elif query.max_wait:
+            timeout -= query.max_wait
             if timeout <= 0:
                 raise late_call_error(
-                    order.name,
-                    f"{order.camera}: the agent was stopped for {order.max_wait:.1f} s, for which "
-                    f"{order.name} may have waited: longer than its timeout of {full_timeout:g} s; "
-                    "it was not done. One with a deadline is done until then",
+                    query.name,
+                    f"{query.camera}: the agent's process hung for {query.max_wait:.1f} s, so "
+                    f"{query.name} may be older than its timeout of {full_timeout:g} s; it was not "
+                    "done. A request with a deadline is done until then",
                 )
         loop = asyncio.get_running_loop()
         started_at = loop.time()
         try:
             async with asyncio.timeout(timeout + CANCEL_GRACE) as limit:
-                host = await self._get_host(order, request)
+                camera = await self._get_camera(query, request)
                 if getattr(request, "application", 0) or getattr(request, "application_id", 0):
                     # two switches of the application take further time
                     limit.reschedule(
-                        started_at + timeout + CANCEL_GRACE + 2 * host.settings.switch_timeout
+                        started_at + timeout + CANCEL_GRACE + 2 * camera.settings.switch_timeout
                     )
                 try:
-                    return await self._serve(order, request, host, started_at + timeout)
+                    return await self._serve(query, request, camera, started_at + timeout)
                 except BaseException:
-                    await self._remove_added_camera(order.camera, request)
+                    await self._remove_added_camera(query.camera, request)
                     raise
         except TimeoutError as exc:
             if isinstance(exc, SmartCamError):
                 raise
             raise ResponseTimeoutError(
-                f"{order.camera}: {order.name} took longer than {timeout:.3g} s; whether it was "
+                f"{query.camera}: {query.name} took longer than {timeout:.3g} s; whether it was "
                 "done is unknown",
                 waited=timeout,
             ) from exc
 
     async def _serve(
-        self, order: _ServiceQuestion, request: PlainRequest, host: Host, deadline: float
+        self, query: _ServiceQuery, request: JsonRequest, camera: SharedCamera, deadline: float
     ) -> dict[str, Any]:
-        service, loop = order.service, asyncio.get_running_loop()
+        service, loop = query.service, asyncio.get_running_loop()
         self._last_call_number += 1
-        program = f"{request.program or 'a program'} without smartcam"
-        needs_gate = service.command and (service is not STOP or host.name in self._added_cameras)
+        program = f"{request.program or 'a program'} (not a smartcam client)"
+        needs_gate = service.is_command and (
+            service is not STOP or camera.name in self._added_cameras
+        )
         if needs_gate:
-            await host.enter(program, order.name, deadline - loop.time())
+            await camera.enter_gate(program, query.name, deadline - loop.time())
         try:
             remaining = max(0.0, deadline - loop.time())
             owner = Owner(self._program, self._last_call_number)
-            with host.counting_trigger(order.name):
-                work = Work(host, host.topics, request, remaining, owner, self._calibrations)
+            with camera.counting_trigger(query.name):
+                work = Work(camera, camera.topics, request, remaining, owner, self._calibrations)
                 answer = await service.carry_out(work)
-            if service is STOP and host.name in self._added_cameras:
-                self._added_cameras.pop(host.name, None)
-                await self._agent.unshare(host.name, "a program has stopped it")
+            if service is STOP and camera.name in self._added_cameras:
+                self._added_cameras.pop(camera.name, None)
+                await self._agent.unshare(camera.name, "a program has stopped it")
         finally:
             if needs_gate:
-                host.gate.leave(program)
+                camera.gate.leave(program)
         return answer
 
     # ------------------------------------------------------------------ cameras that Setup adds
 
-    async def _get_host(self, order: _ServiceQuestion, request: PlainRequest) -> Host:
+    async def _get_camera(self, query: _ServiceQuery, request: JsonRequest) -> SharedCamera:
         """Return the camera; Setup adds a camera that no agent has."""
-        host = self._agent.hosts.get(order.camera)
-        if host is not None:
+        camera = self._agent.shared_cameras.get(query.camera)
+        if camera is not None:
             if isinstance(request, SetupRequest):
-                await host.wait_first_attempt(SETUP_WAIT)
-            return host
+                await camera.wait_first_attempt(SETUP_WAIT)
+            return camera
         if not isinstance(request, SetupRequest):
-            raise ConnectionClosedError(f"{order.camera}: the camera was stopped meanwhile")
+            raise ConnectionClosedError(f"{query.camera}: the camera was stopped meanwhile")
         settings = new_camera(request)
-        await self._agent.refuse_taken(order.camera, settings)
-        if order.camera in self._agent.hosts:
-            return await self._get_host(order, request)  # another Setup was faster
+        await self._agent.check_address_free(query.camera, settings)
+        if query.camera in self._agent.shared_cameras:
+            return await self._get_camera(query, request)  # another Setup was faster
         if len(self._added_cameras) >= MAX_CAMERAS_ADDED:
-            raise LocalProtocolError(f"{order.camera}: Setup has added {MAX_CAMERAS_ADDED} cameras")
-        self._added_cameras[order.camera] = request
+            raise LocalProtocolError(f"{query.camera}: Setup has added {MAX_CAMERAS_ADDED} cameras")
+        self._added_cameras[query.camera] = request
         try:
-            host = self._agent.share(order.camera, settings)
-            await host.wait_first_attempt(SETUP_WAIT)
-            host.require()
+            camera = self._agent.share(query.camera, settings)
+            await camera.wait_first_attempt(SETUP_WAIT)
+            camera.require_client()
         except BaseException:
-            await self._remove_added_camera(order.camera, request)
+            await self._remove_added_camera(query.camera, request)
             raise
-        return host
+        return camera
 
-    async def _remove_added_camera(self, camera: str, request: PlainRequest) -> None:
+    async def _remove_added_camera(self, camera: str, request: JsonRequest) -> None:
         """Remove the camera that a failed Setup has added."""
         if self._added_cameras.get(camera) is request:
             del self._added_cameras[camera]
-            if camera in self._agent.hosts:
+            if camera in self._agent.shared_cameras:
                 await self._agent.unshare(camera, "its Setup has failed")
 
 
 def request_fields(payload: bytes) -> tuple[dict[str, Any] | None, SmartCamError | None]:
     """Return a request's fields, or its error. An empty payload is a request without fields."""
     if len(payload) > MAX_REQUEST_BYTES:
-        text = f"a request of {len(payload)} bytes; {MAX_REQUEST_BYTES} are taken"
+        text = f"a request of {len(payload)} bytes; at most {MAX_REQUEST_BYTES} are accepted"
         return None, ConfigurationError(text)
     try:
         fields: Any = (
@@ -556,7 +557,7 @@ def _refuse_constant(text: str) -> float:
 def _is_read_only(key: str) -> bool:
     """Return True if the key is of a service that changes nothing, which viewers may use, too."""
     service = SERVICES.get(key.rpartition("/")[2])
-    return service is not None and not service.command
+    return service is not None and not service.is_command
 
 
 def _reply(question: BusQuestion, answer: dict[str, Any]) -> None:

@@ -15,16 +15,16 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
+from smartcam.fleet._agent.client import AgentCallbacks, AgentClient
 from smartcam.fleet._agent.gate import Gate
-from smartcam.fleet._agent.shared import AgentCallbacks, SharedCamera
 from smartcam.fleet._bus.errors import late_call_error, to_fields
 from smartcam.fleet._bus.log import AgentLog
 from smartcam.fleet._bus.wire import (
     CURRENT,
     LATE,
-    ResultRun,
+    ResultGroup,
     encode,
-    encode_runs,
+    encode_groups,
     encode_state,
     encode_status,
     timestamp,
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Sequence
 
     from smartcam.fleet._agent.bundle import AgentBundle
+    from smartcam.fleet._agent.client import Owner, RawValue
     from smartcam.fleet._agent.gate import Change
-    from smartcam.fleet._agent.shared import Owner, RawValue
     from smartcam.fleet._bus.bus import Bus, Publisher
     from smartcam.fleet._bus.keys import Keys
     from smartcam.fleet._frames.camera_frames import SharedFrames
@@ -70,8 +70,8 @@ REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
 result. Without these messages, no program would notice the loss of the last results."""
 
 
-class Host:
-    """One camera of an agent.
+class SharedCamera:
+    """A camera that an agent shares.
 
     Args:
         name: name of the camera in the fleet.
@@ -79,7 +79,7 @@ class Host:
         bus: bus on which results and states are sent.
         keys: keys of the fleet.
         epoch: number of the agent's start.
-        history: largest numbers of results and of bytes that are kept.
+        history: largest count of kept results, and of their bytes.
         on_event: callback for the camera's events.
         topics: topics of the agent's cameras in JSON.
         frames: frames of the camera.
@@ -87,7 +87,7 @@ class Host:
         observers: observers of the camera's sessions.
 
     Attributes:
-        epoch: number of the agent's start, or of its current hold of the camera.
+        epoch: number of the agent's start.
         first_result: number of the first result of this epoch.
         is_only_agent: whether no other agent can take over the camera.
         gate: gate that decides which program's commands may pass.
@@ -97,7 +97,7 @@ class Host:
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
         failure: error of the last attempt before the first session; None from that session on.
-        triggers: numbers of programs' triggers, by their outcome (a word of ``OUTCOMES``).
+        triggers: counts of programs' triggers, by their outcome (a word of ``OUTCOMES``).
     """
 
     def __init__(
@@ -130,8 +130,8 @@ class Host:
         # made only to raise for an invalid ``interpret_as``; programs set the other options
         Interpretation(settings.interpret_as, lenient=True, y_down=False)
         self.topics: CameraTopics = CameraTopics(self, topics)
-        self._camera = self._make_client()
-        self._unsent_runs: list[bytes] = []
+        self._client = self._make_client()
+        self._unsent_groups: list[bytes] = []
         self._unsent_states: list[bytes] = []
         self._unsent_bytes = 0
         self._flush_handle: asyncio.Handle | None = None  # the next sending of results
@@ -139,55 +139,56 @@ class Host:
         self._states_timer = DeadlineTimer(self._flush_states)
         self._next_number_timer = DeadlineTimer(self._put_states)
         self._reminder: asyncio.TimerHandle | None = None
-        self._opened = asyncio.Event()
+        self._was_tried = asyncio.Event()
         self._has_ended = False  # whether there will be no further session
         self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_subscribers)
 
     @property
-    def camera(self) -> SharedCamera:
+    def client(self) -> AgentClient:
         """The client that has the session."""
-        return self._camera
+        return self._client
 
     @property
     def was_tried(self) -> bool:
         """True once the first attempt has ended, with or without success."""
-        return self._opened.is_set()
+        return self._was_tried.is_set()
 
     @property
     def connected(self) -> bool:
         """True while there is a session."""
-        return self._camera.connected
+        return self._client.connected
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Numbers of the next result, state, status and event, with which a later host goes on."""
+        """Numbers of the next result, state, status and event, also for when it is shared again."""
         topics = self.topics
-        return self.results.following, self.states.following, topics.next_status, topics.next_event
+        next_numbers = self.results.next_number, self.states.next_number
+        return *next_numbers, topics.next_status, topics.next_event
 
     @numbers.setter
     def numbers(self, numbers: tuple[int, ...]) -> None:
         topics = self.topics
-        self.results.following, self.states.following, topics.next_status, topics.next_event = (
+        self.results.next_number, self.states.next_number, topics.next_status, topics.next_event = (
             numbers
         )
 
-    def _make_client(self) -> SharedCamera:
+    def _make_client(self) -> AgentClient:
         callbacks = AgentCallbacks(
-            self._on_results, self._on_status, self._on_event, self._on_end, self._on_taken
+            self._on_results, self._on_status, self._on_event, self._on_end, self._on_taken_by_other
         )
-        return SharedCamera(self.settings, callbacks, self._observers)
+        return AgentClient(self.settings, callbacks, self._observers)
 
     # ------------------------------------------------------------------ open and close
 
     async def run(self) -> None:
-        """Keep a session with the camera; return after the last session."""
+        """Try until the first session is open, or no further attempt is allowed."""
         backoff = self.settings.reconnect
         delays = iter(()) if backoff is None else backoff.delays()
         try:
             while True:
                 try:
-                    await self._camera.open()
+                    await self._client.open()
                 except (SmartCamError, OSError) as error:
                     self._fail(error)
                     delay = next(delays, None)
@@ -195,27 +196,27 @@ class Host:
                         self._has_ended = True
                         return
                     await asyncio.sleep(delay)
-                    self._camera = self._make_client()
+                    self._client = self._make_client()
                 else:
                     self.failure = None
                     return
         finally:
-            self._opened.set()
+            self._was_tried.set()
             self._publish_state({"kind": "Tried"})
 
     async def wait_first_attempt(self, timeout: float) -> None:
         """Wait until the first attempt has ended, with or without success; bounded."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
-                await self._opened.wait()
+                await self._was_tried.wait()
 
     async def close(self) -> None:
         """End the session with Disconnect; bounded."""
-        self._opened.clear()  # later messages have no further effect
+        self._was_tried.clear()  # later messages have no further effect
         try:
             await self.frames.close()
         finally:
-            await self._camera.close()
+            await self._client.close()
         self.lose_reservation()
         if self._reminder is not None:
             self._reminder.cancel()
@@ -230,21 +231,21 @@ class Host:
         if not isinstance(error, SmartCamError):
             error = ConnectionLostError(f"{self.name}: {error}")
         self.failure = error
-        self._opened.set()
+        self._was_tried.set()
         self._publish_state({"kind": "Absent"})
 
-    def require(self) -> SharedCamera:
+    def require_client(self) -> AgentClient:
         """Return the camera.
 
         Raises:
             LinkError: there is no session; the text has the reason.
         """
-        if self.failure is not None or not (self._opened.is_set() or self.connected):
-            why = self.failure or "it tries for the first time"
+        if self.failure is not None or not (self._was_tried.is_set() or self.connected):
+            reason = self.failure or "it tries for the first time"
             raise ConnectionLostError(
-                f"{self.name}: the agent has no session with the camera: {why}"
+                f"{self.name}: the agent has no session with the camera: {reason}"
             ) from self.failure
-        return self._camera
+        return self._client
 
     @contextlib.contextmanager
     def counting_trigger(self, action: str) -> Iterator[None]:
@@ -259,7 +260,7 @@ class Host:
             if "trigger" in action.lower():
                 self.triggers[outcome] += 1
 
-    async def enter(self, program: str, action: str, timeout: float) -> None:
+    async def enter_gate(self, program: str, action: str, timeout: float) -> None:
         """Wait for the turn of a command of ``program``, like :meth:`Gate.enter`.
 
         Raises:
@@ -315,7 +316,7 @@ class Host:
         """
         if not self.is_only_agent and self.gate.holds(reservation):
             with contextlib.suppress(UnsupportedError):
-                await self.require().query_application(timeout=timeout)
+                await self.require_client().query_application(timeout=timeout)
         return self.gate.holds(reservation)
 
     def lose_reservation(self) -> None:
@@ -325,8 +326,8 @@ class Host:
 
     def _on_reservation(self, change: Change, program: str) -> None:
         self.topics.on_reservation(change, program)
-        if change == "ReservationLost" and self._opened.is_set():
-            self._publish_state({"kind": change, "by": program})
+        if change == "ReservationLost" and self._was_tried.is_set():
+            self._publish_state({"kind": change, "program": program})
         else:
             self.topics.on_state()
 
@@ -341,7 +342,7 @@ class Host:
 
     def state_fields(self) -> dict[str, Any]:
         """Return the fields of a state message."""
-        camera = self._camera
+        camera = self._client
         try:
             status: int | None = int(camera.status)
         except SmartCamError:
@@ -354,7 +355,7 @@ class Host:
             "endian": camera.endian,
             "application": camera.active_application,
         }
-        if not self._opened.is_set():
+        if not self._was_tried.is_set():
             fields["trying"] = True
         elif trouble is not None:
             fields |= {"error": to_fields(trouble), "over": self._has_ended and self.is_only_agent}
@@ -362,17 +363,17 @@ class Host:
 
     def session_state(self) -> tuple[bool, int | None, int | None, str | None]:
         """Return the session's state: connected, status, application, reason if not connected."""
-        camera, trouble = self._camera, self.failure or self._camera.trouble
+        camera, trouble = self._client, self.failure or self._client.trouble
         try:
             status: int | None = int(camera.status)
         except SmartCamError:
             status = None
-        why = None if trouble is None else str(trouble)
-        return trouble is None, status, camera.active_application, why
+        reason = None if trouble is None else str(trouble)
+        return trouble is None, status, camera.active_application, reason
 
     def camera_fields(self) -> dict[str, Any]:
         """Return the fields of the camera that do not change during a session."""
-        camera, settings = self._camera, self.settings
+        camera, settings = self._client, self.settings
         fields: dict[str, Any] = {
             "camera": self.name,
             "url": camera.url,
@@ -389,8 +390,8 @@ class Host:
 
     def _on_status(self, status: Status) -> None:
         self.topics.on_status(status)
-        camera, number = self._camera, self.states.following
-        if not (camera.connected and self._opened.is_set()):
+        camera, number = self._client, self.states.next_number
+        if not (camera.connected and self._was_tried.is_set()):
             self._publish_state({"kind": "Status"}, max_delay=STATUS_DELAY)
             return
         # three times as fast as int(status)
@@ -413,23 +414,23 @@ class Host:
             self.lose_reservation()  # another agent may have taken the camera
 
     def _on_end(self) -> None:
-        if self._opened.is_set() and self.failure is None:
+        if self._was_tried.is_set() and self.failure is None:
             self._has_ended = True
             self._publish_state({"kind": "Over"})
         self.lose_reservation()
 
-    def announce_removed(self, why: str) -> None:
+    def announce_removed(self, reason: str) -> None:
         """Announce that this agent no longer shares the camera, and why."""
-        self._publish_state({"kind": "Removed", "why": why})
+        self._publish_state({"kind": "Removed", "reason": reason})
 
-    def _on_taken(self) -> None:
+    def _on_taken_by_other(self) -> None:
         """Announce that another client has the camera."""
         self._publish_state({"kind": "Taken"})
 
     def _publish_state(self, fields: dict[str, Any], *, max_delay: float = 0.0) -> None:
         """Send an event with the camera's state, at the latest after ``max_delay`` seconds."""
         clock = asyncio.get_running_loop().time()
-        state = {**fields, **self.state_fields(), "number": self.states.following, "clock": clock}
+        state = {**fields, **self.state_fields(), "number": self.states.next_number, "clock": clock}
         self._add_state(encode_state(state), clock, max_delay)
 
     def _add_state(self, data: bytes, clock: float, max_delay: float) -> None:
@@ -446,14 +447,14 @@ class Host:
         first = results[0]
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (LATE if late else 0)
-        cells = first.value.cells
+        cells_json = first.value.cells
         clock = asyncio.get_running_loop().time()
-        run: ResultRun = new_tuple(
-            ResultRun,
+        group: ResultGroup = new_tuple(
+            ResultGroup,
             (
-                self.results.following,
+                self.results.next_number,
                 first.application,
-                self._camera.endian,
+                self._client.endian,
                 flags,
                 owner.program,
                 owner.call,
@@ -462,16 +463,16 @@ class Host:
                 timestamp(first.triggered_at),
                 timestamp(None) if first.latency is None else first.latency,
                 [result.raw for result in results],
-                cells,
+                cells_json,
             ),
         )
-        data = run.encode()
-        self.results.add(len(run.payloads), clock, data)
+        data = group.encode()
+        self.results.add(len(group.payloads), clock, data)
         outcomes = self.outcomes.get(owner)
         if outcomes is not None:
             outcomes.append(data)
         if self._results_out.has_subscribers or self._bundle.has_subscribers:
-            self._unsent_runs.append(data)
+            self._unsent_groups.append(data)
             self._unsent_bytes += len(data)
             if self._unsent_bytes >= FULL_MESSAGE_BYTES:
                 self._flush_results()
@@ -482,12 +483,12 @@ class Host:
                     self._flush_handle = loop.call_at(send_at, self._flush_results)
                 else:
                     self._flush_handle = loop.call_soon(self._flush_results)
-        self.topics.on_run(run)
+        self.topics.on_group(group)
 
     def unsent_states(self, since: int) -> list[bytes]:
         """Return the states that are not sent yet, from number ``since`` on."""
         unsent = self._unsent_states
-        return unsent[max(0, since - self.states.following + len(unsent)) :]
+        return unsent[max(0, since - self.states.next_number + len(unsent)) :]
 
     def drop_unsent_states(self) -> None:
         """Drop the unsent states: the only program of the agent gets them with a reply."""
@@ -510,17 +511,17 @@ class Host:
     def _put_states(self) -> None:
         self._next_number_timer.clear()
         states, self._unsent_states = self._unsent_states, []
-        following = self.states.following
-        self._states_out.put(encode({"epoch": self.epoch, "following": following}, states))
+        next_number = self.states.next_number
+        self._states_out.put(encode({"epoch": self.epoch, "next_number": next_number}, states))
 
     def _flush_results(self) -> None:
         if self._flush_handle is not None:
             self._flush_handle.cancel()
             self._flush_handle = None
-        if self._unsent_runs:
+        if self._unsent_groups:
             self._sent_at, self._unsent_bytes = asyncio.get_running_loop().time(), 0
-            runs, self._unsent_runs = self._unsent_runs, []
-            payload = encode_runs(self.epoch, self.results.following, runs)
+            groups, self._unsent_groups = self._unsent_groups, []
+            payload = encode_groups(self.epoch, self.results.next_number, groups)
             if self._bundle.has_subscribers:
                 self._bundle.add(self.name, payload)
             if self._results_out.has_subscribers:
@@ -543,5 +544,5 @@ class Host:
     def _send_reminder(self, step: int) -> None:
         self._reminder = None
         if self._results_out.has_subscribers:
-            self._results_out.put(encode_runs(self.epoch, self.results.following, []))
+            self._results_out.put(encode_groups(self.epoch, self.results.next_number, []))
             self._schedule_reminder(step)

@@ -1,4 +1,4 @@
-"""Check the settings of a fleet file for access to the bus."""
+"""Check the setting ``access`` of a fleet file: who may use the bus."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ Access = Literal["roles", "any-certificate", "anyone-may-command"]
 
 ANYONE: Access = "anyone-may-command"
 
-CURE = "smartcam fleet certificates makes certificates: then listen: tls/..., certificates: DIR"
+CURE = "Run `smartcam fleet certificates`, then set `listen: tls/...` and `certificates: DIR`"
 
 Mistake = tuple[tuple[str, ...], str]
 
 
 def effective_access(access: Access | None, listen: Sequence[str]) -> Access | None:
-    """Return the access of a fleet file; without one, ``roles`` if an endpoint has TLS."""
+    """Return the effective ``access`` of a fleet file; default: ``roles`` if it has TLS."""
     tls = any(endpoint.startswith("tls/") for endpoint in listen)
     return access or ("roles" if tls else None)
 
 
 def access_mistakes(access: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
-    """Yield the mistakes in the access of a fleet file."""
+    """Yield the mistakes in the setting ``access`` of a fleet file."""
     plain = [endpoint for endpoint in listen if not endpoint.startswith("tls/")]
     open_to_all = [
         endpoint for endpoint in plain if not is_loopback(endpoint[4:].rpartition(":")[0])

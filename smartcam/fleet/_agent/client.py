@@ -98,7 +98,7 @@ class AgentCallbacks(NamedTuple):
     on_status: Callable[[Status], None]
     on_event: Callable[[CameraEvent], None]
     on_end: Callable[[], None]
-    on_taken: Callable[[], None]
+    on_taken_by_other: Callable[[], None]
 
 
 class AgentListeners(Listeners):
@@ -108,7 +108,7 @@ class AgentListeners(Listeners):
     callbacks: AgentCallbacks | None = None
 
     @property
-    def results_only_streamed(self) -> bool:
+    def results_only_streamed(self) -> bool:  # results need not be offered one by one
         return True
 
     @property
@@ -149,7 +149,7 @@ class AgentListeners(Listeners):
             self.callbacks.on_results((result,), current, late)
 
 
-class SharedCamera(SmartCamera[RawValue]):
+class AgentClient(SmartCamera[RawValue]):
     """A camera that its agent shares.
 
     Args:
@@ -166,7 +166,7 @@ class SharedCamera(SmartCamera[RawValue]):
     ) -> None:
         super().__init__(settings, observers=observers)
         self._listeners.callbacks = callbacks
-        self._supervisor.on_taken = callbacks.on_taken
+        self._supervisor.on_taken = callbacks.on_taken_by_other
 
     _listeners: AgentListeners
 
