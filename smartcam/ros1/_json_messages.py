@@ -79,7 +79,7 @@ def ros1_name(name: str) -> str | None:
 
 
 def to_json(message_type: MessageType, message: Any) -> dict[str, Any]:
-    """Return a message, or the mapping of its fields, as JSON values and :class:`RawBytes`.
+    """Return the JSON values, and :class:`RawBytes`, of a message or of a mapping of its fields.
 
     Raises:
         RosMessageError: the value does not fit the type.
@@ -139,8 +139,8 @@ def from_json(message_type: MessageType, data: Any) -> Any:
                 f"got {len(data)}"
             )
         names = RENAMED_FIELDS.get(message_type.name, {})
-        ordered = [names.get(field.name, field.name) for field in message_type.fields]
-        data = dict(zip(ordered, data, strict=False))
+        field_names = [names.get(field.name, field.name) for field in message_type.fields]
+        data = dict(zip(field_names, data, strict=False))
     message = message_type.new(**_checked_fields(message_type, data, "", _MAX_NESTING))
     return message_type.decode(
         message_type.encode(message)

@@ -51,8 +51,8 @@ class LinkListener(Protocol):
     def on_operation(self, operation: dict[str, Any]) -> None:
         """Handle an operation; never wait."""
 
-    async def on_lost(self, was: bool) -> None:
-        """Handle a lost connection; ``was``: it was connected, not only tried."""
+    async def on_lost(self, was_connected: bool) -> None:
+        """Handle a lost connection, or a failed attempt if ``was_connected`` is False."""
 
 
 def checked_url(url: str) -> str:
@@ -186,7 +186,7 @@ class BridgeLink:
         except link_errors() as exc:
             return str(getattr(exc, "os_error", exc)) or type(exc).__name__
         except Exception as exc:  # a fault of smartcam: the next link may work
-            logger.exception("%s ! the link", self.url)
+            logger.exception("%s ! the link failed unexpectedly", self.url)
             return f"{type(exc).__name__}: {exc}"
         return "it closed the link"
 
@@ -260,6 +260,6 @@ class BridgeLink:
             except ENDS_PROGRAM:
                 raise
             except BaseException:
-                logger.exception("%s ! %.200r", self.url, operation)  # the link goes on
+                logger.exception("%s ! operation failed: %.200r", self.url, operation)
         else:
             logger.warning("%s: expected an operation of rosbridge, got %.80r", self.url, text)

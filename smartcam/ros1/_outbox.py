@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from smartcam.ros1._json_messages import TextPart
 
 MAX_WAITING_OPERATIONS = 256
-"""Number of waiting operations at which no more operations of the bridge are read."""
+"""Number of operations waiting to be sent at which nothing more is read from the bridge."""
 MAX_WAITING_BYTES = 32 << 20
 """Largest number of bytes of all waiting messages of one topic; a single message may have more."""
 

@@ -47,7 +47,7 @@ class RosbridgePublisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """True if the bridge is connected and the topic may have subscribers.
+        """True if the bridge is connected and the topic may have subscribers, or if it is latched.
 
         For a topic with long messages, rosapi is asked for subscribers every two seconds, if it
         answers, as it does with most bridges.

@@ -171,8 +171,8 @@ class RosbridgeNode(NamedNode):
         Args:
             topic: name of the topic: absolute, relative to the namespace, or private (``~/it``).
             type: type of the messages, such as ``std_msgs/msg/String``.
-            qos: quality of service, of which ``depth``, for messages that wait for the bridge, and
-                ``latched`` count.
+            qos: quality of service. Only ``depth`` (number of messages that may wait for the
+                bridge) and ``latched`` have an effect.
 
         Raises:
             ConfigurationError: the topic is not valid, exists already, or there is no such type.
@@ -194,7 +194,7 @@ class RosbridgeNode(NamedNode):
         Args:
             topic: name of the topic, as of :meth:`publisher`.
             type: type of the messages, such as ``std_msgs/msg/String``.
-            qos: quality of service, of which ``depth`` counts, for messages that wait for a reader.
+            qos: quality of service; only ``depth`` has an effect: messages that wait for a reader.
 
         Raises:
             ConfigurationError: the topic is not valid, or there is no such type.
@@ -258,24 +258,24 @@ class RosbridgeNode(NamedNode):
 
     # ------------------------------------------------------------------ for publishers and services
 
-    def has(self, end: RosbridgePublisher | RosbridgeService) -> bool:
+    def has(self, endpoint: RosbridgePublisher | RosbridgeService) -> bool:
         """Return True if a publisher or service is not closed."""
-        return end in (self._publishers.get(end.name), self._services.get(end.name))
+        return endpoint in (self._publishers.get(endpoint.name), self._services.get(endpoint.name))
 
-    def forget(self, end: RosbridgePublisher | RosbridgeService) -> None:
+    def forget(self, endpoint: RosbridgePublisher | RosbridgeService) -> None:
         """Remove a closed publisher or service."""
-        if not self.has(end):
+        if not self.has(endpoint):
             return
-        if isinstance(end, RosbridgePublisher):
-            del self._publishers[end.name]
-            if end.has_ros1_type:
-                self._outbox.remove_queue(end.queue)
-                self.send(encode_operation({"op": "unadvertise", "topic": end.name}))
+        if isinstance(endpoint, RosbridgePublisher):
+            del self._publishers[endpoint.name]
+            if endpoint.has_ros1_type:
+                self._outbox.remove_queue(endpoint.queue)
+                self.send(encode_operation({"op": "unadvertise", "topic": endpoint.name}))
             return
-        del self._services[end.name]
-        end.discard_calls()
-        if end.has_ros1_type:
-            self._to_withdraw.append(end)
+        del self._services[endpoint.name]
+        endpoint.discard_calls()
+        if endpoint.has_ros1_type:
+            self._to_withdraw.append(endpoint)
             self._schedule_changes()
 
     def forget_subscription(self, subscription: RosbridgeSubscription) -> None:
@@ -364,7 +364,7 @@ class RosbridgeNode(NamedNode):
         await asyncio.gather(*(service.stop_calls() for service in to_withdraw))
         names = dict.fromkeys(service.name for service in (*to_withdraw, *to_advertise))
         await withdraw_services(self._link.url, list(names))
-        if to_withdraw:  # first handle calls that the bridge has aborted
+        if to_withdraw:  # aborted calls arrive before the answer to this call
             await self.ask(PROBED_SERVICE, {})
         self._to_withdraw = self._to_withdraw[len(to_withdraw) :]
         for service in to_advertise:
@@ -401,9 +401,9 @@ class RosbridgeNode(NamedNode):
         else:
             handle(operation)
 
-    async def on_lost(self, was: bool) -> None:
+    async def on_lost(self, was_connected: bool) -> None:
         """End the calls and tasks of the lost bridge."""
-        if self._link_task is not None and was:
+        if self._link_task is not None and was_connected:
             self._report_change()
         for service in self._services.values():
             service.discard_calls()
@@ -417,13 +417,13 @@ class RosbridgeNode(NamedNode):
     def _on_call(self, operation: dict[str, Any]) -> None:
         name, identity = operation.get("service"), operation.get("id")
         if not isinstance(name, str) or not isinstance(identity, str | int | None):
-            logger.warning("%s: no call: %.200r", self.full_name, operation)
+            logger.warning("%s: expected a service call, got %.200r", self.full_name, operation)
             return
         service = self._services.get(name)
         if any(service.name == name for service in self._to_withdraw):
             return  # the call fails at its caller
         if service is None:
-            logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
+            logger.warning("%s: got a call of %.80r, which it does not serve", self.full_name, name)
             refusal = {"op": "service_response", "service": name, "id": identity, "result": False}
             self.send(encode_operation(refusal))
         elif service.is_advertised:  # otherwise the bridge aborts the call

@@ -23,8 +23,8 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 MAX_CONCURRENT_CALLS = 64
 """Largest number of calls of a service that run at the same time; further calls are refused."""
 RESPONSE_TRANSFER_TIME = 0.5
-"""Seconds for a bridge to pass on a response before its service is withdrawn. Of a response that it
-still had, a later call would become the receiver."""
+"""Seconds for a bridge to pass on a response before its service is withdrawn. The bridge
+would pass on a response that it still has to a later caller."""
 CLOSE_TIMEOUT = 5.0
 """Seconds to wait for cancelled handlers; a handler that continues longer is wrong."""
 ERROR_FIELDS = ("error", "message", "status_message")
@@ -138,7 +138,7 @@ class RosbridgeService:
         self, identity: object, arguments: object, *, is_full: bool
     ) -> tuple[TextPart, ...]:
         if is_full:
-            raise RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most")
+            raise RosError(f"{MAX_CONCURRENT_CALLS} calls are running, the maximum")
         request = from_json(self.type.request, {} if arguments is None else arguments)
         async with asyncio.timeout(self._timeout):
             response = await self._handler(request)
@@ -154,8 +154,8 @@ class RosbridgeService:
                 advertisement_number, self._encode_response(identity, values, result=False)
             )
         elif advertisement_number == self._advertisement_number:
-            # A bridge ignores ``result`` and would pass on a response of zeros. Withdrawing the
-            # service for a moment is an error for its callers.
+            # A bridge ignores ``result`` and would pass on a response of zeros. The caller gets an
+            # error because the service is withdrawn before the bridge passes on this response.
             self._respond(advertisement_number, self._encode_response(identity, None, result=False))
             self._node.renew(self)
 

@@ -473,7 +473,7 @@ async def test_too_many_calls(
     node.serve("~/trigger", TRIGGER, never)
     calls = [asyncio.create_task(bridge.call("/line1/cam3/trigger")) for _ in range(4)]
     response = await calls[3]
-    assert "3 calls of it are running, which is the most" in response["values"]["message"]
+    assert "3 calls are running, the maximum" in response["values"]["message"]
     await node.stop()
     for call in calls[:3]:
         with pytest.raises(Gone):
@@ -576,7 +576,7 @@ async def test_a_call_of_what_is_not_served(
     await bridge.until(lambda: any(one["op"] == "service_response" for one in bridge.said))
     answer = {"op": "service_response", "service": "/other", "id": 7, "result": False}
     assert answer in bridge.said
-    assert "called '/other', which it does not serve" in caplog.text
+    assert "got a call of '/other', which it does not serve" in caplog.text
     node.serve("~/trigger", TRIGGER, yes)
     assert (await bridge.call("/line1/cam3/trigger"))["result"] is True
 
