@@ -118,7 +118,7 @@ def measuring_calls() -> dict[str, Call]:
         ),
         "MovingCamera": (
             calibration.MovingCamera,
-            {"static": static, "calibrated_at": still, "field": corners}
+            {"static": static, "calibration_pose": still, "field": corners}
             | {"tolerance": 0.0002, "max_lag": 0.001},
         ),
         "PlacePattern": (

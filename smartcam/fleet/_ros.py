@@ -189,13 +189,13 @@ class RosFleet(Server):
             frame_id=options.frame_id or as_name(name).replace("/", "_"),
             parent_frame=options.parent_frame or "",
             flange_frame=options.flange_frame or "",
-            place=self._hand_eyes.get(name),
-            calibrated_at=options.robot_pose(),
+            hand_eye=self._hand_eyes.get(name),
+            calibration_pose=options.robot_pose(),
             autostart=self._section.autostart,
             settings=self._settings.get(name),
             is_agent_alive=lambda: camera.has_agent,
-            frames=self._frames.get(name, {}),
-            controls=self._controls.get(name),
+            video_parameters=self._frames.get(name, {}),
+            get_frame_source=self._controls.get(name),
             calibrations=None if calibrations is None else calibrations.of(name),
         )
 

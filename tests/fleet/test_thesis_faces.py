@@ -185,9 +185,7 @@ class Ros2Face(Face):
             self._task = asyncio.create_task(self._take(heard))
         assert self._server._ros is not None
         (node,) = self._server._ros.nodes.values()
-        await until(
-            lambda: node.results._outlet is not None and node.results._outlet.has_subscribers
-        )
+        await until(lambda: (topic := node.results._delayed) is not None and topic.has_subscribers)
 
     async def _take(self, heard: Any) -> None:
         async for message in heard:

@@ -56,7 +56,7 @@ class Device:
 @contextlib.asynccontextmanager
 async def nodes(source: Any) -> AsyncIterator[tuple[CameraNode, Node]]:
     """Give a camera's node, and another one."""
-    place, options = free_place(), CameraNodeOptions(controls=source)
+    place, options = free_place(), CameraNodeOptions(get_frame_source=source)
     async with (
         Node("viewer", listen=place, domain=7) as viewer,
         box() as emulated,

@@ -228,7 +228,8 @@ async def with_parameters(**options: Any) -> AsyncIterator[tuple[Any, RosParamet
 
 
 async def test_what_is_read_only_cannot_be_set() -> None:
-    async with with_parameters(frames={"video_device": "v4l2:///dev/video0"}) as (_, found):
+    parameters = {"video_device": "v4l2:///dev/video0"}
+    async with with_parameters(video_parameters=parameters) as (_, found):
         settable = {"application", "diagnostics_period", "use_sim_time"}
         assert settable < set(found.names())
         for name in set(found.names()) - settable:

@@ -186,7 +186,7 @@ async def test_what_cannot_be_read_is_an_error_and_no_poses(
         await camera.trigger(PARTS)
         await until(lambda: results.taken == 3)
         assert len(node.said("localizations")) == 1
-    told = [one for one in caplog.records if "a result has no poses" in one.getMessage()]
+    told = [one for one in caplog.records if "could not be interpreted" in one.getMessage()]
     assert [one.levelno for one in told if one.levelno >= logging.WARNING] == [logging.WARNING]
 
 

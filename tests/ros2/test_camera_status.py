@@ -321,7 +321,7 @@ async def test_no_password_is_said() -> None:
         (KnownState("cam", True, Status.RUNNING, -1), (True, 0, "", OK, "ready")),
         (KnownState("cam", True, Status.RUNNING, 7), (True, 7, "", OK, "ready")),
         (KnownState("cam", True, Status.RUNNING | Status.BUSY, 7), (False, 7, "", OK, "busy")),
-        (KnownState("cam", why="gone"), (False, 0, "gone", ERROR, "gone")),
+        (KnownState("cam", failure="gone"), (False, 0, "gone", ERROR, "gone")),
         (
             KnownState("cam"),
             (False, 0, "there was no session yet", ERROR, "there was no session yet"),

@@ -185,7 +185,7 @@ async def test_closing_in_the_middle_closes_the_cameras() -> None:
         with contextlib.suppress(asyncio.CancelledError):
             await closing
         await until(lambda: pair.closed)
-        await until(lambda: not here.graph.ends("/line1/cam3/points2", "MP"))
+        await until(lambda: not here.graph.endpoints("/line1/cam3/points2", "MP"))
         clouds.close()
 
 

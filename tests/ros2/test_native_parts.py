@@ -124,7 +124,7 @@ def test_a_job_that_fails_leaves_the_others() -> None:
 def test_changes_of_parameters_reach_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     node: Any = SimpleNamespace(full_name="/cam", types=TYPES)
     seen: list[tuple[str, object]] = []
-    node.ros = SimpleNamespace(
+    node.rclpy_node = SimpleNamespace(
         add_on_set_parameters_callback=lambda _hook: None,
         describe_parameter=lambda _name: SimpleNamespace(read_only=False),
         set_parameters=lambda values: seen.append(("set", values)),

@@ -184,7 +184,7 @@ async def test_a_request_that_cannot_be_read_is_told_by_an_ordinary_reply() -> N
                 found = await soon(asyncio.to_thread(list, replies))
             assert served.failed == 1
             served.close()
-            await until(lambda: not there.graph.ends("/line1/cam3/it", "SS"))
+            await until(lambda: not there.graph.endpoints("/line1/cam3/it", "SS"))
             ok = [one.ok and one.ok.payload.to_bytes() for one in found]
             return [one and served.type.response.decode(one) for one in ok]
 
@@ -353,7 +353,7 @@ async def test_the_graph_says_who_does_what_and_forgets_who_is_gone() -> None:
             assert graph.services() == {"/line1/cam3/trigger": [TRIGGER]}
             kinds = {one.kind for one in graph.of_node("/viewer")}
             assert kinds == {"MS", "SC"}
-            assert [one.node for one in graph.ends("/line1/chatter", "MP")] == ["cam3"]
+            assert [one.node for one in graph.endpoints("/line1/chatter", "MP")] == ["cam3"]
         served.close()
         await until(lambda: there.graph.services() == {})
         await here.stop()
@@ -370,11 +370,11 @@ async def test_nodes_of_one_session_do_not_collide() -> None:
     ):
         one.publisher("chatter", STRING)
         other.publisher("chatter", STRING)
-        await until(lambda: len(viewer.graph.ends("/chatter", "MP")) == 2)
+        await until(lambda: len(viewer.graph.endpoints("/chatter", "MP")) == 2)
         await until(lambda: viewer.graph.nodes() == ["/twin", "/twin", "/viewer"])
         await other.stop()
         await until(lambda: viewer.graph.nodes() == ["/twin", "/viewer"])
-        assert len(viewer.graph.ends("/chatter", "MP")) == 1
+        assert len(viewer.graph.endpoints("/chatter", "MP")) == 1
         hears, says = viewer.subscribe("/chatter", STRING), one.publisher("/chatter", STRING)
         await until(lambda: says.has_subscribers)
         says.publish(data="still here")
@@ -389,7 +389,7 @@ async def test_domains_are_apart() -> None:
     ):
         says = here.publisher("/chatter", STRING)
         there.subscribe("/chatter", STRING)
-        await until(lambda: there.graph.ends("/chatter", "MS"))
+        await until(lambda: there.graph.endpoints("/chatter", "MS"))
         assert there.graph.nodes() == ["/viewer"]
         assert not says.has_subscribers
 

@@ -61,7 +61,7 @@ async def test_every_node_has_the_services(nodes: tuple[Node, Node]) -> None:
     described = "type_description_interfaces/srv/GetTypeDescription"
     assert found == {**SERVICES, "get_type_description": described}
     assert {one.qos for one in services if "parameter" in one.name} == {PARAMETERS}
-    (events,) = there.graph.ends("/parameter_events", "MP")[:1]
+    (events,) = there.graph.endpoints("/parameter_events", "MP")[:1]
     assert (events.ros_type, events.qos) == ("rcl_interfaces/msg/ParameterEvent", PARAMETERS)
     async with Node("quiet", context=here.context, parameters=False) as quiet:
         quiet.parameters.declare("a", 1)

@@ -247,7 +247,7 @@ async def test_a_subscriber_that_is_stopped_holds_up_nobody() -> None:
         try:
             images = there.subscribe(f"{CAM}/image_raw", IMAGE)
             assert slow.stdout is not None
-            await until(lambda: len(here.graph.ends(f"{CAM}/image_raw", "MS")) == 2)
+            await until(lambda: len(here.graph.endpoints(f"{CAM}/image_raw", "MS")) == 2)
             line = b""
             while not line:  # until it hears them
                 await given(driver, frame(1, data=bytes([1]) * (1280 * 1024), **large))
@@ -283,7 +283,7 @@ async def test_it_ends_in_the_middle_of_a_picture_and_once_only() -> None:
         await soon(driver.rests())
         await until(lambda: not there_is_a_task("pictures of"))
         await shown.close()
-        await until(lambda: not here.graph.ends(f"{CAM}/image_raw", "MP"))
+        await until(lambda: not here.graph.endpoints(f"{CAM}/image_raw", "MP"))
         images.close()
 
 
@@ -436,7 +436,7 @@ async def test_of_a_camera_with_single_pictures_they_come_on_request(tmp_path: P
     async with two_nodes() as (here, there):
         shown = CameraPictures(camera, here, camera_info_url=str(tmp_path / "a.yaml"))
         shown.start()
-        assert not here.graph.ends(f"{CAM}/image_raw", "MP")
+        assert not here.graph.endpoints(f"{CAM}/image_raw", "MP")
         client = there.client(f"{CAM}/request_image", GET)
         for number in range(3):
             camera.file = bitmap(number)

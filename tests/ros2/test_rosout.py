@@ -61,7 +61,7 @@ async def test_what_is_logged_is_published(pair: tuple[Node, Node], logger: logg
     assert first.function == "test_what_is_logged_is_published"
     assert first.line > 0
     assert abs(first.stamp.sec - int(logging.makeLogRecord({}).created)) < 60
-    (ends,) = there.graph.ends("/rosout", "MP")
+    (ends,) = there.graph.endpoints("/rosout", "MP")
     assert (ends.qos, ends.ros_type) == (ROSOUT, LOG)
     assert (ROSOUT.latched, ROSOUT.depth, ROSOUT.lifespan) == (True, 1000, 10.0)
     says = out._publisher
@@ -71,7 +71,7 @@ async def test_what_is_logged_is_published(pair: tuple[Node, Node], logger: logg
     assert says.published == 3
     await out.close()
     logger.critical("not this")
-    await until(lambda: not there.graph.ends("/rosout", "MP"))
+    await until(lambda: not there.graph.endpoints("/rosout", "MP"))
 
 
 @pytest.mark.parametrize(

@@ -111,8 +111,8 @@ async def test_it_is_heard_and_its_publisher_is_known(tmp_path: Path) -> None:
         assert hears.attachment is not None
         assert hears.attachment.number in {0, 1}  # it counts from 0
         assert not hears.rejected
-        await until(lambda: node.graph.ends("/chatter", "MP"))
-        (end,) = node.graph.ends("/chatter", "MP")
+        await until(lambda: node.graph.endpoints("/chatter", "MP"))
+        (end,) = node.graph.endpoints("/chatter", "MP")
         assert end.ros_type == STRING
         assert end.hash == hears.entity.hash
 

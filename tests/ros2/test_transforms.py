@@ -41,7 +41,7 @@ def test_hand_eye_puts_the_pictures_at_the_base_or_the_flange(
 ) -> None:
     found = turned("of_the_robot", "camera", (0.1, 0.2, 0.3))
     place = SimpleNamespace(setup=setup, camera_pose=found)
-    frames = CameraFrames("cam3", place=place, **names)
+    frames = CameraFrames("cam3", hand_eye=place, **names)
     (one,) = frames.transforms()
     assert (one.target, one.source) == (named, "cam3_optical")
     assert frames.optical == "cam3_optical"
@@ -134,9 +134,9 @@ async def test_tf_finds_the_poses_of_a_plane_from_base_link() -> None:
 
 async def test_tf_finds_the_poses_of_a_camera_that_the_robot_carries() -> None:
     turn = (0.0, 0.0, np.sin(0.2), np.cos(0.2))
-    calibrated_at = Transform.from_quaternion("robot", "flange", (0.4, 0.1, 0.6), turn)
+    calibration_pose = Transform.from_quaternion("robot", "flange", (0.4, 0.1, 0.6), turn)
     poses, tree = await first_pose(
-        parent_frame="base_link", flange_frame="tool0", calibrated_at=calibrated_at
+        parent_frame="base_link", flange_frame="tool0", calibration_pose=calibration_pose
     )
     assert poses.header.frame_id == "cam_robot"
     tree.put("base_link", "tool0", (0.4, 0.1, 0.6), turn)  # the robot as it was then
@@ -146,7 +146,7 @@ async def test_tf_finds_the_poses_of_a_camera_that_the_robot_carries() -> None:
     now = Transform.from_quaternion("robot", "flange", (0.7, -0.1, 0.6), (0, 0, 0, 1))
     tree.put("base_link", "tool0", (0.7, -0.1, 0.6))  # and somewhere else
     calibration = fit_plane(SEEN, TOUCHED, model="similarity")
-    carried = MovingCamera(chain_of(calibration), calibrated_at, field=TOUCHED)
+    carried = MovingCamera(chain_of(calibration), calibration_pose, field=TOUCHED)
     wanted = carried.at_pose(now).transform([[0.001, -0.25]])
     moved = tree.lookup("base_link", poses.header.frame_id)
     assert np.allclose(moved.apply(where(poses.poses[0])), wanted)

@@ -48,8 +48,8 @@ class MovingCamera:
 
     Args:
         static: solver from the camera, at the pose of its calibration, to the robot's frame.
-        calibrated_at: pose of the robot at the calibration, ``T_base_flange``, or that of any part
-            of the robot to which the camera is fixed.
+        calibration_pose: pose of the robot at the calibration, ``T_base_flange``, or that of any
+            part of the robot to which the camera is fixed.
         field: (N, 3), three points or more in the plane, in the robot's frame, metres: the touched
             ones. The plane must not move at these points.
         tolerance: largest distance that the plane may move out of itself at any point of the field,
@@ -65,7 +65,7 @@ class MovingCamera:
     def __init__(
         self,
         static: Solver,
-        calibrated_at: Transform,
+        calibration_pose: Transform,
         *,
         field: ArrayLike,
         tolerance: float = 2e-4,
@@ -77,7 +77,7 @@ class MovingCamera:
                 "moving camera: expected 3 points of the field or more", 3, len(points)
             )
         self._static = static
-        self._calibrated_at = calibrated_at
+        self._calibration_pose = calibration_pose
         self._tolerance = tolerance
         self._max_lag = timedelta(seconds=max_lag)
         self._centre: Array = points.mean(axis=0)
@@ -96,7 +96,7 @@ class MovingCamera:
         """Return the chain of solvers for an image that was taken at a pose.
 
         Args:
-            pose: the robot's pose at the image, in the same frames as ``calibrated_at``.
+            pose: the robot's pose at the image, in the same frames as ``calibration_pose``.
                 :meth:`~smartcam.calibration.PoseHistory.at` gives the pose at the time of an image
                 from those before and after it.
             image_at: time of the image. A localization's header has the time of its arrival, which
@@ -112,7 +112,7 @@ class MovingCamera:
         self._check_frames(pose)
         if image_at is not None:
             self._check_time(pose, image_at)
-        motion = pose.undated() @ self._calibrated_at.undated().inverse()
+        motion = pose.undated() @ self._calibration_pose.undated().inverse()
         self._check_plane(motion)
         chain = self._static if isinstance(self._static, Chain) else Chain([self._static])
         return Chain(
@@ -123,7 +123,7 @@ class MovingCamera:
         )
 
     def _check_frames(self, pose: Transform) -> None:
-        expected = self._calibrated_at
+        expected = self._calibration_pose
         if (pose.target, pose.source) != (expected.target, expected.source):
             raise Code.WRONG_FRAME.error_with_value(
                 f"moving camera: expected {expected.label}, as it was calibrated",

@@ -598,7 +598,7 @@ def _entry_mistakes(
     for key, load in (
         ("calibration", lambda: ros.load_calibration(folder)),
         ("hand_eye", lambda: ros.load_hand_eye(folder)),
-        ("calibrated_at", ros.robot_pose),
+        ("calibration_pose", ros.robot_pose),
     ):
         try:
             load()

@@ -74,10 +74,12 @@ class RosCamera(Fields):
     calibration: str | None = Field(
         None, description="file, beside this file, with the calibration to the robot's frame"
     )
-    calibrated_at: Annotated[tuple[float, ...], Field(min_length=7, max_length=7)] | None = Field(
-        None,
-        description="pose, at the calibration, of the part that carries the camera, in the robot's "
-        "frame: x, y, z in metres, and the quaternion x, y, z, w",
+    calibration_pose: Annotated[tuple[float, ...], Field(min_length=7, max_length=7)] | None = (
+        Field(
+            None,
+            description="pose, at the calibration, of the part that carries the camera, in the "
+            "robot's frame: x, y, z in metres, and the quaternion x, y, z, w",
+        )
     )
     hand_eye: str | None = Field(
         None,
@@ -110,16 +112,16 @@ class RosCamera(Fields):
         return HandEyeCalibration.load(folder / self.hand_eye)
 
     def robot_pose(self) -> Transform | None:
-        """Return the pose of ``calibrated_at``; None without it.
+        """Return the pose of ``calibration_pose``; None without it.
 
         Raises:
             CalibrationError: the numbers are not a pose.
         """
-        if self.calibrated_at is None:
+        if self.calibration_pose is None:
             return None
         from smartcam.geometry import Transform
 
-        position, quaternion = self.calibrated_at[:3], self.calibrated_at[3:]
+        position, quaternion = self.calibration_pose[:3], self.calibration_pose[3:]
         flange = self.flange_frame or "flange"
         return Transform.from_quaternion("robot", flange, position, quaternion)
 

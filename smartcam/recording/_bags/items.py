@@ -228,9 +228,9 @@ class _BagCamera:
         match event:
             case Connected() | Reconnected():
                 self.url = event.url
-                self.state = self.state._replace(connected=True, why="")
+                self.state = self.state._replace(connected=True, failure="")
             case Disconnected():
-                self.state = self.state._replace(connected=False, status=None, why=event.reason)
+                self.state = self.state._replace(connected=False, status=None, failure=event.reason)
             case StatusChanged():
                 self.state = self.state._replace(status=event.status)
             case ApplicationChanged():
@@ -242,7 +242,7 @@ class _BagCamera:
         """Yield the messages of the state for its topic and, if they changed, the diagnostics."""
         state = self.state
         # no reason: there was no session yet, which is no error
-        condition = health(state, session_alive=bool(state.why))
+        condition = health(state, session_alive=bool(state.failure))
         fields = {"header": header_fields(at, self.name), **status_fields(state)}
         yield BagMessage(self._status, nanoseconds(at), fields)
         health_contents = (

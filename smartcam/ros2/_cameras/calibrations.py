@@ -1,4 +1,4 @@
-"""Serve the thesis' five calibration services at a camera's node."""
+"""Serve, at a node, the five calibration services of the thesis with which smartcam began."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class CalibrationServices:
         self.thesis_calibration: ThesisCalibration | None = calibrations
 
     def camera(self, timeout: float) -> RosCalibrationCamera:
-        """Return the camera, for one call."""
+        """Return the camera for a call; ``timeout`` has no effect here."""
         return RosCalibrationCamera(self._camera)
 
     async def answer(self, name: str, message: Any) -> dict[str, Any]:

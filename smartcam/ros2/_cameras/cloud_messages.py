@@ -223,8 +223,8 @@ def _column(message: Any, field: Any, allowed_kinds: str) -> NDArray[Any]:
     name = _TYPES.get(field.datatype, "")
     if not name or name[0] not in allowed_kinds or field.count > 1:
         raise RosMessageError(
-            f"point cloud: {field.name}: expected one number of {'/'.join(allowed_kinds)}, got "
-            f"{field.count} of type {field.datatype}"
+            f"point cloud: {field.name}: expected one number a point, of numpy's kinds "
+            f"{'/'.join(allowed_kinds)}, got {field.count} of datatype {field.datatype}"
         )
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{name}")
     height, width, step, row = (message.height, message.width, message.point_step, message.row_step)
@@ -235,8 +235,9 @@ def _column(message: Any, field: Any, allowed_kinds: str) -> NDArray[Any]:
         return np.zeros((0, 0), dtype.newbyteorder("="))
     if field_end > step or row < step * (width - 1) + field_end or expected_bytes > len(data):
         raise RosMessageError(
-            f"point cloud {width}x{height}: expected {expected_bytes} bytes with {field.name} at "
-            f"{field.offset} of {step}, rows of {step * width}, got {len(data)}, rows of {row}"
+            f"point cloud {width}x{height}: expected {expected_bytes} bytes, rows of "
+            f"{step * width}, points of {step}, {field.name} at offset {field.offset}, "
+            f"got {len(data)} bytes, rows of {row}"
         )
     view = np.ndarray((height, width), dtype, data, field.offset, (row, step))
     return view if dtype.isnative else view.astype(dtype.newbyteorder("="))

@@ -37,11 +37,11 @@ class CameraControls:
 
     Args:
         node: node of ROS 2.
-        source: function that returns the open source of the frames.
+        get_source: function that returns the open source of the frames.
     """
 
-    def __init__(self, node: Any, source: Callable[[], Awaitable[FrameSource]]) -> None:
-        self._node, self._source = node, source
+    def __init__(self, node: Any, get_source: Callable[[], Awaitable[FrameSource]]) -> None:
+        self._node, self._get_source = node, get_source
         self._declared: list[str] = []
         self._features: dict[str, str] = {}  # feature by parameter
         self._refresh_task: asyncio.Task[None] | None = None
@@ -69,7 +69,7 @@ class CameraControls:
 
     async def _declare_all(self) -> None:
         try:
-            source = await self._source()
+            source = await self._get_source()
             driver: Any = source.driver
             if not hasattr(driver, "set_control"):
                 await self._declare_features(source)

@@ -1,4 +1,4 @@
-"""Publish the depth of two cameras: disparity, depth, a cloud, and the rectified lenses."""
+"""Publish the depth of two cameras: disparity, depth, a cloud, and their ``CameraInfo``."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class DepthTopics:
     is on ``/tf_static`` from the first pair on.
 
     Args:
-        stereo: function that returns a closed :class:`smartcam.depth.StereoDepth` each time that
-            a subscriber comes; or an open one, which the caller closes, and which always streams.
+        stereo: function that returns a new :class:`smartcam.depth.StereoDepth`, not open, when a
+            subscriber comes; or an open one, which the caller closes, and which always streams.
         node: open node of ROS.
         frame_id: frame id of the left camera after rectification; "": the node's name with
             ``_left_optical``.

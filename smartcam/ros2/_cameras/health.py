@@ -44,20 +44,20 @@ class KnownState(NamedTuple):
         connected: whether there is a session with the camera.
         status: status that the camera sent in this session; None if it sent none.
         application: the id of the active application; None if that is not known.
-        why: reason why there is no session; empty before the first attempt.
+        failure: reason why there is no session; empty before the first attempt.
     """
 
     name: str
     connected: bool = False
     status: Status | None = None
     application: int | None = None
-    why: str = ""
+    failure: str = ""
 
     @classmethod
     def of(cls, camera: Camera[Any]) -> KnownState:
         """Return the current state of a camera."""
         if not camera.connected:
-            return cls(camera.name, why=str(camera.trouble or ""))
+            return cls(camera.name, failure=str(camera.trouble or ""))
         try:
             status = camera.status
         except SmartCamError:
@@ -86,7 +86,7 @@ def health(known: KnownState, *, session_alive: bool = True) -> Health:
         session_alive: whether the program that has the session with the camera is alive.
     """
     if not known.connected:
-        text = known.why[:MAX_ERROR_CHARACTERS] or "there was no session yet"
+        text = known.failure[:MAX_ERROR_CHARACTERS] or "there was no session yet"
         return Health(ERROR if session_alive else STALE, text)
     status = known.bits
     bits = [bit for bit in TROUBLES if bit in status]
@@ -113,7 +113,7 @@ def status_fields(known: KnownState) -> dict[str, Any]:
         "ready": connected and Status.RUNNING in status and not is_unusable,
         "busy": Status.BUSY in status,
         "running": Status.RUNNING in status,
-        "application_id": max(0, application or 0),  # -1 if a camera does not report it
+        "application_id": max(0, application or 0),  # a camera that does not report it has -1
         "status": status.value,
         "status_names": list(status.names),
         "error": utf8(camera_health.text) if camera_health.errors or not connected else "",

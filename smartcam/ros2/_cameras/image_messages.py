@@ -94,8 +94,8 @@ def to_ros_format(frame: Frame) -> Frame:
     """Return the frame in a pixel format for which ROS has a name; blocks.
 
     A frame in such a format is returned unchanged. Samples that share bytes are unpacked to 16
-    bits. Y, U and V in planes, of full range, of BT.709 or BT.2020 become RGB8 or RGB16, since ROS
-    has no names for them. A JPEG, PNG or JPEG XL is decoded, then converted in the same way.
+    bits. Formats of Y, U and V that ROS has no names for (in planes, or of full range, or of BT.709
+    or BT.2020) become RGB8 or RGB16. A JPEG, PNG or JPEG XL is decoded first.
 
     Raises:
         FrameFormatError: the format cannot be converted, or the frame's bytes are wrong.
@@ -186,7 +186,7 @@ class Compression(NamedTuple):
 def choose_compression(frame: Frame) -> Compression:
     """Return the compression of a frame: PNG, without loss, for depth, JPEG for all others.
 
-    A JPEG has the highest 8 bits of a sample, and the colours of a Bayer pattern.
+    For JPEG, samples are cut to their highest 8 bits, and a Bayer pattern becomes colours.
 
     Raises:
         FrameFormatError: the frame is of H.264.

@@ -95,7 +95,7 @@ class CameraLifecycle(Lifecycle):
             self._closables.append(
                 self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler)
             )
-            await asyncio.sleep(0)  # a declaration takes the engine a while
+            await asyncio.sleep(0)  # let other tasks run: declaring takes Zenoh a while
 
     def _services(self) -> dict[str, tuple[str, Callable[[Any], Awaitable[Any]]]]:
         def handler_returning(

@@ -56,7 +56,7 @@ class ResultMessages:
         types: types of the messages, from the node that publishes them.
         camera: name of the camera, which is also the frame of poses without a calibration.
         frame_id: name of the camera's frame in ROS.
-        calibration: calibration of the camera's settings, which names the robot's frame.
+        calibration: calibration in the camera's settings, which names the robot's frame.
         robot_frame: name of the robot's frame in ROS; empty: the calibration's own.
 
     Attributes:
@@ -80,7 +80,7 @@ class ResultMessages:
             dict.fromkeys(robots, robot_frame) if robot_frame else {}
         )
         self._ros_frame_names[camera] = frame_id
-        cls = {
+        by_name = {
             name: types.message(name).cls
             for name in (
                 "builtin_interfaces/msg/Time",
@@ -102,7 +102,7 @@ class ResultMessages:
             )
         }
         self._classes: Any = type(
-            "Classes", (), {name.rpartition("/")[2]: class_ for name, class_ in cls.items()}
+            "Classes", (), {name.rpartition("/")[2]: each for name, each in by_name.items()}
         )
         self._no_covariance = np.zeros(36)
         self._no_covariance.flags.writeable = False
@@ -121,27 +121,27 @@ class ResultMessages:
                 f"{', '.join(sorted(frames))}"
             )
         return self._ros_frame_name(
-            frames.pop() if frames else self._empty_frame(result.application)
+            frames.pop() if frames else self._default_frame(result.application)
         )
 
     def _ros_frame_name(self, frame_id: str) -> str:
         return self._ros_frame_names.get(frame_id, frame_id)
 
-    def _empty_frame(self, application: int) -> str:
+    def _default_frame(self, application: int) -> str:
         """Return smartcam's name of the frame of a result without localizations."""
         calibration = calibration_of(self._calibration, application)
         return robot_frame_of(calibration) or self._camera
 
     def header(self, at: datetime, frame_id: str) -> Any:
         """Return a header."""
-        elapsed, cls = at - EPOCH, self._classes
-        time = cls.Time(elapsed.days * 86_400 + elapsed.seconds, elapsed.microseconds * 1000)
-        return cls.Header(time, frame_id)
+        elapsed, ros = at - EPOCH, self._classes
+        time = ros.Time(elapsed.days * 86_400 + elapsed.seconds, elapsed.microseconds * 1000)
+        return ros.Header(time, frame_id)
 
     def _pose(self, localization: Localization) -> Any:
         _, position, orientation = localization.pose
-        cls = self._classes
-        return cls.Pose(cls.Point(*position), cls.Quaternion(*orientation))
+        ros = self._classes
+        return ros.Pose(ros.Point(*position), ros.Quaternion(*orientation))
 
     def poses(self, result: Result, parts: Sequence[Localization]) -> Any:
         """Return the ``PoseArray`` of a result.
@@ -161,33 +161,33 @@ class ResultMessages:
         Raises:
             RosMessageError: the poses are in several frames.
         """
-        cls = self._classes
+        ros = self._classes
         header = self.header(result.received_at, self.frame_of(result))
-        no_size = cls.Vector3(0.0, 0.0, 0.0)
+        no_size = ros.Vector3(0.0, 0.0, 0.0)
         detections = list[Any]()
         for part in parts:
             pose = self._pose(part)
-            hypothesis = cls.ObjectHypothesisWithPose(
-                cls.ObjectHypothesis(part.feature_id, part.quality),
-                cls.PoseWithCovariance(pose, self._no_covariance),
+            hypothesis = ros.ObjectHypothesisWithPose(
+                ros.ObjectHypothesis(part.feature_id, part.quality),
+                ros.PoseWithCovariance(pose, self._no_covariance),
             )
             detections.append(
-                cls.Detection3D(header, [hypothesis], cls.BoundingBox3D(pose, no_size), "")
+                ros.Detection3D(header, [hypothesis], ros.BoundingBox3D(pose, no_size), "")
             )
-        return cls.Detection3DArray(header, detections)
+        return ros.Detection3DArray(header, detections)
 
     def localizations(self, parts: Sequence[Localization]) -> list[Any]:
-        """Return the thesis' ``Localization`` of each part."""
-        cls, messages = self._classes, list[Any]()
+        """Return the ``smartcam_msgs/msg/Localization`` of each part."""
+        ros, messages = self._classes, list[Any]()
         for part in parts:
             pose_header = part.pose.header
             header = self.header(pose_header.stamp, self._ros_frame_name(pose_header.frame_id))
-            pose = cls.PoseStamped(header, self._pose(part))
-            messages.append(cls.Localization(part.feature_id, part.quality, part.photo_index, pose))
+            pose = ros.PoseStamped(header, self._pose(part))
+            messages.append(ros.Localization(part.feature_id, part.quality, part.photo_index, pose))
         return messages
 
     def result(self, result: Result, parts: Sequence[Localization] | None) -> Any:
-        """Return the message of a result: the container's bytes and the value.
+        """Return the message of a result: the result's bytes and its value.
 
         Args:
             result: result to send.
@@ -207,7 +207,7 @@ class ResultMessages:
         return self._classes.Result(
             self.header(result.received_at, frame_id),
             self._camera,
-            max(result.application, 0),  # -1 if a camera does not report it
+            max(result.application, 0),  # a camera that does not report it has -1
             result.number,
             error,
             self.localizations(parts or ()),

@@ -61,7 +61,7 @@ PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
         camera_node.camera,
         camera_node.node,
         frame_id=camera_node.frames.optical,
-        camera_info_url=str(camera_node.options.frames.get("camera_info_url", "")),
+        camera_info_url=str(camera_node.options.video_parameters.get("camera_info_url", "")),
     ),
     lambda camera_node: camera_node.controls(),
     lambda camera_node: StaticTransforms(camera_node.node, camera_node.frames.transforms()),
@@ -134,18 +134,18 @@ class CameraNode(Server):
         return CameraFrames(
             self.frame_id,
             self.camera.settings.calibration,
-            place=options.place,
+            hand_eye=options.hand_eye,
             parent=options.parent_frame,
             flange=options.flange_frame,
-            calibrated_at=options.calibrated_at,
+            calibration_pose=options.calibration_pose,
         )
 
     def controls(self) -> CameraControls | None:
-        """Return the parameters of the frames' device; None if there are none."""
-        source = self.options.controls
-        if self.node.parameters is None or source is None:
+        """Return the parameters of the device that takes the pictures; None if there are none."""
+        get_frame_source = self.options.get_frame_source
+        if self.node.parameters is None or get_frame_source is None:
             return None
-        return CameraControls(self.node, source)
+        return CameraControls(self.node, get_frame_source)
 
     def rosout(self) -> RosOut | None:
         """Return the publisher of the camera's warnings on ``/rosout``; None in ROS 1."""
@@ -183,7 +183,7 @@ class CameraNode(Server):
                         started = part.start()
                         if inspect.isawaitable(started):
                             await started
-                        await asyncio.sleep(0)  # a declaration takes the engine a while
+                        await asyncio.sleep(0)  # let other tasks run: declaring takes Zenoh a while
                 self._stack = stack.pop_all()
 
     async def stop(self) -> None:

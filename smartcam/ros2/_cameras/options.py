@@ -27,8 +27,8 @@ class CameraNodeOptions:
         parent_frame: name of the robot's frame; empty: the name in a calibration.
         flange_frame: name of the frame of the part of the robot that carries the camera; empty: the
             name in a calibration.
-        place: hand-eye calibration, the camera's place; None without.
-        calibrated_at: pose of the part that carries the camera, in the robot's frame, when the
+        hand_eye: hand-eye calibration of the camera; None without.
+        calibration_pose: pose of the part that carries the camera, in the robot's frame, when the
             calibration of the camera's settings was made; None if the camera stands still.
         autostart: whether the life cycle goes to Active by itself.
         application: id of the application that configuring loads and runs; None: that of the
@@ -40,10 +40,10 @@ class CameraNodeOptions:
             the agent's, for a camera of a fleet.
         is_agent_alive: function that returns whether the agent with the session is alive; None if
             there is no agent.
-        frames: parameters for the source of its frames, by v4l2_camera's names:
+        video_parameters: parameters for the source of its pictures, by v4l2_camera's names:
             ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
-        controls: function that returns the open source of the frames, whose device's controls
-            become parameters; None: no controls.
+        get_frame_source: function that returns the open source of its pictures, whose device's
+            controls become parameters; None: no controls.
         calibrations: folder for calibrations of the camera, or calibrations that are shared with
             other interfaces of the camera; None: the services for them refuse.
     """
@@ -51,8 +51,8 @@ class CameraNodeOptions:
     frame_id: str = ""
     parent_frame: str = ""
     flange_frame: str = ""
-    place: HandEyeCalibration | None = None
-    calibrated_at: Transform | None = None
+    hand_eye: HandEyeCalibration | None = None
+    calibration_pose: Transform | None = None
     autostart: bool = True
     application: int | None = None
     diagnostics_period: float = 1.0
@@ -60,8 +60,8 @@ class CameraNodeOptions:
     hardware_id: str = ""
     settings: CameraSettings | None = None
     is_agent_alive: Callable[[], bool] | None = None
-    frames: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    controls: Callable[[], Awaitable[FrameSource]] | None = None
+    video_parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    get_frame_source: Callable[[], Awaitable[FrameSource]] | None = None
     calibrations: str | os.PathLike[str] | ThesisCalibration | None = None
 
     def __post_init__(self) -> None:

@@ -138,9 +138,9 @@ class CameraParameters:
             maximum=DIAGNOSTICS_PERIODS[1],
             on_set=self._status.set_period,
         )
-        for name, value in options.frames.items():
+        for name, value in options.video_parameters.items():
             self._declare(name, value, PICTURE_PARAMETERS.get(name, ""), read_only=True)
-        if options.frames:
+        if options.video_parameters:
             optical = CameraFrames(frame_id).optical
             self._declare("camera_frame_id", optical, "frame of pictures", read_only=True)
         self._stop_listening = self._status.listen(self._update_application)

@@ -34,7 +34,7 @@ class SubscribedPictures(Generic[Item]):
     Args:
         name: name of the camera, for the log.
         publishers: publishers of the topics.
-        read: function that opens a reader; the number is the timeout of each frame in seconds.
+        make_reader: function that makes a reader with this timeout of each frame, seconds.
         publish: coroutine function that publishes a frame; the next frame is read after it.
 
     Attributes:
@@ -45,12 +45,12 @@ class SubscribedPictures(Generic[Item]):
         self,
         name: str,
         publishers: Sequence[Any],
-        read: Callable[[float], AbstractAsyncContextManager[AsyncIterator[Item]]],
+        make_reader: Callable[[float], AbstractAsyncContextManager[AsyncIterator[Item]]],
         publish: Callable[[Item], Awaitable[None]],
     ) -> None:
         self.frames: int = 0
         self._name, self._publishers = name, publishers
-        self._read, self._publish = read, publish
+        self._make_reader, self._publish = make_reader, publish
         self._last_warning = ""
         self._subscriber_event = asyncio.Event()
         self._stop_watching: list[Callable[[], None]] = []
@@ -129,7 +129,7 @@ class SubscribedPictures(Generic[Item]):
     async def _publish_until_end(self) -> None:
         """Publish until there is no subscriber, or the source ends."""
         try:
-            async with self._read(CHECK_INTERVAL) as reader:
+            async with self._make_reader(CHECK_INTERVAL) as reader:
                 while self.has_subscriber:
                     with contextlib.suppress(FrameTimeoutError):
                         await self._publish_one(await anext(reader))
@@ -159,7 +159,7 @@ class SubscribedPictures(Generic[Item]):
 
 
 async def publish_newest(publisher: Any, fields: dict[str, Any]) -> None:
-    """Publish the newest message; a node of ROS 1 has its own queue for that."""
+    """Publish a message that must not queue up; ROS 1's publishers can only queue it."""
     newest = getattr(publisher, "publish_newest", None)
     if newest is None:
         publisher.publish(fields)

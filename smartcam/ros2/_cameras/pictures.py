@@ -94,7 +94,7 @@ class CameraPictures:
         if has_frames is not None:
             return bool(has_frames)
         try:
-            self._read(1.0)
+            self._make_reader(1.0)
         except UnsupportedError:
             return False
         return True
@@ -117,11 +117,11 @@ class CameraPictures:
             self._image, self._info, self._compressed = image, info, compressed
             name = node.full_name
             self._streams = [
-                SubscribedPictures(name, (image, info), self._read, self._publish_raw),
+                SubscribedPictures(name, (image, info), self._make_reader, self._publish_raw),
                 SubscribedPictures(
                     name,
                     (compressed,),
-                    partial(self._read, encoding="jpeg"),
+                    partial(self._make_reader, encoding="jpeg"),
                     self._publish_compressed,
                 ),
             ]
@@ -159,7 +159,7 @@ class CameraPictures:
 
     # ------------------------------------------------------------------ frames
 
-    def _read(
+    def _make_reader(
         self, timeout: float, encoding: Any = "raw"
     ) -> AbstractAsyncContextManager[FrameReader]:
         if self._frames is not None:
@@ -209,7 +209,7 @@ class CameraPictures:
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:
-        """Publish the lens of a picture, unless it was published for the same stamp."""
+        """Publish the ``CameraInfo`` of a picture, unless it was published for the same stamp."""
         if frame.utc in self._stamps:
             return
         self._stamps.append(frame.utc)

@@ -25,20 +25,20 @@ def interpretation_of(camera: Camera[Any]) -> Interpretation:
 
 
 def address_of(camera: Camera[Any]) -> Address:
-    """Return the address of the camera itself, also of one that an agent of a fleet has."""
+    """Return the address of the camera itself, even if an agent of a fleet is connected to it."""
     return camera._camera_address  # noqa: SLF001 - smartcam's own
 
 
-def calibrations_by_application(argument: Any) -> dict[int | None, Any]:
-    """Return the calibrations of a camera's settings by application; key None is for all others."""
-    if hasattr(argument, "items") and not hasattr(argument, "to_robot"):
-        return {number: value for number, value in argument.items() if value is not None}
-    return {} if argument is None else {None: argument}
+def calibrations_by_application(setting: Any) -> dict[int | None, Any]:
+    """Return the calibrations of the setting ``calibration``; None is the key for all others."""
+    if hasattr(setting, "items") and not hasattr(setting, "to_robot"):
+        return {number: value for number, value in setting.items() if value is not None}
+    return {} if setting is None else {None: setting}
 
 
-def calibration_of(argument: Any, application: int) -> Any:
-    """Return the calibration of an application in a camera's settings; None without one."""
-    calibrations = calibrations_by_application(argument)
+def calibration_of(setting: Any, application: int) -> Any:
+    """Return an application's calibration of the setting ``calibration``; None without one."""
+    calibrations = calibrations_by_application(setting)
     return calibrations.get(application, calibrations.get(None))
 
 
@@ -69,6 +69,6 @@ def localizations_in_metres(
     reader = camera_interpreter(camera, result.application) if spec is None else resolve(spec)
     if has_pixel_positions(reader):
         return None
-    # an empty list of an interpreter without poses is a list of texts, or of records
+    # an empty list may be one of texts or records, from an interpreter without poses
     is_other_list = not parts and reader is not None and name_if_poseless(reader) is not None
     return None if is_other_list else parts

@@ -37,7 +37,7 @@ MAX_WAITING_RESULTS: Final = 4096
 
 
 class CameraResults:
-    """Publishes the results of a camera, of any program's triggers.
+    """Publishes all results of a camera, whichever program triggered them.
 
     A header's stamp is the time of the result's arrival, by the clock of the machine that has the
     session (for a camera of a fleet: its agent's); no protocol of these cameras has the time of the
@@ -73,7 +73,7 @@ class CameraResults:
             node.types, camera.name, frame_id or camera.name, calibration, robot_frame
         )
         self._publishers: dict[str, Any] = {}
-        self._outlet: _SubscriberOutlet | None = None
+        self._delayed: _DelayedTopic | None = None
         self._stream: Subscription[Result] | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -84,16 +84,16 @@ class CameraResults:
 
     @property
     def dropped(self) -> int:
-        """Number of results that were dropped, because they came too fast or by a delay."""
+        """Number of results dropped since they came too fast to publish, or for ``min_delay``."""
         dropped_by_stream = 0 if self._stream is None else self._stream.statistics().dropped
-        return dropped_by_stream + (0 if self._outlet is None else self._outlet.dropped)
+        return dropped_by_stream + (0 if self._delayed is None else self._delayed.dropped)
 
     @property
     def has_subscribers(self) -> bool:
         """True if one of the topics has a subscriber."""
-        outlet = () if self._outlet is None else (self._outlet,)
+        delayed = () if self._delayed is None else (self._delayed,)
         return any(
-            _has_subscribers(publisher) for publisher in (*self._publishers.values(), *outlet)
+            _has_subscribers(publisher) for publisher in (*self._publishers.values(), *delayed)
         )
 
     def start(self) -> None:
@@ -121,7 +121,7 @@ class CameraResults:
         except ConfigurationError as exc:
             if type_name != DETECTIONS:
                 raise
-            # ROS 1 does the same
+            # vision_msgs may not be installed: go on without this topic
             logger.info("%s: without %s: %s", self._node.full_name, name, exc)
 
     async def close(self) -> None:
@@ -164,19 +164,19 @@ class CameraResults:
             raise ConfigurationError(
                 f"{self._camera.name}: queue_size {queue_size}: expected 1 to {MAX_QUEUED_RESULTS}"
             )
-        old_outlet, self._outlet = self._outlet, None
-        if old_outlet is not None and old_outlet.topic == topic:
-            self._outlet = old_outlet.with_limits(min_delay, queue_size)
+        old_topic, self._delayed = self._delayed, None
+        if old_topic is not None and old_topic.topic == topic:
+            self._delayed = old_topic.with_limits(min_delay, queue_size)
             return
         try:
             if topic:
                 publisher = self._make_publisher(topic, queue_size)
-                self._outlet = _SubscriberOutlet(topic, publisher, min_delay, queue_size)
+                self._delayed = _DelayedTopic(topic, publisher, min_delay, queue_size)
         except BaseException:
-            self._outlet = old_outlet
+            self._delayed = old_topic
             raise
-        if old_outlet is not None:
-            old_outlet.close()
+        if old_topic is not None:
+            old_topic.close()
 
     def _make_publisher(self, topic: str, depth: int) -> Any:
         publisher = self._node.publisher(topic, RESULT, qos=QoS(depth=depth))
@@ -224,14 +224,14 @@ class CameraResults:
         self.taken += 1
         self.failed += 1
         level = logging.DEBUG if self.failed > 1 else logging.WARNING
-        logger.log(level, "%s ! a result has no poses: %s", self._camera.name, error)
+        logger.log(level, "%s ! a result could not be interpreted: %s", self._camera.name, error)
         message = self._messages.failed(error, datetime.now(UTC))
         self._publish_result(_LazyMessage(0, lambda: message, 0))
 
     def _publish_result(self, message: _LazyMessage) -> None:
         self._publish_to("results", message.make)
-        if self._outlet is not None:
-            self._outlet.offer(message, self._publish_message)
+        if self._delayed is not None:
+            self._delayed.offer(message, self._publish_message)
 
     def _publish_to(self, name: str, make: Any) -> None:
         publisher = self._publishers.get(name)
@@ -271,7 +271,7 @@ class _LazyMessage(NamedTuple):
     size: int
 
 
-class _SubscriberOutlet:
+class _DelayedTopic:
     """A topic with a least delay between two messages, and a queue of waiting messages.
 
     Attributes:
@@ -315,12 +315,12 @@ class _SubscriberOutlet:
         self._timer = None
         self._publish_waiting(publish)
 
-    def with_limits(self, min_delay: float, queue_size: int) -> _SubscriberOutlet:
-        """Return an outlet for the same publisher with other limits; drop waiting results."""
+    def with_limits(self, min_delay: float, queue_size: int) -> _DelayedTopic:
+        """Return a topic of the same publisher with other limits; drop waiting results."""
         self._drop_waiting()
-        outlet = _SubscriberOutlet(self.topic, self._publisher, min_delay, queue_size)
-        outlet.dropped = self.dropped
-        return outlet
+        delayed = _DelayedTopic(self.topic, self._publisher, min_delay, queue_size)
+        delayed.dropped = self.dropped
+        return delayed
 
     def _drop_waiting(self) -> None:
         self.dropped += len(self._queue)

@@ -140,7 +140,7 @@ class CameraGraph:
         return COMPRESSED if topic.endswith("/compressed") else IMAGE
 
     def _missing_error(self, topic: str, type_name: str, times: list[float]) -> Exception:
-        earlier = f"; {len(times)} came that were taken before" if times else ""
+        earlier = f"; {len(times)} came with an earlier stamp, or another clock's" if times else ""
         return Code.NO_PICTURE.error(
             f"{topic}: no picture came within {PICTURE_TIMEOUT:g} s{earlier}; expected {type_name} "
             "with the time of its exposure, from a camera that is running",

@@ -1,4 +1,4 @@
-"""The services of a camera's node: the thesis' eleven, services of std_srvs, and a typed trigger.
+"""The services of a camera's node: eleven of the thesis with which smartcam began, and others.
 
 A call that fails gets a reply with the error, since all these replies have a field for it.
 """
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._inside import ThesisCalibration
     from smartcam.camera import Camera
     from smartcam.ros2._cameras.results import CameraResults
-    from smartcam.ros2._cameras.thesis import ManagedCamera
+    from smartcam.ros2._cameras.thesis import ThesisLifecycle
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
@@ -59,7 +59,7 @@ class CameraServices:
         camera: Camera[Any],
         node: Any,
         results: CameraResults,
-        lifecycle: ManagedCamera,
+        lifecycle: ThesisLifecycle,
         calibrations: ThesisCalibration | None = None,
     ) -> None:
         self._camera, self._node, self._results = camera, node, results
@@ -96,8 +96,8 @@ class CameraServices:
                 self._serve(
                     name, f"std_srvs/srv/{type_name}", self._with_success_field(answer_text)
                 )
-            typed_value = self._with_error_field(self._trigger_results)
-            self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", typed_value)
+            trigger_results = self._with_error_field(self._trigger_results)
+            self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", trigger_results)
         except BaseException:
             self._withdraw()
             raise

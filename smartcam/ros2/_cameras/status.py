@@ -46,7 +46,7 @@ WARNING_COUNTERS: Mapping[str, str] = {
     "uninterpretable": "results do not fit their layout",
     "wrong_application": "results came from another application than expected",
     "overtriggers": "triggers were dropped: they come too fast",
-    "late": "results came after their triggers had given up",
+    "late": "results came after the wait for them had ended",
 }
 """Warning for each counter that has risen since the last diagnostics."""
 
@@ -95,7 +95,7 @@ class CameraStatus:
         self._events = self._camera.events(max_queue=MAX_WAITING_EVENTS)
         if self._camera.connected:
             self._connected_at = datetime.now(UTC)
-        self._call_logging_errors(self._publish_if_new)
+        self._call_and_log_errors(self._publish_if_new)
         loop = asyncio.get_running_loop()
         self._tasks = [
             loop.create_task(self._publish_changes()),
@@ -125,7 +125,7 @@ class CameraStatus:
         self.period = seconds
         self._period_changed.set()
 
-    def _call_logging_errors(self, publish: Callable[[], None]) -> None:
+    def _call_and_log_errors(self, publish: Callable[[], None]) -> None:
         """Call a function that publishes; log its errors."""
         try:
             publish()
@@ -148,9 +148,9 @@ class CameraStatus:
             async for event in self._events:
                 self._note_event(event)
                 await asyncio.sleep(self._next_status_at - loop.time())
-                self._call_logging_errors(self._publish_if_new)
+                self._call_and_log_errors(self._publish_if_new)
         await asyncio.sleep(self._next_status_at - loop.time())
-        self._call_logging_errors(self._publish_if_new)
+        self._call_and_log_errors(self._publish_if_new)
 
     def _note_event(self, event: object) -> None:
         if isinstance(event, (Connected, Reconnected)):
@@ -166,7 +166,7 @@ class CameraStatus:
         self._status.publish({"header": self._header(), **fields})
         self._published = fields
         for on_change in tuple(self._listeners):
-            self._call_logging_errors(on_change)
+            self._call_and_log_errors(on_change)
 
     # ------------------------------------------------------------------ diagnostics
 
@@ -176,10 +176,10 @@ class CameraStatus:
         next_at = loop.time()
         while True:
             if getattr(self._diagnostics, "has_subscribers", True):
-                self._call_logging_errors(self._publish_diagnosis)
+                self._call_and_log_errors(self._publish_diagnosis)
             if loop.time() >= self._next_status_at:
-                # the reason why there is no session changes without an event
-                self._call_logging_errors(self._publish_if_new)
+                # without a session, the reason for that changes without an event
+                self._call_and_log_errors(self._publish_if_new)
             delay = max(0.0, loop.time() - next_at)
             next_at += self.period * (1 + delay // self.period)
             with contextlib.suppress(TimeoutError):
@@ -220,7 +220,7 @@ class CameraStatus:
         return options.hardware_id or hardware_id(address or address_of(self._camera))
 
     def _is_session_alive(self, statistics: Statistics) -> bool:
-        """Return True if the program with the session is alive, or has tried to connect."""
+        """Return True if the agent is alive; without an agent: if a connection was tried."""
         if self._options.is_agent_alive is not None:
             return self._options.is_agent_alive()
         return bool(statistics.sessions or statistics.last_error)

@@ -1,4 +1,4 @@
-"""Serve the thesis' six services at a camera's node.
+"""Serve, at a camera's node, the six services of the thesis with which smartcam began.
 
 In the thesis one node had many cameras, and ``camera_name`` chose one. Here each camera has its own
 node, so the field may be empty; another camera's name is an error, since the request is meant for
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.settings import Address
 
 
-class ManagedCamera(Protocol):
+class ThesisLifecycle(Protocol):
     """The life cycle that the thesis' services use."""
 
     @property
@@ -58,7 +58,7 @@ class RosThesisCamera:
     """
 
     def __init__(
-        self, camera: Camera[Any], node: Any, results: CameraResults, lifecycle: ManagedCamera
+        self, camera: Camera[Any], node: Any, results: CameraResults, lifecycle: ThesisLifecycle
     ) -> None:
         self._camera, self._results, self._lifecycle = camera, results, lifecycle
         self._status = CameraStatusTopic(camera, node, results.messages)

@@ -1,7 +1,7 @@
 """Receive ``/tf`` and ``/tf_static`` while programs ask for poses of frames, within bounds.
 
-Poses are never extrapolated. A present pose is refused if the newest transform on the way is old: a
-robot whose driver has died keeps its last pose in TF.
+Poses are not extrapolated, except to 0.25 s before the first transform. A present pose is refused
+if the newest transform on the way is old: a robot whose driver has died keeps its last pose in TF.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class _FrameLink:
 
 
 class TransformListener:
-    """Receives transforms of a node's graph from the first request for a pose on.
+    """Receives TF's transforms at a node, beginning with the first request for a pose.
 
     Args:
         node: open node of ROS.

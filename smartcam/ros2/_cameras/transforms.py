@@ -35,12 +35,12 @@ class CameraFrames:
         frame_id: name of the camera's frame, the frame of its results without a calibration.
         calibration: calibration of the camera's settings, or one for each application; None
             without.
-        place: hand-eye calibration of the camera; None without.
+        hand_eye: hand-eye calibration of the camera; None without.
         parent: name of the robot's frame; empty: the name in a calibration.
         flange: name of the frame of the part of the robot that carries the camera; empty: the name
             in a calibration.
-        calibrated_at: pose of that part in the robot's frame when ``calibration`` was made; None if
-            the camera stands still.
+        calibration_pose: pose of that part in the robot's frame when ``calibration`` was made; None
+            if the camera stands still.
 
     Attributes:
         optical: name of the frame of the camera's pictures, z ahead and y down.
@@ -52,16 +52,16 @@ class CameraFrames:
         frame_id: str,
         calibration: Any = None,
         *,
-        place: Any = None,
+        hand_eye: Any = None,
         parent: str = "",
         flange: str = "",
-        calibrated_at: Transform | None = None,
+        calibration_pose: Transform | None = None,
     ) -> None:
         self._frame_id, self._parent, self._flange = frame_id, parent, flange
         self._calibrations = calibrations_by_application(calibration)
-        self._place, self._calibrated_at = place, calibrated_at
+        self._hand_eye, self._calibration_pose = hand_eye, calibration_pose
         self.optical: str = f"{frame_id.removesuffix('_optical')}_optical"
-        self.robot: str = parent if calibrated_at is None else f"{frame_id}_robot"
+        self.robot: str = parent if calibration_pose is None else f"{frame_id}_robot"
 
     def transforms(self) -> list[Transform]:
         """Return the transforms from the calibrations.
@@ -80,9 +80,9 @@ class CameraFrames:
 
         With calibrations for several applications, each child's name ends with ``_APPLICATION``.
         """
-        transforms = [] if self._place is None else [self._picture_transform(self._place)]
-        if self._calibrated_at is not None:
-            base_in_flange = self._calibrated_at.inverse()
+        transforms = [] if self._hand_eye is None else [self._picture_transform(self._hand_eye)]
+        if self._calibration_pose is not None:
+            base_in_flange = self._calibration_pose.inverse()
             return [
                 *transforms,
                 _with_frame_names(
@@ -94,9 +94,9 @@ class CameraFrames:
             transforms += self._plane_transforms(calibration, suffix)
         return transforms
 
-    def _picture_transform(self, place: Any) -> Transform:
-        pose: Transform = place.camera_pose
-        frame = self._flange if place.setup == "eye-in-hand" else self._parent
+    def _picture_transform(self, hand_eye: Any) -> Transform:
+        pose: Transform = hand_eye.camera_pose
+        frame = self._flange if hand_eye.setup == "eye-in-hand" else self._parent
         return _with_frame_names(pose, frame or pose.target, self.optical)
 
     def _plane_transforms(self, calibration: Any, suffix: str) -> list[Transform]:

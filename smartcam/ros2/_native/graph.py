@@ -36,4 +36,4 @@ class NativeGraph:
         return {name: sorted(types) for name, types in self._call("get_service_names_and_types")}
 
     def _call(self, method: str) -> Any:
-        return self._node.create(lambda ros: getattr(ros, method)())
+        return self._node.call_rclpy(lambda rclpy_node: getattr(rclpy_node, method)())

@@ -99,6 +99,6 @@ EMPTY_FIELD = "structure_needs_at_least_one_member"
 """The field that ROS puts into a message without fields."""
 
 
-def to_ros(message_type: MessageType, value: Any, cls: Any) -> Any:
+def to_ros(message_type: MessageType, value: Any, rclpy_type: Any) -> Any:
     """Return a message of rclpy for one of smartcam's, or for a mapping of its fields."""
-    return rclpy("serialization").deserialize_message(message_type.encode(value), cls)
+    return rclpy("serialization").deserialize_message(message_type.encode(value), rclpy_type)

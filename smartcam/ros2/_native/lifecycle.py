@@ -36,19 +36,18 @@ class NativeLifecycle:
         handler: coroutine function that answers ``change_state``.
 
     Raises:
-        RosError: rclpy's node has its life cycle in another attribute.
+        RosError: rclpy's node keeps its state machine in other attributes.
     """
 
     def __init__(
         self, node: NativeNode, lifecycle: Lifecycle, handler: Callable[[Any], Awaitable[Any]]
     ) -> None:
-        ros = node.ros
-        self._machine: Any = getattr(ros, "_state_machine", None)
-        service: Any = getattr(ros, "_service_change_state", None)
+        self._machine: Any = getattr(node.rclpy_node, "_state_machine", None)
+        service: Any = getattr(node.rclpy_node, "_service_change_state", None)
         if self._machine is None or service is None:
             raise RosError(
-                f"{node.full_name}: this rclpy has its life cycle in another place: expected that "
-                "of Humble to Kilted; without rclpy smartcam has one of its own"
+                f"{node.full_name}: this rclpy keeps its state machine in other attributes than "
+                "Humble to Kilted; run without rclpy to use smartcam's own life cycle"
             )
         self._name = node.full_name
         service_type = node.types.service(CHANGE_STATE)

@@ -53,7 +53,7 @@ class NativeNode(NamedNode):
         namespace: namespace of the node, such as ``/line1``.
         context: context shared with other nodes of this process; None for its own.
         domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``.
-        managed: whether the node has a life cycle, which :meth:`manage` then has to follow.
+        managed: whether the node has a life cycle; if so, call :meth:`manage` once it is open.
 
     Attributes:
         parameters: parameters of the node.
@@ -101,9 +101,9 @@ class NativeNode(NamedNode):
         return self._spun_node is not None
 
     @property
-    def ros(self) -> Any:
+    def rclpy_node(self) -> Any:
         """The node of rclpy."""
-        return None if self._spun_node is None else self._spun_node.ros
+        return None if self._spun_node is None else self._spun_node.rclpy_node
 
     @property
     def executor(self) -> Any:
@@ -141,8 +141,9 @@ class NativeNode(NamedNode):
         self._spun_node = spun
         self.outbox = MessageThread(f"smartcam-rclpy-outbox {self.full_name}")
         self.concurrent_group = rclpy("callback_groups").ReentrantCallbackGroup()
-        self._clock = spun.ros.get_clock()
-        self.name, self.namespace = spun.ros.get_name(), spun.ros.get_namespace()  # remapped
+        made = spun.rclpy_node
+        self._clock = made.get_clock()
+        self.name, self.namespace = made.get_name(), made.get_namespace()  # remapped
         try:
             self.parameters.open()
         except BaseException:
@@ -174,7 +175,7 @@ class NativeNode(NamedNode):
                     await service.wait_closed()
                 await asyncio.to_thread(self.outbox.close, CLOSE_TIMEOUT / 2)
         except TimeoutError:
-            pass  # the handler's author must end it at cancellation
+            pass  # a handler did not end when it was cancelled
         finally:
             self._spun_node = None
             spun.stop()
@@ -222,23 +223,23 @@ class NativeNode(NamedNode):
         if self._spun_node is not None:
             self._spun_node.wake()
 
-    def create(self, make: Callable[[Any], Any]) -> Any:
-        """Return an endpoint created by rclpy.
+    def call_rclpy(self, call: Callable[[Any], Any]) -> Any:
+        """Call a function with rclpy's node, and return what it returns.
 
         Raises:
-            RosError: rclpy cannot create the endpoint.
+            RosError: the call failed.
         """
         self.check_open()
         try:
-            return make(self.ros)
+            return call(self.rclpy_node)
         except Exception as exc:
             raise RosError(f"{self.full_name}: {type(exc).__name__}: {exc!s:.300}") from exc
 
     def destroy(self, kind: str, endpoint: Any) -> None:
         """Destroy an endpoint of rclpy."""
-        ros = self.ros
-        if ros is not None:
-            getattr(ros, f"destroy_{kind}")(endpoint)
+        rclpy_node = self.rclpy_node
+        if rclpy_node is not None:
+            getattr(rclpy_node, f"destroy_{kind}")(endpoint)
 
     def forget(self, endpoint: Any) -> None:
         """Forget a closed endpoint."""
@@ -259,14 +260,13 @@ class NativeNode(NamedNode):
             qos: quality of service.
 
         Raises:
-            ConfigurationError: the topic is not valid, or the type is not known or has other
-                fields.
+            ConfigurationError: the topic is not valid, or the type is unknown or differs in ROS.
             RosError: the node is not open.
         """
         message_type, name = self.types.message(type), self._resolve_name(topic, "topic")
-        cls = checked_message_class(message_type)
-        self._note_missing(cls, type, name)
-        return self._register(NativePublisher(self, name, message_type, qos, cls))
+        rclpy_type = checked_message_class(message_type)
+        self._note_missing(rclpy_type, type, name)
+        return self._register(NativePublisher(self, name, message_type, qos, rclpy_type))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativeSubscription:
         """Subscribe to a topic; read it by ``async for``.
@@ -281,8 +281,8 @@ class NativeNode(NamedNode):
             RosError: the node is not open.
         """
         message_type, name = self.types.message(type), self._resolve_name(topic, "topic")
-        cls = self._require_built(checked_message_class(message_type), type)
-        return self._register(NativeSubscription(self, name, message_type, qos, cls))
+        rclpy_type = self._require_built(checked_message_class(message_type), type)
+        return self._register(NativeSubscription(self, name, message_type, qos, rclpy_type))
 
     def serve(
         self,
@@ -300,18 +300,18 @@ class NativeNode(NamedNode):
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields.
-            qos: quality of service; ROS' own for services is used.
+            qos: is ignored; ROS' own quality of service for services is used.
             timeout: seconds of the handler's timeout.
 
         Raises:
-            ConfigurationError: the name is not valid, or the type is not known or has other fields.
+            ConfigurationError: the name is not valid, or the type is unknown or differs in ROS.
             RosError: the node is not open.
         """
         del qos
         service_type, name = self.types.service(type), self._resolve_name(service, "service")
-        cls = checked_service_class(service_type)
-        self._note_missing(cls, type, name)
-        return self._register(NativeService(self, name, service_type, cls, handler, timeout))
+        rclpy_type = checked_service_class(service_type)
+        self._note_missing(rclpy_type, type, name)
+        return self._register(NativeService(self, name, service_type, rclpy_type, handler, timeout))
 
     def client(self, service: str, type: str, *, qos: QoS = SERVICES) -> NativeClient:
         """Return a client that calls a service.
@@ -319,7 +319,7 @@ class NativeNode(NamedNode):
         Args:
             service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
-            qos: quality of service; ROS' own for services is used.
+            qos: is ignored; ROS' own quality of service for services is used.
 
         Raises:
             ConfigurationError: the name is not valid, or the type is not built for this ROS.
@@ -353,16 +353,16 @@ class NativeNode(NamedNode):
 
     # ------------------------------------------------------------------ types that are not built
 
-    def _require_built(self, cls: Any, type: str) -> Any:
-        if cls is None:
+    def _require_built(self, rclpy_type: Any, type: str) -> Any:
+        if rclpy_type is None:
             raise ConfigurationError(
                 f"{type}: its package is not built for the ROS that is installed"
                 f"{how_to_build(type)}"
             )
-        return cls
+        return rclpy_type
 
-    def _note_missing(self, cls: Any, type: str, name: str) -> None:
-        if cls is not None:
+    def _note_missing(self, rclpy_type: Any, type: str, name: str) -> None:
+        if rclpy_type is not None:
             return
         self._missing.setdefault(type.partition("/")[0], []).append(name)
         if self._missing_timer is None:

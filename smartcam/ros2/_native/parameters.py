@@ -46,37 +46,37 @@ class NativeParameters(RosParameters):
         super().__init__(node, served=False)
         self.undeclare(SIM_TIME)
         self._native = node
-        self._ros: Any = None
+        self._rclpy_node: Any = None
         self._own_change = threading.local()  # set while this object sets a value in rclpy
 
     def open(self) -> None:
         """Declare the parameters in ROS."""
-        self._ros = self._native.ros
-        self._ros.add_on_set_parameters_callback(self._on_set)
+        self._rclpy_node = self._native.rclpy_node
+        self._rclpy_node.add_on_set_parameters_callback(self._on_set)
         for name in self.names():
             self._declare_in_ros(name)
 
     async def close(self) -> None:
         """Cancel running sets; the declarations stay."""
-        self._ros = None
+        self._rclpy_node = None
         await super().close()
 
     # ------------------------------------------------------------------ changes here, told to ROS
 
     def _notify(self, **changes: Any) -> None:
         """Add, change or delete parameters in ROS."""
-        if getattr(self, "_ros", None) is None:
+        if getattr(self, "_rclpy_node", None) is None:
             return
         for name in changes.get("new", ()):
             self._declare_in_ros(name)
         changed = changes.get("changed", ())
         if changed and not _asked_by_ros.get():
             self._change_in_ros(
-                lambda: self._ros.set_parameters([self._rclpy_parameter(name) for name in changed])
+                lambda: self._rclpy_node.set_parameters(list(map(self._rclpy_parameter, changed)))
             )
         for name in changes.get("deleted", ()):
-            if not self._ros.describe_parameter(name).read_only:  # rclpy keeps read-only ones
-                self._change_in_ros(lambda name=name: self._ros.undeclare_parameter(name))
+            if not self._rclpy_node.describe_parameter(name).read_only:  # rclpy keeps those
+                self._change_in_ros(lambda name=name: self._rclpy_node.undeclare_parameter(name))
 
     def _change_in_ros(self, change: Any) -> Any:
         self._own_change.now = True
@@ -94,7 +94,7 @@ class NativeParameters(RosParameters):
         parameter = self._rclpy_parameter(name)
         self._own_change.now = True
         try:
-            declared = self._ros.declare_parameter(
+            declared = self._rclpy_node.declare_parameter(
                 name, parameter.value, descriptor, ignore_override=description.read_only
             )
         except Exception as exc:
@@ -128,7 +128,7 @@ class NativeParameters(RosParameters):
             plain = [bytes([byte]) for byte in plain]
         parameter_class = rclpy("parameter").Parameter
         plain = list(plain) if isinstance(plain, tuple) else plain
-        return parameter_class(name, parameter_class.Type(value.number), plain)
+        return parameter_class(name, parameter_class.Type(value.type_number), plain)
 
     # ------------------------------------------------------------------ changes by other nodes
 
@@ -162,7 +162,7 @@ class NativeParameters(RosParameters):
 
         async def set_values() -> None:
             task = asyncio.current_task()
-            if self._ros is None or task is None:
+            if self._rclpy_node is None or task is None:
                 raise RosError(f"{self._native.full_name} is closed")
             self._tasks.add(task)  # close() cancels it
             task.add_done_callback(self._on_task_done)

@@ -37,7 +37,7 @@ class ServiceCalls:
         node: node of the service.
         name: name of the service.
         service_type: type of the service.
-        cls: rclpy's class of the type.
+        rclpy_type: rclpy's class of the type.
         handler: coroutine function that takes each request and returns the response.
         timeout: seconds of the handler's timeout.
 
@@ -51,13 +51,14 @@ class ServiceCalls:
         node: NativeNode,
         name: str,
         service_type: ServiceType,
-        cls: Any,
+        rclpy_type: Any,
         handler: Callable[[Any], Awaitable[Any]],
         timeout: float,
     ) -> None:
         self.calls: int = 0
         self.failed: int = 0
-        self._node, self._name, self._service_type, self._cls = node, name, service_type, cls
+        self._node, self._name = node, name
+        self._service_type, self._rclpy_type = service_type, rclpy_type
         self._handler, self._timeout = handler, timeout
         self._serialize = rclpy("serialization").serialize_message
         self._future = rclpy("task").Future
@@ -71,7 +72,7 @@ class ServiceCalls:
             self._running_count += not is_full
         if is_full:
             return self._reply(
-                self._encode_refusal(f"{MAX_CONCURRENT_CALLS} calls are running, which is the most")
+                self._encode_refusal(f"{MAX_CONCURRENT_CALLS} calls are running, the maximum")
             )
         try:
             reply_future = self._future(executor=self._node.executor)
@@ -87,7 +88,7 @@ class ServiceCalls:
     def _reply(self, data: bytes | None) -> Any:
         if data is None:
             raise NoReplyError
-        return rclpy("serialization").deserialize_message(data, self._cls.Response)
+        return rclpy("serialization").deserialize_message(data, self._rclpy_type.Response)
 
     def _start_call(self, data: bytes, reply_future: Any) -> None:
         self.calls += 1
@@ -162,20 +163,20 @@ class NativeService:
         node: NativeNode,
         name: str,
         service_type: ServiceType,
-        cls: Any,
+        rclpy_type: Any,
         handler: Callable[[Any], Awaitable[Any]],
         timeout: float,
     ) -> None:
         self.name: str = name
         self.type: ServiceType = service_type
         self._node, self._closed, self._ros_object = node, False, None
-        self._calls = ServiceCalls(node, name, service_type, cls, handler, timeout)
-        if cls is not None:
+        self._calls = ServiceCalls(node, name, service_type, rclpy_type, handler, timeout)
+        if rclpy_type is not None:
             group = node.concurrent_group
             callback = self._calls.on_request
-            self._ros_object = node.create(
-                lambda ros: ros.create_service(
-                    cls,
+            self._ros_object = node.call_rclpy(
+                lambda rclpy_node: rclpy_node.create_service(
+                    rclpy_type,
                     name,
                     callback,
                     qos_profile=rclpy_profile(CALL_QUEUE_QOS),
@@ -206,14 +207,16 @@ class NativeClient:
         type: type of requests and replies.
     """
 
-    def __init__(self, node: NativeNode, name: str, service_type: ServiceType, cls: Any) -> None:
+    def __init__(
+        self, node: NativeNode, name: str, service_type: ServiceType, rclpy_type: Any
+    ) -> None:
         self.name: str = name
         self.type: ServiceType = service_type
-        self._node, self._cls, self._closed = node, cls, False
+        self._node, self._rclpy_type, self._closed = node, rclpy_type, False
         self._replies: set[asyncio.Future[Any]] = set()
-        self._ros_object = node.create(
-            lambda ros: ros.create_client(
-                cls,
+        self._ros_object = node.call_rclpy(
+            lambda rclpy_node: rclpy_node.create_client(
+                rclpy_type,
                 name,
                 qos_profile=rclpy_profile(CALL_QUEUE_QOS),
                 callback_group=node.concurrent_group,
@@ -273,12 +276,13 @@ class NativeClient:
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
-        message = to_ros(self.type.request, message_or_fields(request, fields), self._cls.Request)
+        message = message_or_fields(request, fields)
+        ros_request = to_ros(self.type.request, message, self._rclpy_type.Request)
         self._check_open()
         await self.wait_served(timeout)
         reply: asyncio.Future[Any] = loop.create_future()
         self._replies.add(reply)
-        ros_future = self._send_request(message, reply)
+        ros_future = self._send_request(ros_request, reply)
         try:
             async with asyncio.timeout_at(deadline):
                 reply_message = await reply

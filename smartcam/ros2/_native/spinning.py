@@ -118,7 +118,7 @@ class SpunNode:
         managed: whether the node has a life cycle.
 
     Attributes:
-        ros: the node of rclpy; None before it is created.
+        rclpy_node: the node of rclpy; None before it is created.
         executor: executor of rclpy; None before the node is created.
     """
 
@@ -132,7 +132,7 @@ class SpunNode:
         *,
         managed: bool,
     ) -> None:
-        self.ros: Any = None
+        self.rclpy_node: Any = None
         self.executor: Any = None
         self._context, self._name, self._namespace = context, name, namespace
         self._loop, self._on_end, self._managed = loop, on_end, managed
@@ -225,16 +225,16 @@ class SpunNode:
     def _create_node(self, context: Any) -> None:
         namespace = "" if self._namespace == "/" else self._namespace
         make = managed_node if self._managed else rclpy("node").Node
-        self.ros = make(self._name, namespace=namespace, context=context)
+        self.rclpy_node = make(self._name, namespace=namespace, context=context)
         self.executor = rclpy("executors").MultiThreadedExecutor(EXECUTOR_THREADS, context=context)
-        self.executor.add_node(self.ros)
+        self.executor.add_node(self.rclpy_node)
 
     def _spin(self, context: Any) -> RosError | None:
         """Spin until the end; return its reason, None after :meth:`stop`."""
         shut_down = rclpy("executors").ExternalShutdownException
         while not self._stop_requested.is_set():
             if self._loop.is_closed():
-                logger.error("%s ! its event loop is closed: the node is taken back", self._name)
+                logger.error("%s ! its event loop is closed: the node is destroyed", self._name)
                 return RosError(f"{self._name}: its event loop is closed")
             if not context.ok():
                 return RosError(f"{self._name}: rclpy's context was shut down: the node is gone")
@@ -261,10 +261,10 @@ class SpunNode:
         with contextlib.suppress(Exception):  # the handles end with their context
             self.executor.shutdown(EXIT_TIMEOUT)
         with contextlib.suppress(Exception):
-            self.ros.destroy_node()
+            self.rclpy_node.destroy_node()
         # rclpy's state machine would keep the node in the graph until both are garbage collected
-        vars(self.ros or self).pop("_state_machine", None)
-        self.ros = self.executor = None
+        vars(self.rclpy_node or self).pop("_state_machine", None)
+        self.rclpy_node = self.executor = None
 
 
 def managed_node(name: str, *, namespace: str, context: Any) -> Any:

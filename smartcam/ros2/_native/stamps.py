@@ -2,7 +2,7 @@
 
 All stamps come from the system's clock, and are converted when a message leaves the node. To the
 stamp of a first message the present difference of ROS' time and the system's is added. Later
-messages with the same stamp, such as a picture's lens, get the same new stamp.
+messages with the same stamp, such as a picture's CameraInfo, get the same new stamp.
 """
 
 from __future__ import annotations

@@ -44,7 +44,8 @@ class NativePublisher:
     """Publishes on a topic through rclpy; created by :meth:`NativeNode.publisher`.
 
     Messages are encoded here and passed to rclpy as bytes, so that a picture never becomes a list
-    of numbers. A thread of the node passes them on, since a middleware may wait for room.
+    of numbers. A thread of the node passes them on, since a middleware may wait for room. If
+    ``rclpy_type`` is None, since it is not built, nothing is published.
 
     Attributes:
         name: absolute name of the topic.
@@ -55,7 +56,7 @@ class NativePublisher:
     """
 
     def __init__(
-        self, node: NativeNode, name: str, message_type: MessageType, qos: QoS, cls: Any
+        self, node: NativeNode, name: str, message_type: MessageType, qos: QoS, rclpy_type: Any
     ) -> None:
         self.name: str = name
         self.type: MessageType = message_type
@@ -64,9 +65,9 @@ class NativePublisher:
         self.dropped: int = 0
         self._node, self._closed = node, False
         self._ros_object: Any = None
-        if cls is not None:
-            self._ros_object = node.create(
-                lambda ros: ros.create_publisher(cls, name, rclpy_profile(qos))
+        if rclpy_type is not None:
+            self._ros_object = node.call_rclpy(
+                lambda rclpy_node: rclpy_node.create_publisher(rclpy_type, name, rclpy_profile(qos))
             )
 
     @property
@@ -107,7 +108,7 @@ class NativePublisher:
             RosMessageError: the message is not of the type.
             RosError: the publisher is closed, or rclpy has ended.
 
-        Cancellation: the message is published or not.
+        Cancellation: the message may be published nevertheless.
         """
         self._check_open()
         if self._ros_object is None:
@@ -164,15 +165,15 @@ class NativeSubscription(TopicReader[bytes]):
     """
 
     def __init__(
-        self, node: NativeNode, name: str, message_type: MessageType, qos: QoS, cls: Any
+        self, node: NativeNode, name: str, message_type: MessageType, qos: QoS, rclpy_type: Any
     ) -> None:
         super().__init__(name, message_type, qos.kept, MAX_WAITING_BYTES)
         self.name: str = name
         self._node, self._closed = node, False
         self._max_on_way, self._messages_on_way, self._lock = qos.kept, 0, threading.Lock()
-        self._ros_object = node.create(
-            lambda ros: ros.create_subscription(
-                cls,
+        self._ros_object = node.call_rclpy(
+            lambda rclpy_node: rclpy_node.create_subscription(
+                rclpy_type,
                 name,
                 self._on_message,
                 rclpy_profile(qos),

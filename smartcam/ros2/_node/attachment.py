@@ -1,7 +1,7 @@
 """Write and read the attachment of a message or request: number, time, and sender.
 
 ``AttachmentData::serialize_to_zbytes`` in ``rmw_zenoh_cpp/src/detail/attachment_helpers.cpp``: two
-int64, and 16 bytes after their number, little-endian, as Zenoh's serializer writes them.
+int64, a byte with the length 16, and 16 bytes; little-endian, as Zenoh's serializer writes them.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class Attachment(NamedTuple):
         if data is None or len(data) != _FORM.size or data[16] != GID_BYTES:
             actual = "nothing" if data is None else f"{len(data)} bytes, {data[:48].hex()}"
             raise RosMessageError(
-                f"attachment: expected {_FORM.size} bytes (number, time, {GID_BYTES}, GID), "
-                f"got {actual}"
+                f"attachment: expected {_FORM.size} bytes (number, time, the length {GID_BYTES}, "
+                f"GID), got {actual}"
             )
         number, when, _, gid = _FORM.unpack(data)
         if number < 0 or when < 0:
-            raise RosMessageError(f"attachment: number {number} and time {when} are not below 0")
+            raise RosMessageError(f"attachment: number {number} or time {when} is below 0")
         return cls(number, when, gid)

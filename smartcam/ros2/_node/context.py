@@ -28,7 +28,7 @@ ROUTER = "tcp/localhost:7447"
 """Endpoint of the router of rmw_zenoh's nodes (``DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5``)."""
 
 SETTINGS: Mapping[str, Any] = {
-    # publishers of latched topics keep messages by their times
+    # publishers of latched topics keep only messages with a timestamp
     "timestamping/enabled": {"router": True, "peer": True, "client": True},
     # nodes of rmw_zenoh are peers, and learn of each other from their router
     "scouting/gossip/enabled": True,
@@ -37,13 +37,13 @@ SETTINGS: Mapping[str, Any] = {
 
 
 CALM_TIME, MAX_DIRECT_MESSAGES = 0.5, 8
-"""The event loop passes at most ``MAX_DIRECT_MESSAGES`` to the engine in ``CALM_TIME`` seconds; a
-thread, which can wait for room, passes all others. The engine's queue has room for 16 messages and
+"""The event loop passes at most ``MAX_DIRECT_MESSAGES`` to Zenoh in ``CALM_TIME`` seconds; a
+thread, which can wait for room, passes all others. Zenoh's queue has room for 16 messages and
 silently drops further ones while its own thread gets no processor or the link takes no data. With
 0.01 s, 3 of 4 bursts of 1000 results lost some on a busy machine; with 0.5 s, none of 8."""
 
 PRIORITIES = ("DATA_LOW", "BACKGROUND", "DATA")
-"""Priorities for long messages of which only the newest is needed. On each link the engine sends
+"""Priorities for long messages of which only the newest is needed. On each link Zenoh sends
 one message of a priority at a time. Topics get the priorities in turn, so that the two pictures of
 a pair do not wait for each other."""
 
@@ -51,12 +51,12 @@ MESSAGE_PAUSE, LINK_BYTES_PER_SECOND = 0.002, 5e8
 """Seconds, and bytes per second: the assumed time of a healthy link for one long message."""
 
 
-class NewestSlot:
+class NewestLane:
     """A thread, and a priority, for long messages of which only the newest is needed.
 
     Attributes:
         thread_name: name of the thread.
-        priority: name of the engine's priority.
+        priority: name of Zenoh's priority.
     """
 
     def __init__(self, priority: str) -> None:
@@ -75,7 +75,7 @@ class RosContext:
 
     Args:
         session: open session of Zenoh, which stays open; None for an own session.
-        connect: endpoints that an own session connects to.
+        connect: endpoints that an own session connects to, if it does not listen.
         listen: endpoints that an own session listens on, which makes it the router.
         domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``, or 0.
         distribution: name of the ROS distribution whose messages and type hashes are used.
@@ -98,8 +98,8 @@ class RosContext:
         self.types: RosTypes = RosTypes(distribution)
         self._owns_session = session is None
         if session is None:
-            listening = _as_tuple(listen)
-            link = BusLink(listening, () if listening else _as_tuple(connect))
+            listen_endpoints = _as_tuple(listen)
+            link = BusLink(listen_endpoints, () if listen_endpoints else _as_tuple(connect))
             session = ZenohSession(link, SETTINGS, bus_name="ROS 2")
         self.zenoh: ZenohSession = session
         self.graph: RosGraph = RosGraph(self.domain)
@@ -113,7 +113,7 @@ class RosContext:
         self._waiting_by_owner: collections.Counter[object] = collections.Counter()
         self._waiting_by_thread: collections.Counter[str] = collections.Counter()
         self._interval_started_at, self._direct_messages, self._last_thread_send_at = 0.0, 0, 0.0
-        self._slots = itertools.cycle(NewestSlot(priority) for priority in PRIORITIES)
+        self._lanes = itertools.cycle(NewestLane(priority) for priority in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
     async def open(self, timeout: float) -> None:
@@ -159,7 +159,7 @@ class RosContext:
     def add_endpoint(self, entity: Entity) -> None:
         """Add an endpoint of this process, and log endpoints that are incompatible with it."""
         self._endpoints.setdefault((entity.name, entity.kind), []).append(entity)
-        for other in self.graph.ends(entity.name, OPPOSITE_KIND[entity.kind]):
+        for other in self.graph.endpoints(entity.name, OPPOSITE_KIND[entity.kind]):
             self._warn_if_incompatible(entity, other)
 
     def remove_endpoint(self, entity: Entity) -> None:
@@ -216,19 +216,19 @@ class RosContext:
 
     # ------------------------------------------------------------------ waiting messages
 
-    def next_slot(self) -> NewestSlot:
-        """Return a slot for one more topic of which only the newest message is needed."""
-        return next(self._slots)
+    def next_lane(self) -> NewestLane:
+        """Return a lane for one more topic of which only the newest message is needed."""
+        return next(self._lanes)
 
     def has_waiting(self, owner: object) -> bool:
         """Return True if messages of an owner wait to be sent."""
         return bool(self._waiting_by_owner[owner])
 
     def allow_direct_send(self) -> bool:
-        """Return True, and count the message, if the event loop may pass it to the engine."""
+        """Return True, and count the message, if the event loop may pass it to Zenoh."""
         now = time.monotonic()
         if self._waiting_by_thread["short"] or now - self._last_thread_send_at < CALM_TIME:
-            # the engine may be full: then its thread waits, and the event loop would be blocked
+            # Zenoh's queue may be full: sending would wait for room, and block the event loop
             return False
         if now - self._interval_started_at > CALM_TIME:
             self._interval_started_at, self._direct_messages = now, 0
@@ -236,7 +236,7 @@ class RosContext:
         return self._direct_messages <= MAX_DIRECT_MESSAGES
 
     def send_in_thread(self, owner: object, send: Callable[[], None], thread_name: str) -> None:
-        """Call ``send`` in the thread of this name, in order; there it may wait for room."""
+        """Call ``send`` in the context's thread of this name, where it may wait for room."""
         thread = self._threads.get(thread_name)
         if thread is None:
             thread = self._threads[thread_name] = ThreadPoolExecutor(

@@ -50,8 +50,8 @@ class RosGraph:
         put = session.zenoh.SampleKind.PUT
 
         def on_sample(sample: Any) -> None:
-            session.call_in_loop(
-                declared.call, 0, self.update, str(sample.key_expr), sample.kind == put
+            session.call_in_loop_uncounted(
+                declared.call, self.update, str(sample.key_expr), sample.kind == put
             )
 
         self._declared = declared = ZenohDeclared(session)
@@ -135,7 +135,7 @@ class RosGraph:
         """Return the types of each service by its name, as ``ros2 service list -t``."""
         return self._types_by_name({SERVICE})
 
-    def ends(self, name: str, kind: str) -> list[Entity]:
+    def endpoints(self, name: str, kind: str) -> list[Entity]:
         """Return the endpoints of a topic or a service.
 
         Args:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from smartcam.ros2._types.types import RosTypes
 
 
-class PublisherEnd(Protocol):
+class AnyPublisher(Protocol):
     """A publisher of a topic.
 
     It may also have ``has_subscribers``, False if the topic is known to have no subscriber;
@@ -37,7 +37,7 @@ class PublisherEnd(Protocol):
         ...
 
 
-class ServiceEnd(Protocol):
+class AnyService(Protocol):
     """A server of a service. It may also have ``wait_closed``."""
 
     def close(self) -> None:
@@ -48,8 +48,8 @@ class ServiceEnd(Protocol):
 class NodeOfRos(Protocol):
     """A node of ROS, opened and closed by ``async with``.
 
-    A node of ROS 2 also has ``subscribe``, ``client``, and ``graph``, by which a node with a life
-    cycle is recognized.
+    A node of ROS 2 also has ``subscribe``, ``client``, and ``graph``, which shows the other nodes;
+    only a node with ``graph`` can have a life cycle.
 
     Attributes:
         name: name of the node.
@@ -82,7 +82,7 @@ class NodeOfRos(Protocol):
         """Close the node, with all its endpoints."""
         ...
 
-    def publisher(self, topic: str, type: str, *, qos: QoS = ...) -> PublisherEnd:
+    def publisher(self, topic: str, type: str, *, qos: QoS = ...) -> AnyPublisher:
         """Publish on a topic."""
         ...
 
@@ -94,6 +94,6 @@ class NodeOfRos(Protocol):
         *,
         qos: QoS = ...,
         timeout: float = ...,
-    ) -> ServiceEnd:
+    ) -> AnyService:
         """Serve a service."""
         ...

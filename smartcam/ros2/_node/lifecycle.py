@@ -108,8 +108,8 @@ class Lifecycle:
     """The states of a managed node, and its transitions, of which one runs at a time.
 
     A transition that has begun continues when its caller is cancelled. If its work raises a
-    :exc:`~smartcam.SmartCamError`, the node returns to the previous state; after any other error
-    it goes through error processing to Unconfigured.
+    :exc:`~smartcam.SmartCamError` or takes too long, the node returns to the previous state; after
+    any other error it goes through error processing to Unconfigured.
 
     Args:
         name: name of the node, for texts.
@@ -186,19 +186,19 @@ class Lifecycle:
         """Do what a subclass needs before a requested transition begins."""
 
     async def configure(self) -> None:
-        """Go from Unconfigured to Inactive like :meth:`change`; in other states do nothing."""
+        """Go from Unconfigured to Inactive like :meth:`change`, unless Inactive or Active."""
         await self._change_unless_in("configure", INACTIVE, ACTIVE)
 
     async def activate(self) -> None:
-        """Go from Inactive to Active like :meth:`change`; in other states do nothing."""
+        """Go from Inactive to Active like :meth:`change`, unless Active already."""
         await self._change_unless_in("activate", ACTIVE)
 
     async def deactivate(self) -> None:
-        """Go from Active to Inactive like :meth:`change`; in other states do nothing."""
+        """Go from Active to Inactive like :meth:`change`, unless Inactive or Unconfigured."""
         await self._change_unless_in("deactivate", INACTIVE, UNCONFIGURED)
 
     async def cleanup(self) -> None:
-        """Go from Inactive to Unconfigured like :meth:`change`; in other states do nothing."""
+        """Go from Inactive to Unconfigured like :meth:`change`, unless Unconfigured already."""
         await self._change_unless_in("cleanup", UNCONFIGURED)
 
     async def shutdown(self) -> None:

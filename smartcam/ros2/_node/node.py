@@ -45,7 +45,7 @@ class Node(NamedNode):
         name: name of the node, of letters, digits and ``_``.
         namespace: namespace of the node, such as ``/line1``.
         connect: endpoints of the Zenoh router; default: rmw_zenoh's own.
-        listen: endpoints to listen on instead, as the router.
+        listen: endpoints to listen on as the router; then ``connect`` is not used.
         domain: number of the domain, which separates systems; None for the variable
             ``ROS_DOMAIN_ID``.
         distribution: name of the ROS distribution, whose type hashes are part of all names.

@@ -18,7 +18,7 @@ from smartcam.ros2._node.qos import PARAMETERS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from smartcam.ros2._node.interface import NodeOfRos, PublisherEnd
+    from smartcam.ros2._node.interface import AnyPublisher, NodeOfRos
     from smartcam.ros2._node.parameter_values import Typed
     from smartcam.ros2._node.parameters import RosParameters
 
@@ -51,7 +51,7 @@ class ParameterServices:
 
     def __init__(self, node: NodeOfRos, parameters: RosParameters) -> None:
         self._node, self._parameters = node, parameters
-        self._events: PublisherEnd | None = None
+        self._events: AnyPublisher | None = None
 
     def open(self) -> None:
         """Start to serve, and publish the current parameters."""
@@ -111,9 +111,8 @@ class ParameterServices:
         }
 
     async def _get_types(self, request: Any) -> dict[str, Any]:
-        return {
-            "types": bytes(await self._answer_each(request.names, lambda _, value: value.number))
-        }
+        types = await self._answer_each(request.names, lambda _, value: value.type_number)
+        return {"types": bytes(types)}
 
     async def _get(self, request: Any) -> dict[str, Any]:
         message_type = self._node.types.message("rcl_interfaces/msg/ParameterValue")

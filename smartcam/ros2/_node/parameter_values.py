@@ -141,7 +141,7 @@ def _is_double_in_range(value: float, first: float, last: float, step: float) ->
 
 
 def checked_range(
-    name: str, number: int, minimum: float | None, maximum: float | None, step: float | None
+    name: str, type_number: int, minimum: float | None, maximum: float | None, step: float | None
 ) -> tuple[float | None, float | None, float | None]:
     """Return minimum, maximum and step of a declared range; without a range all are None.
 
@@ -150,19 +150,19 @@ def checked_range(
     """
     if minimum is None and maximum is None and step is None:
         return None, None, None
-    if number not in _NUMBER_TYPES:
+    if type_number not in _NUMBER_TYPES:
         raise ConfigurationError(
-            f"parameter {name!r}: {TYPES[number]} has no range: expected integer or double"
+            f"parameter {name!r}: {TYPES[type_number]} has no range: expected integer or double"
         )
-    least, most = _INT64 if number == INTEGER else (-math.inf, math.inf)
-    first, last = least if minimum is None else minimum, most if maximum is None else maximum
+    lowest, highest = _INT64 if type_number == INTEGER else (-math.inf, math.inf)
+    first, last = lowest if minimum is None else minimum, highest if maximum is None else maximum
     if step is not None and (minimum is None or not math.isfinite(minimum) or not step > 0):
         raise ConfigurationError(
             f"parameter {name!r}: step {step}: expected a number above 0, and a minimum"
         )
-    if number == INTEGER:
-        value = [bound for bound in (first, last, step) if bound is not None]
-        too_large = [bound for bound in value if not _is_int64(bound)]
+    if type_number == INTEGER:
+        bounds = [bound for bound in (first, last, step) if bound is not None]
+        too_large = [bound for bound in bounds if not _is_int64(bound)]
         if too_large:
             raise ConfigurationError(
                 f"parameter {name!r}: a range of {too_large[0]}: expected whole numbers of 64 bits"
@@ -180,29 +180,29 @@ def _is_int64(value: float) -> bool:
     )
 
 
-def type_name(number: int) -> str:
+def type_name(type_number: int) -> str:
     """Return a type's name.
 
     Raises:
         RosMessageError: there is no type of this number.
     """
-    if not 0 <= number < len(TYPES):
+    if not 0 <= type_number < len(TYPES):
         raise RosMessageError(
-            f"parameter type {number}: expected 0 to {len(TYPES) - 1}, as ParameterType has"
+            f"parameter type {type_number}: expected 0 to {len(TYPES) - 1}, as ParameterType has"
         )
-    return TYPES[number]
+    return TYPES[type_number]
 
 
 class Typed(NamedTuple):
     """A value with the number of its type. Arrays are tuples; a value that is not set is None."""
 
-    number: int
+    type_number: int
     value: Any
 
     @property
     def type(self) -> str:
         """The name of the value's type."""
-        return TYPES[self.number]
+        return TYPES[self.type_number]
 
     def __str__(self) -> str:
         return f"{self.type} {self.value!r:.80}"
@@ -225,14 +225,14 @@ def typed_value(name: str, value: object, declared: int = NOT_SET) -> Typed:
         value = value.tolist()
     if isinstance(value, list | tuple):
         return _typed_array(name, value, declared)
-    number = _type_number(type(value))
-    if number == NOT_SET:
+    type_number = _type_number(type(value))
+    if type_number == NOT_SET:
         raise ConfigurationError(
             f"parameter {name!r}: got {type(value).__name__}, expected bool, int, float, str, "
             "bytes, or a list of bool, int, float or str"
         )
-    _check_elements(name, number, (value,))
-    return Typed(number, _PYTHON_TYPES[number](value))
+    _check_elements(name, type_number, (value,))
+    return Typed(type_number, _PYTHON_TYPES[type_number](value))
 
 
 def _typed_array(name: str, value: Sequence[Any], declared: int) -> Typed:
@@ -242,16 +242,16 @@ def _typed_array(name: str, value: Sequence[Any], declared: int) -> Typed:
                 f"parameter {name!r}: a list without elements: expected its type, too"
             )
         return Typed(declared, b"" if declared == BYTES else ())
-    numbers = {_type_number(kind) for kind in set(map(type, value))}
-    number = numbers.pop()
-    if numbers or not BOOL <= number <= STRING:
+    type_numbers = {_type_number(kind) for kind in set(map(type, value))}
+    type_number = type_numbers.pop()
+    if type_numbers or not BOOL <= type_number <= STRING:
         names = sorted({type(value).__name__ for value in value})
         raise ConfigurationError(
             f"parameter {name!r}: expected a list of bool, of int, of float or of str, got "
             f"{', '.join(names)}"
         )
-    _check_elements(name, number, value)
-    return Typed(number + _ARRAY_OFFSET, tuple(map(_PYTHON_TYPES[number], value)))
+    _check_elements(name, type_number, value)
+    return Typed(type_number + _ARRAY_OFFSET, tuple(map(_PYTHON_TYPES[type_number], value)))
 
 
 _PYTHON_TYPES: Final[dict[int, Callable[[Any], Any]]] = {
@@ -266,10 +266,10 @@ def _type_number(python_type: type) -> int:
     return BYTES if issubclass(python_type, bytes | bytearray) else NOT_SET
 
 
-def _check_elements(name: str, number: int, value: Sequence[Any]) -> None:
-    if number == INTEGER and not (_is_int64(min(value)) and _is_int64(max(value))):
+def _check_elements(name: str, type_number: int, value: Sequence[Any]) -> None:
+    if type_number == INTEGER and not (_is_int64(min(value)) and _is_int64(max(value))):
         raise ConfigurationError(f"parameter {name!r}: expected integers of 64 bits")
-    if number == STRING:
+    if type_number == STRING:
         text = "".join(value)
         try:
             text.encode()
@@ -283,7 +283,7 @@ def encode_value(value: Typed) -> dict[str, Any]:
     """Return the fields of a ``rcl_interfaces/msg/ParameterValue``."""
     plain = value.value
     field = f"{value.type}_value"
-    return {"type": value.number, field: list(plain) if isinstance(plain, tuple) else plain}
+    return {"type": value.type_number, field: list(plain) if isinstance(plain, tuple) else plain}
 
 
 def decode_value(message: Any) -> Typed:
@@ -292,13 +292,13 @@ def decode_value(message: Any) -> Typed:
     Raises:
         RosMessageError: there is no such type.
     """
-    number = int(message.type)
-    name = type_name(number)
-    if number == NOT_SET:
-        return Typed(number, None)
+    type_number = int(message.type)
+    name = type_name(type_number)
+    if type_number == NOT_SET:
+        return Typed(type_number, None)
     value = getattr(message, f"{name}_value")
-    if number == BYTES:
-        return Typed(number, bytes(value))
-    if number > BYTES:
+    if type_number == BYTES:
+        return Typed(type_number, bytes(value))
+    if type_number > BYTES:
         value = tuple(value.tolist() if isinstance(value, np.ndarray) else value)
-    return Typed(number, value)
+    return Typed(type_number, value)

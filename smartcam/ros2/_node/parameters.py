@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 SET_TIMEOUT = 10.0
-"""Seconds that a hook may take, and that a set may wait for earlier sets."""
+"""Seconds that a hook may take, and that a change may wait for earlier changes."""
 
 MAX_VALUE_SIZE = 1 << 16
 """Largest number of characters, bytes or elements of a value."""
@@ -56,8 +56,8 @@ class _Declared:
             raise ConfigurationError(f"parameter {name!r} cannot be set: it is read-only")
         if value is None or (isinstance(value, Typed) and value.value is None):
             raise ConfigurationError(f"parameter {name!r} cannot be unset: it is {self.value.type}")
-        value = typed_value(name, value, self.value.number)
-        if value.number != self.value.number:
+        value = typed_value(name, value, self.value.type_number)
+        if value.type_number != self.value.type_number:
             raise ConfigurationError(
                 f"parameter {name!r} is {self.value.type}, it cannot be set to {value}"
             )
@@ -89,7 +89,7 @@ class RosParameters:
     Args:
         node: node of the parameters.
         served: whether other nodes can use the parameters.
-        timeout: seconds that one ``on_set`` may take, and that a set may wait for earlier sets.
+        timeout: seconds that one ``on_set`` may take, and that a change may wait for earlier ones.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class RosParameters:
             self._services.open()
 
     async def close(self) -> None:
-        """Cancel running sets; declared parameters stay. The node calls this."""
+        """Cancel running changes; declared parameters stay. The node calls this."""
         if self._services is not None:
             self._services.close()
         for task in self._tasks:
@@ -149,8 +149,8 @@ class RosParameters:
             minimum: least value of a number.
             maximum: greatest value of a number.
             step: step of a number, from ``minimum`` on.
-            on_set: coroutine function that is called with a new value before the parameter gets
-                it; it refuses the value by a :class:`~smartcam.SmartCamError`, with its text.
+            on_set: function or coroutine function that is called with a new value before it is
+                set; it refuses the value by a :class:`~smartcam.SmartCamError`, with its text.
             type: name of the type, such as ``string_array``, for a list without elements.
 
         Raises:
@@ -160,9 +160,9 @@ class RosParameters:
         if not 0 < len(name) <= MAX_NAME_CHARACTERS or not name.isprintable():
             raise ConfigurationError(f"parameter {name!r:.80}: expected a name in printable text")
         if name in self._declared:
-            raise ConfigurationError(f"parameter {name!r} of {self._node.full_name} is declared")
+            raise ConfigurationError(f"parameter {name!r} of {self._node.full_name} exists already")
         if len(self._declared) >= MAX_PARAMETERS:
-            raise ConfigurationError(f"parameter {name!r}: expected {MAX_PARAMETERS} at most")
+            raise ConfigurationError(f"{name!r}: expected at most {MAX_PARAMETERS} parameters")
         if type and type not in TYPES[1:]:
             raise ConfigurationError(
                 f"parameter {name!r}: type {type!r}: expected one of {', '.join(TYPES[1:])}"
@@ -171,7 +171,7 @@ class RosParameters:
         first = typed_value(name, value, TYPES.index(type) if type else 0)
         if type and first.type != type:
             raise ConfigurationError(f"parameter {name!r}: expected {type}, got {first}")
-        bounds = checked_range(name, first.number, minimum, maximum, step)
+        bounds = checked_range(name, first.type_number, minimum, maximum, step)
         parameter_description = ParameterDescription(
             name, first.type, description, read_only, *bounds
         )
@@ -239,11 +239,11 @@ class RosParameters:
             self._notify(changed=[name])
 
     async def set(self, name: str, value: object) -> None:
-        """Set a parameter like another node.
+        """Set a parameter as another node would: its ``on_set`` may refuse the value.
 
         Raises:
             ConfigurationError: there is no parameter of this name, or the value is not valid.
-            RosError: its ``on_set`` failed, or earlier sets took too long.
+            RosError: its ``on_set`` failed, or earlier changes took too long.
             SmartCamError: its ``on_set`` refused the value.
 
         Cancellation: the value is unchanged; whether ``on_set`` was carried out is unknown.
@@ -255,7 +255,7 @@ class RosParameters:
 
         Raises:
             ConfigurationError: there is no parameter of a name, or a value is not valid.
-            RosError: an ``on_set`` failed, or earlier sets took too long.
+            RosError: an ``on_set`` failed, or earlier changes took too long.
             SmartCamError: an ``on_set`` refused a value.
 
         Cancellation: like a failed ``on_set``.
@@ -267,7 +267,7 @@ class RosParameters:
                 await self._lock.acquire()
         except TimeoutError:
             raise RosError(
-                f"{', '.join(values):.80}: other sets took more than {self._timeout:g} s"
+                f"{', '.join(values):.80}: earlier changes took more than {self._timeout:g} s"
             ) from None
         self._setting_task = asyncio.current_task()
         try:
@@ -316,7 +316,7 @@ class RosParameters:
             except SmartCamError as exc:
                 change.declared.value = change.new
                 text = f"parameter {name!r} stays {change.new}: it was not taken back: {exc}"
-                logger.error("%s ! %s", self._node.full_name, text)  # noqa: TRY400 - it is said
+                logger.error("%s ! %s", self._node.full_name, text)  # noqa: TRY400 - the text has it
                 error.add_note(text)
                 self._notify(changed=[name])
 

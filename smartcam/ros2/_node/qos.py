@@ -30,7 +30,7 @@ class QoS:
     Attributes:
         reliable: ``False`` for best effort.
         latched: transient local: a later subscriber gets the last ``depth`` messages.
-        depth: number of kept messages; None keeps all, and the publisher waits for subscribers.
+        depth: number of kept messages; None: all, and a reliable publisher waits for room.
         lifespan: seconds after which a message is no longer delivered.
 
     Raises:
@@ -52,7 +52,7 @@ class QoS:
 
     @property
     def kept(self) -> int:
-        """Number of kept messages, bounded also if ``depth`` is None."""
+        """Number of messages that queues of smartcam keep, also if ``depth`` is None."""
         return DEFAULT_DEPTH if self.depth is None else self.depth
 
     def encode(self) -> str:

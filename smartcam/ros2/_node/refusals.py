@@ -5,9 +5,9 @@ response if the service's type can express it: many types have a field ``success
 field ``error``. ROS' own services that return lists return an empty list, as rclcpp does if a
 parameter is not declared.
 
-A response of any other type, such as a sum, would be wrong. A call of such a service waits until it
-can be carried out. If its request is not valid, the call gets an error reply, and a client of
-rmw_zenoh waits forever, as with any node of ROS.
+A response of any other type would be wrong, such as a number from a service that adds. A call of
+such a service waits until it can be carried out. If its request is not valid, the call gets an
+error reply, and a client of rmw_zenoh waits forever, as with any node of ROS.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ class RosOut:
             return
         with _ignoring_own_records():
             for _ in range(min(RECORDS_PER_TURN, len(self._waiting))):
-                with contextlib.suppress(RosError):  # a log record of it would come here again
+                with contextlib.suppress(RosError):  # logging the error would call this again
                     publisher.publish(self._waiting.popleft())
                     self._passed_count += 1
         if self._waiting and not self._publish_scheduled and self._loop is not None:

@@ -49,7 +49,7 @@ SERVER_POLL_INTERVAL = 0.02
 
 
 class _RequestedCall(NamedTuple):
-    """A call of a client: the engine's query, the request's bytes, and the caller."""
+    """A call of a client: Zenoh's query, the request's bytes, and the caller."""
 
     query: Any
     data: bytes
@@ -86,7 +86,7 @@ class RosService(RosEndpoint):
         def on_query(query: Any) -> None:
             data = b"" if query.payload is None else query.payload.to_bytes()
             attachment_bytes = None if query.attachment is None else query.attachment.to_bytes()
-            zenoh.call_in_loop(self._on_request, 0, query, data, attachment_bytes)
+            zenoh.call_in_loop_uncounted(self._on_request, query, data, attachment_bytes)
 
         self._declare(
             lambda session: session.declare_queryable(entity.key, direct(on_query), complete=True)
@@ -111,10 +111,8 @@ class RosService(RosEndpoint):
         elif is_full and not self._can_refuse and len(self._waiting) < MAX_WAITING_CALLS:
             self._waiting.append(call)
         elif is_full:
-            self._refuse(
-                call,
-                RosError(f"{MAX_CONCURRENT_CALLS} calls of it are running, which is the most"),
-            )
+            reason = f"{MAX_CONCURRENT_CALLS} calls are running, the maximum"
+            self._refuse(call, RosError(reason))
         else:
             self._start_call(call)
 
@@ -241,8 +239,8 @@ class RosClient(RosEndpoint):
     @property
     def served(self) -> bool:
         """True if there is a server, as far as is known."""
-        ends = self._context.graph.ends(self.name, SERVICE)
-        return not self._closed and any(set_error.key == self.entity.key for set_error in ends)
+        servers = self._context.graph.endpoints(self.name, SERVICE)
+        return not self._closed and any(server.key == self.entity.key for server in servers)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
         """Wait until there is a server.
@@ -258,9 +256,8 @@ class RosClient(RosEndpoint):
                     self._check_open()
                     await asyncio.sleep(SERVER_POLL_INTERVAL)
         except TimeoutError as exc:
-            others = [
-                set_error.ros_type for set_error in self._context.graph.ends(self.name, SERVICE)
-            ]
+            servers = self._context.graph.endpoints(self.name, SERVICE)
+            others = [server.ros_type for server in servers]
             others_text = f", but one for {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
                 f"{self.name}: no server for {self.type.name} {self.type.hash} within "
@@ -344,7 +341,7 @@ class RosClient(RosEndpoint):
 
         def on_end() -> None:
             if not has_reply:  # after a reply, the event loop has been woken already
-                zenoh.call_in_loop(set_error, 0)
+                zenoh.call_in_loop_uncounted(set_error)
 
         self._querier.get(
             direct(on_reply, on_end),
@@ -353,7 +350,7 @@ class RosClient(RosEndpoint):
         )
 
     def _is_reply_to(self, request: Attachment, attachment_bytes: bytes | None) -> bool:
-        """Return True if a reply answers this call; called in a thread of the engine."""
+        """Return True if a reply answers this call; called in a thread of Zenoh."""
         try:
             attachment = Attachment.decode(attachment_bytes)
         except RosMessageError as exc:

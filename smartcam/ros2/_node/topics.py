@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Self
 
-    from smartcam.ros2._node.context import NewestSlot, RosContext
+    from smartcam.ros2._node.context import NewestLane, RosContext
     from smartcam.ros2._node.tokens import Entity
     from smartcam.ros2._types.types import MessageType
 
@@ -76,6 +76,7 @@ class RosEndpoint:
     def _declare(
         self, declare: Callable[[Any], Any], *, by_dropping: bool = False
     ) -> ZenohDeclared:
+        """Declare at Zenoh, until this endpoint is closed; arguments as of ZenohDeclared."""
         declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).declare(declare)
         self._declared.append(declared)
         return declared
@@ -108,7 +109,7 @@ class RosPublisher(RosEndpoint):
 
     Attributes:
         type: type of the messages.
-        published: number of messages passed to the engine.
+        published: number of messages passed to Zenoh.
         dropped: number of messages dropped for want of room, the oldest first.
     """
 
@@ -128,13 +129,13 @@ class RosPublisher(RosEndpoint):
         self._waiting: collections.deque[tuple[bytes, bytes]] = collections.deque()
         self._bytes = 0
         self._publisher: Any = None
-        qos = entity.qos  # a message that must not be dropped may block, which the loop cannot
+        qos = entity.qos  # sending what must not be dropped may block; the event loop must not
         self._may_send_directly = not qos.latched and not (qos.reliable and qos.depth is None)
         # publishers that wait for room, by thread name
         self._blocking_publishers: dict[str, Any] = {}
         # publisher that skips links with a message in transmission
         self._newest_publisher: Any = None
-        self._slot: NewestSlot | None = None
+        self._lane: NewestLane | None = None
         self._thread_name = "latched" if qos.latched else "short"
         self._declared_publisher = ZenohDeclared(context.zenoh, by_dropping=qos.latched).declare(
             self._declare_publisher
@@ -208,13 +209,13 @@ class RosPublisher(RosEndpoint):
         """
         self._check_open()
         attachment = self._attachment()
-        is_blocking = self._context.has_waiting(self)
-        if len(data) > MAX_DIRECT_BYTES and self._thread_name == "short" and not is_blocking:
+        has_waiting = self._context.has_waiting(self)
+        if len(data) > MAX_DIRECT_BYTES and self._thread_name == "short" and not has_waiting:
             self._thread_name = "long"  # also for later messages: a short one would overtake it
         if (
             self._may_send_directly
             and self._thread_name == "short"
-            and not is_blocking
+            and not has_waiting
             and self._context.allow_direct_send()
         ):
             quietly(self._publisher.put, data, attachment=attachment)
@@ -235,20 +236,20 @@ class RosPublisher(RosEndpoint):
         """Publish a message; a long one is left out on links that are still sending another.
 
         It is meant for pictures, which thus never queue up, or get old, for a slow subscriber, and
-        never delay other subscribers. A thread encodes the message; the call returns when the
-        engine has copied it.
+        never delay other subscribers. A thread encodes the message; the call returns when Zenoh
+        has copied it.
 
         Raises:
             RosMessageError: the value is not a message of the type.
             RosError: the publisher is closed.
 
-        Cancellation: the message is published or not.
+        Cancellation: the message may be published nevertheless.
         """
         self._check_open()
         message = message_or_fields(message, fields)
-        if self._slot is None:
-            self._slot = self._context.next_slot()
-            self._thread_name = self._slot.thread_name
+        if self._lane is None:
+            self._lane = self._context.next_lane()
+            self._thread_name = self._lane.thread_name
         sent: concurrent.futures.Future[None] = concurrent.futures.Future()
 
         def publish() -> None:
@@ -265,13 +266,13 @@ class RosPublisher(RosEndpoint):
         await asyncio.wrap_future(sent)
 
     def _send_newest(self, data: bytes) -> None:
-        """Send a message; called in the topic's thread.
+        """Send a message; called in a sending thread of the context.
 
         Long messages have a publisher of their own. On a link that is still sending a message of
-        the same priority, the engine skips the new one; hence the short pause between messages.
+        the same priority, Zenoh skips the new one; hence the short pause between messages.
         """
-        slot, publisher = self._slot, self._publisher
-        if self._closed or slot is None:
+        lane, publisher = self._lane, self._publisher
+        if self._closed or lane is None:
             return
         attachment = self._attachment()
         if len(data) > MAX_DIRECT_BYTES:
@@ -280,10 +281,10 @@ class RosPublisher(RosEndpoint):
                 self._newest_publisher = self._context.zenoh.session.declare_publisher(
                     self.entity.key,
                     congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
-                    priority=getattr(zenoh.Priority, slot.priority),
+                    priority=getattr(zenoh.Priority, lane.priority),
                 )
             publisher = self._newest_publisher
-            slot.wait_for_link(len(data))
+            lane.wait_for_link(len(data))
         quietly(publisher.put, data, attachment=attachment)
         self.published += 1
 
@@ -296,7 +297,7 @@ class RosPublisher(RosEndpoint):
         return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
 
     def _send_oldest(self) -> None:
-        """Send the oldest waiting message; called in the topic's thread."""
+        """Send the oldest waiting message; called in a sending thread of the context."""
         with self._lock:
             if not self._waiting or self._closed:
                 return
@@ -367,14 +368,14 @@ class RosSubscription(RosEndpoint, TopicReader[_ReceivedMessage]):
         self._declare_token()
 
     def _declare_subscriber(self, session: Any) -> Any:
-        context = self._context.zenoh
+        zenoh_session = self._context.zenoh
 
         def on_sample(sample: Any) -> None:
             data = sample.payload.to_bytes()
-            if context.full(len(data)):
+            if zenoh_session.full(len(data)):
                 return
             attachment_bytes = None if sample.attachment is None else sample.attachment.to_bytes()
-            context.call_in_loop(self._on_message, len(data), data, attachment_bytes)
+            zenoh_session.call_in_loop(self._on_message, len(data), data, attachment_bytes)
 
         qos = self.entity.qos
         if not qos.latched:

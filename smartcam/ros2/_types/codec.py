@@ -2,7 +2,7 @@
 
 Consecutive fields of fixed size (a run) are packed with one Struct. A run may begin at any
 position, so it has eight Structs, one for each position modulo 8. For alignment, positions count
-from the end of the encapsulation, four bytes.
+from the first byte after the encapsulation, which has four bytes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Numbers: TypeAlias = "np.ndarray[Any, np.dtype[Any]]"
 
 ENCAPSULATION: Final = b"\0\1\0\0"
-_FLAGS: Final = {True: 1, False: 0}
+_BYTE_OF_FLAG: Final = {True: 1, False: 0}
 _SIZES: Final = {code: struct.calcsize(f"<{code}") for code in "bBhHiIqQfd?"}
 
 
@@ -102,28 +102,28 @@ class _Writer:
 # -- encoding -----------------------------------------------------------------------------------
 
 
-def pack_numbers(value: Any, code: str, least: int, most: int) -> Any:
-    """Return the bytes of ``least`` to ``most`` numbers; ``most`` 0 means any count."""
+def pack_numbers(value: Any, code: str, min_count: int, max_count: int) -> Any:
+    """Return the bytes of numbers; ``min_count`` is 0 unless their count is fixed."""
     if isinstance(value, bytes | bytearray | memoryview):
         if code not in "bB":
             raise MisfitError(f"bytes are no numbers of {code}")
-        data: Any = bytes(value) if least or not value else memoryview(value).cast("B")
+        data: Any = bytes(value) if min_count or not value else memoryview(value).cast("B")
         count = len(data)
     elif isinstance(value, np.ndarray):
         if value.ndim != 1:
             raise MisfitError(f"expected numbers in one row, got {value.shape}")
         count = len(value)
         array = _as_array(value, np.dtype(f"<{code}"))
-        data = array.tobytes() if least else array.view(np.uint8)
+        data = array.tobytes() if min_count else array.view(np.uint8)
     else:
         if isinstance(value, str | dict):
             raise MisfitError(f"expected numbers, got {type(value).__name__}")
         if code == "?":
-            value = [_FLAGS[flag] for flag in value]
+            value = [_BYTE_OF_FLAG[flag] for flag in value]
         data = struct.pack(f"<{len(value)}{code}", *value)
         count = len(value)
-    if count < least or (most and count > most):
-        raise MisfitError(f"expected {least or f'up to {most}'} numbers, got {count}")
+    if count < min_count or (max_count and count > max_count):
+        raise MisfitError(f"expected {min_count or f'up to {max_count}'} numbers, got {count}")
     return data
 
 
@@ -157,13 +157,13 @@ def text_bytes(text: str, limit: int) -> bytes:
     return data + b"\0"
 
 
-def checked_length(value: Any, least: int, most: int) -> int:
+def checked_length(value: Any, min_count: int, max_count: int) -> int:
     """Return the length of a list of messages or strings, after checking its bounds."""
     if not isinstance(value, list | tuple):
         raise MisfitError(f"expected a list, got {type(value).__name__}")
     count = len(value)
-    if count < least or (most and count > most):
-        raise MisfitError(f"expected {least or f'up to {most}'}, got {count}")
+    if count < min_count or (max_count and count > max_count):
+        raise MisfitError(f"expected {min_count or f'up to {max_count}'}, got {count}")
     return count
 
 
@@ -171,7 +171,7 @@ class _Encoder(_Writer):
     def __init__(self) -> None:
         super().__init__("<")
         self.names |= {
-            "F": _FLAGS,
+            "F": _BYTE_OF_FLAG,
             "pack_numbers": pack_numbers,
             "text_bytes": text_bytes,
             "checked_length": checked_length,
@@ -206,14 +206,14 @@ class _Encoder(_Writer):
             self.add_fixed("B" if flag else code, _SIZES[code], f"F[{value}]" if flag else value)
 
     def add_array(self, message_type: MessageType, field: MessageField, value: str) -> None:
-        array = field.shape == "array"
-        least = field.size if array else 0
+        is_fixed = field.shape == "array"
+        min_count = field.size if is_fixed else 0
         name = self.new_name()
         if field.type in NUMBERS:
             code = NUMBERS[field.type]
             size = _SIZES[code]
-            self.add_line(f"{name} = pack_numbers({value}, {code!r}, {least}, {field.size})")
-            if array:
+            self.add_line(f"{name} = pack_numbers({value}, {code!r}, {min_count}, {field.size})")
+            if is_fixed:
                 self.add_fixed(f"{field.size * size}s", size, name)
                 return
             self.add_fixed("I", 4, f"len({name}) // {size}")
@@ -230,8 +230,8 @@ class _Encoder(_Writer):
         item = self.new_name()
         self.add_line(f"{name} = {value}")
         count = self.new_name()
-        self.add_line(f"{count} = checked_length({name}, {least}, {field.size})")
-        if not array:
+        self.add_line(f"{count} = checked_length({name}, {min_count}, {field.size})")
+        if not is_fixed:
             self.add_fixed("I", 4, count)
         self.flush()
         self.add_line(f"for {item} in {name}:")
@@ -256,7 +256,7 @@ def encoder(message_type: MessageType) -> Callable[[Any], bytes]:
 
 # -- decoding -----------------------------------------------------------------------------------
 
-_FLAG_OF: Final = (False, True)
+_FLAG_OF_BYTE: Final = (False, True)
 
 
 def read_text(data: Any, start: int, size: int, limit: int) -> str:
@@ -270,16 +270,16 @@ def read_text(data: Any, start: int, size: int, limit: int) -> str:
         )
     text = str(data[start : end - 1], "utf-8")
     if data[end - 1] or "\0" in text:
-        raise MisfitError(f"a string of {size} bytes at {start} without NUL at its end, or within")
+        raise MisfitError(f"a string of {size} bytes at {start} not with one NUL, at its end")
     if limit and size - 1 > limit:
         raise MisfitError(f"expected up to {limit} bytes of text, got {size - 1}")
     return text
 
 
-def read_numbers(data: Any, start: int, count: int, dtype: np.dtype[Any], most: int) -> Any:
+def read_numbers(data: Any, start: int, count: int, dtype: np.dtype[Any], max_count: int) -> Any:
     """Return ``count`` numbers as a view of the bytes, or for another byte order as a copy."""
-    if most and count > most:
-        raise MisfitError(f"expected up to {most} numbers, got {count}")
+    if max_count and count > max_count:
+        raise MisfitError(f"expected up to {max_count} numbers, got {count}")
     if count * dtype.itemsize > len(data) - start:
         raise MisfitError(
             f"{count} numbers of {dtype} at {start}, where {len(data) - start} bytes are left"
@@ -296,10 +296,10 @@ def native_numbers(array: Numbers) -> Numbers:
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
-def checked_count(count: int, most: int, bytes_left: int) -> int:
-    """Return the count of items that follow, after checking that each can have a byte."""
-    if most and count > most:
-        raise MisfitError(f"expected up to {most} items, got {count}")
+def checked_count(count: int, max_count: int, bytes_left: int) -> int:
+    """Return the count of items that follow, after checking that each has at least a byte."""
+    if max_count and count > max_count:
+        raise MisfitError(f"expected up to {max_count} items, got {count}")
     if count > bytes_left:
         raise MisfitError(f"{count} items where {bytes_left} bytes are left")
     return count
@@ -309,7 +309,7 @@ class _Decoder(_Writer):
     def __init__(self, order: str) -> None:
         super().__init__(order)
         self.names |= {
-            "F": _FLAG_OF,
+            "F": _FLAG_OF_BYTE,
             "read_text": read_text,
             "read_numbers": read_numbers,
             "native_numbers": native_numbers,
@@ -346,12 +346,12 @@ class _Decoder(_Writer):
         return f"F[{name}]" if flag else name
 
     def add_array(self, message_type: MessageType, field: MessageField) -> str:
-        array = field.shape == "array"
+        is_fixed = field.shape == "array"
         name, count = self.new_name(), self.new_name()
         if field.type in NUMBERS:
             size = _SIZES[NUMBERS[field.type]]
             dtype = self.new_name(np.dtype(self.order + NUMBERS[field.type]), "D")
-            if array:
+            if is_fixed:
                 self.add_fixed(f"{field.size * size}s", size, name)
                 return f"native_numbers(frombuffer({name}, {dtype}))"
             self.add_fixed("I", 4, count)
@@ -361,7 +361,7 @@ class _Decoder(_Writer):
             self.add_line(f"{name} = read_numbers(data, pos, {count}, {dtype}, {field.size})")
             self.add_line(f"pos += {count} * {size}")
             return name
-        if array:
+        if is_fixed:
             self.flush()
             self.add_line(f"{count} = {field.size}")
         else:

@@ -219,7 +219,7 @@ def _full_name(package: str, name: str) -> str:
 
 
 def _parse_value(field: MessageField, text: str | None, *, is_constant: bool) -> Any:
-    """Return the value of a constant, whose text is the whole rest of the line, or of a default."""
+    """Return the value of a constant or a default; a constant's unquoted string may have ``#``."""
     if text is None or not (text := text.strip()) or (not is_constant and text.startswith("#")):
         return None
     if field.type == "string" and not field.shape:
@@ -242,7 +242,8 @@ def _checked_values(field: MessageField, values: list[Any]) -> list[Any]:
         raise ValueError("a message has no default")
     max_count = field.size or len(values)
     if len(values) > max_count or (field.shape == "array" and len(values) != max_count):
-        raise ValueError(f"expected {field.size} values, got {len(values)}")
+        limit = "" if field.shape == "array" else "up to "
+        raise ValueError(f"expected {limit}{field.size} values, got {len(values)}")
     for value in values:
         if field.type == "string":
             if not isinstance(value, str) or (field.limit and len(value.encode()) > field.limit):

@@ -37,7 +37,7 @@ MISSING_BUILT_INS: Final = {
         }
     )
 }
-"""Names of built-in texts that a distribution does not have, by the distribution."""
+"""Names of types that smartcam has built in, but a distribution does not have."""
 
 _DEFAULTS: Final[dict[tuple[str, str], float | str]] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,

@@ -183,8 +183,8 @@ class MessageType:
 
         Args:
             data: bytes of the message.
-            whole: True if the message has to fill the bytes; ROS' own serializer may add further
-                bytes with any contents.
+            whole: True if the message has to fill the bytes, except for up to 3 zeros of padding;
+                ROS' own serializer may add further bytes with any contents.
 
         Raises:
             RosMessageError: the bytes are not such a message, or too few, or too many.
@@ -257,8 +257,8 @@ class ServiceType:
 class RosTypes:
     """The messages and services of a distribution of ROS 2, and added ones.
 
-    All objects of a distribution share the distribution's own types; an added type is only in its
-    object. It may be used from any thread.
+    All objects of a distribution share the distribution's own types; an added type is known only
+    to the object to which it was added. The object may be used from any thread.
 
     Args:
         distribution: ``humble``, ``jazzy``, ``kilted``, ``lyrical`` or ``rolling``.
@@ -417,8 +417,8 @@ class RosTypes:
     def _unknown_type_error(self, name: str) -> ConfigurationError:
         suggestion = did_you_mean(name, self.names())
         return ConfigurationError(
-            f"{name}: no such type in {self.distribution}, expected a name of it or add() first"
-            f"{suggestion}"
+            f"{name}: no such type in {self.distribution}, expected the name of one of its types, "
+            f"or add() first{suggestion}"
         )
 
 

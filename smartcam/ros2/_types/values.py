@@ -67,7 +67,7 @@ def _value_text(value: Any) -> str:
 
 
 def message_class(definition: Definition) -> type[RosMessage]:
-    """Return the class of a message, which is created with its fields in order."""
+    """Return the class of a message; the constructor takes the fields in their order."""
     names = tuple(field.attribute for field in definition.fields)
     class_: type[RosMessage] = dataclasses.make_dataclass(
         definition.name.rpartition("/")[2],
@@ -115,11 +115,9 @@ _MISFIT_ERRORS: Final = (MisfitError, struct.error, KeyError, TypeError, ValueEr
 
 def zero_maker(message_type: MessageType) -> Callable[[], RosMessage]:
     """Return the function that creates a message of defaults and zeros."""
-    message_class, parts = (
-        message_type.cls,
-        [_zero_value_maker(message_type, field) for field in message_type.fields],
-    )
-    return lambda: message_class(*[part() for part in parts])
+    create = message_type.cls
+    makers = [_zero_value_maker(message_type, field) for field in message_type.fields]
+    return lambda: create(*[make() for make in makers])
 
 
 def _zero_value_maker(message_type: MessageType, field: MessageField) -> Callable[[], Any]:
@@ -180,12 +178,12 @@ def value_rule(message_type: MessageType, field: MessageField) -> Callable[[Any]
     """
     if not field.shape:
         return _single_value_rule(message_type, field)
-    least = field.size if field.shape == "array" else 0
+    min_count = field.size if field.shape == "array" else 0
     if field.type in NUMBERS:
         code = NUMBERS[field.type]
 
         def numbers(value: Any) -> Any:
-            pack_numbers(value, code, least, field.size)
+            pack_numbers(value, code, min_count, field.size)
             return value
 
         return numbers
@@ -193,7 +191,7 @@ def value_rule(message_type: MessageType, field: MessageField) -> Callable[[Any]
     rule = _single_value_rule(message_type, element)
 
     def check_elements(values: Any) -> list[Any]:
-        checked_length(values, least, field.size)
+        checked_length(values, min_count, field.size)
         checked: list[Any] = []
         for index, value in enumerate(values):
             try:

@@ -1,4 +1,4 @@
-"""The fields of messages and services of other packages."""
+"""The fields of messages and services of ROS' packages, such as vision_msgs and std_srvs."""
 
 from __future__ import annotations
 
