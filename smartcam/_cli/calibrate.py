@@ -28,7 +28,7 @@ from smartcam._cli.options import (
     OUTPUT_OPTIONS,
     Options,
     async_command,
-    naming_file_errors,
+    label_file_errors,
     option,
 )
 from smartcam._cli.page import PageOptions, page_options
@@ -74,7 +74,7 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
 )
 @click.argument("url", required=False)
 @click.option(
-    "--name", "calibration_name", metavar="NAME", help="Its name.  [default: the wizard's]"
+    "--name", "calibration_name", metavar="NAME", help="Name to save by.  [default: the wizard's]"
 )
 @click.option(
     "--wizard",
@@ -284,7 +284,7 @@ def _make_service(folder: str, sources: _Sources) -> CalibrationService:
     from smartcam.calibration.wizards import CalibrationService
 
     load("scipy")  # fails before anything is measured
-    with naming_file_errors(f"--folder {folder}"):
+    with label_file_errors(f"--folder {folder}"):
         calibrations = Folder(folder)
     return CalibrationService(calibrations, sources.wizards(calibrations))
 
@@ -411,7 +411,7 @@ def _read_lens(path: str) -> Lens:
     from smartcam.calibration._inside import read_lenses
 
     try:
-        with naming_file_errors(f"--lens {path}"):
+        with label_file_errors(f"--lens {path}"):
             return read_lenses(path).lenses[0]
     except CalibrationError as exc:
         raise ConfigurationError(f"--lens: {exc}") from exc

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, naming_file_errors
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, label_file_errors
 from smartcam._cli.texts import table_text
 from smartcam._cli.usage import ListedGroup, write_commands
 from smartcam.exceptions import ConfigurationError
@@ -24,7 +24,7 @@ DIFFERENT_EXIT_CODE = 7
 """Exit code after a comparison of calibrations that differ by more than noise explains."""
 
 COLUMNS = ("centre", "corners", "worst", "rms")
-"""Names of a map's figures."""
+"""Columns of the table of differences between two calibrations, pixels."""
 
 
 WIZARDS = ("plane", "sheet", "hand-eye")
@@ -200,7 +200,7 @@ async def draw(
     """Draw a calibration."""
     from smartcam.calibration._inside import draw_file
 
-    with naming_file_errors(file):
+    with label_file_errors(file):
         svg_text = draw_file(file, drawing, distance)
     _write(output, svg_text)
     options.show({"file": output}, output)
@@ -209,7 +209,7 @@ async def draw(
 def _read(path: str, unit: LengthUnit | None) -> StoredLenses:
     from smartcam.calibration._inside import read_lenses
 
-    with naming_file_errors(path):
+    with label_file_errors(path):
         return read_lenses(path, unit=unit)
 
 
@@ -278,5 +278,5 @@ def _draw_comparisons(
 
 
 def _write(path: str, svg: str) -> None:
-    with naming_file_errors(path):
+    with label_file_errors(path):
         Path(path).write_text(svg, encoding="utf-8", newline="\n")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from smartcam._cli.frame_sources import is_source, make_source
-from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, naming_file_errors, option
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, label_file_errors, option
 from smartcam._cli.texts import table_text
 from smartcam.exceptions import CalibrationError, ConfigurationError, FrameTimeoutError
 
@@ -102,15 +102,15 @@ def _check_output_name(_context: object, _option: object, file: str) -> str:
     type=click.Choice(["plumb_bob", "rational_polynomial", "equidistant"]),
     default="plumb_bob",
     show_default=True,
-    help="Model of the distortion: for most lenses, for wide ones, for fisheyes.",
+    help="Model of the distortion, in this order: for most lenses, wide ones, fisheyes.",
 )
 @click.option(
     "--sheet",
     type=click.Choice(["auto", "exact", "free"]),
     default="auto",
     show_default=True,
-    help="Whether the target's points are exact, or are adjusted, too; auto: "
-    "the choice that predicts left-out views better.",
+    help="exact: the target's points are as described; free: they are estimated with the lens; "
+    "auto: the better of both at predicting views that the fit did not use.",
 )
 @option(
     "--count",
@@ -218,7 +218,7 @@ def _view_of_file(path: Path, target: Target) -> TargetView:
     from smartcam.calibration import find_target
     from smartcam.calibration._inside import MAX_PICTURE_BYTES, decode_picture
 
-    with naming_file_errors(str(path)), path.open("rb") as stream:
+    with label_file_errors(str(path)), path.open("rb") as stream:
         data = stream.read(MAX_PICTURE_BYTES + 1)
     return find_target(decode_picture(data, path.name), target, name=path.name)
 

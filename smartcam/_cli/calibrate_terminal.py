@@ -177,7 +177,7 @@ async def _ask_step(
             if isinstance(typed, _TypedCommand):
                 return await _run_command(session, typed.name, token)
         if step.waiting:
-            text = f"{step.waiting}; Ctrl-C ends it, and the same command goes on"
+            text = f"{step.waiting}; after Ctrl-C the same command continues here"
             click.echo("\n".join(textwrap.wrap(text, WIDTH)))
         view = await session.submit(token, answers)
         field_names = [name for name in view["errors"] if name in answers] or list(answers)

@@ -182,7 +182,7 @@ def _show_frame(
 
 
 def _possible_senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
-    """Return the senders that the frame can have, by id and size; both if neither fits."""
+    """Return the senders whose message fits by id and size, else one by the id, or the camera."""
     from smartcam.protocols.messages import Sender
 
     exact = [

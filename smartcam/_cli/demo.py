@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam._cli.options import Options
 
 STREAMED_COUNT = 10
-TANGRAM, COUNTER, HELLO = 7, 9, 21
+TANGRAM_ID, COUNTER_ID, HELLO_ID = 7, 9, 21
 
 
 @dataclass(eq=False)
@@ -43,35 +43,35 @@ async def demo(options: Options) -> None:
     async with EmulatedCamera(seed=1) as emulator:
         steps.step(f"An emulated BVS002C listens on real TCP: {emulator.url}", url=emulator.url)
         interpret_as = {
-            TANGRAM: "localizations",
-            COUNTER: "n: int32",
-            HELLO: "text: string[20]",
+            TANGRAM_ID: "localizations",
+            COUNTER_ID: "n: int32",
+            HELLO_ID: "text: string[20]",
         }
         async with smartcam.connect(
-            emulator.url, name="demo", application=HELLO, interpret_as=interpret_as
+            emulator.url, name="demo", application=HELLO_ID, interpret_as=interpret_as
         ) as camera:
             steps.step(f"Connected, application {camera.active_application} runs: {camera.status}")
             await _switch(camera, steps)
             await _localize(camera, emulator, steps)
             await _stream(camera, steps)
-            account = camera.statistics()
-        steps.step("Disconnected. The account of every result that arrived:")
+            counts = camera.statistics()
+        steps.step("Disconnected. The counts of all results that arrived:")
         steps.detail(
-            f"   received {account.received} = triggered {account.triggered} + streamed "
-            f"{account.streamed} + unclaimed {account.unclaimed} + late {account.late} + wrong "
-            f"application {account.wrong_application} + uninterpretable {account.uninterpretable}",
-            statistics=account,
+            f"   received {counts.received} = triggered {counts.triggered} + streamed "
+            f"{counts.streamed} + unclaimed {counts.unclaimed} + late {counts.late} + wrong "
+            f"application {counts.wrong_application} + uninterpretable {counts.uninterpretable}",
+            statistics=counts,
         )
 
 
 async def _switch(camera: smartcam.Camera, steps: Steps) -> None:
     loop = asyncio.get_running_loop()
     steps.step(
-        f"Switch to application {TANGRAM}. The camera must be stopped, is BUSY, then runs again:"
+        f"Switch to application {TANGRAM_ID}. The camera must be stopped, is BUSY, then runs again:"
     )
     started_at = loop.time()
     events = camera.events()
-    switching = asyncio.create_task(camera.switch_application(TANGRAM))
+    switching = asyncio.create_task(camera.switch_application(TANGRAM_ID))
     await camera.wait_status(lambda status: smartcam.Status.BUSY in status)
     # requested while the camera is BUSY: it waits until the camera accepts a trigger
     result = await camera.trigger()
@@ -120,8 +120,8 @@ async def _localize(camera: smartcam.Camera, emulator: EmulatedCamera, steps: St
 
 
 async def _stream(camera: smartcam.Camera, steps: Steps) -> None:
-    steps.step(f"Application {COUNTER} runs free: {STREAMED_COUNT} results as they come:")
-    async with camera.application(COUNTER):
+    steps.step(f"Application {COUNTER_ID} runs free: {STREAMED_COUNT} results as they come:")
+    async with camera.application(COUNTER_ID):
         numbers: list[int] = []
         async with camera.results() as results, asyncio.timeout(10):
             async for result in results:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import smartcam
-from smartcam._cli.demo import TANGRAM, Steps
+from smartcam._cli.demo import TANGRAM_ID, Steps
 from smartcam._cli.texts import table_text
 from smartcam.exceptions import ConnectionLostError, SmartCamError
 
@@ -52,7 +52,7 @@ async def demo(options: Options) -> None:
         agents: dict[str, Process] = {}
         for name, link_kind in (("north", "listen"), ("south", "connect")):
             line, count = CAMERAS_OF_AGENT[name]
-            cameras = {f"{line}/**": {"emulated": {"count": count}, "application": TANGRAM}}
+            cameras = {f"{line}/**": {"emulated": {"count": count}, "application": TANGRAM_ID}}
             file = Path(folder) / f"{name}.yaml"
             # JSON is YAML, too
             file.write_text(json.dumps({"agent": name, link_kind: endpoint, "cameras": cameras}))
@@ -144,14 +144,15 @@ async def _show_sharing(
             f"   {name:9} results {', '.join(map(str, numbers))}", program=name, numbers=numbers
         )
     owned = sorted([*robot_task.result(), *dashboard_task.result()])
-    verdict = "each is one's own" if owned == recorder_task.result() else "they are NOT one's own"
-    account, status_count = recorded.statistics(), statuses.statistics().offered
+    is_right = owned == recorder_task.result()
+    verdict = f"{'each' if is_right else 'NOT each'} trigger got its own"
+    counts, status_count = recorded.statistics(), statuses.statistics().offered
     steps.detail(f"   {len(owned)} triggers, {len(set(owned))} results: {verdict}", own=owned)
     steps.detail(
-        f"   the recorder's account: sent {account.offered + account.missed} = taken "
-        f"{account.taken} + dropped {account.dropped} + queued {account.queued} + missed "
-        f"{account.missed}; the dashboard saw {status_count} statuses",
-        account=account,
+        f"   the recorder's counts: sent {counts.offered + counts.missed} = taken "
+        f"{counts.taken} + dropped {counts.dropped} + queued {counts.queued} + missed "
+        f"{counts.missed}; the dashboard saw {status_count} statuses",
+        counts=counts,
         statuses=status_count,
     )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from smartcam._cli.demo import Steps
-from smartcam._cli.options import naming_file_errors
+from smartcam._cli.options import label_file_errors
 from smartcam._cli.texts import table_text
 from smartcam._extras import load
 
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
     Pixels = NDArray[np.uint8]
 
-INSPECTION_NEEDS: Final = "inspection needs"
+CV2_PURPOSE: Final = "inspection needs"
+"""Beginning of the error if cv2 is missing."""
 
 SIZE_PX: Final = (640, 400)
 """Width and height of a picture, pixels."""
@@ -88,7 +89,7 @@ class DrawnPart(NamedTuple):
 PARTS: Final = (
     DrawnPart("good", ""),
     DrawnPart("turned", "", 300.0, 215.0, 14.0),
-    DrawnPart("dim", "", 330.0, 190.0, -11.0, noise=9.0),
+    DrawnPart("noisy", "", 330.0, 190.0, -11.0, noise=9.0),
     DrawnPart("no-hole", "hole", 310.0, 205.0, 5.0, hole=False),
     DrawnPart("wrong-code", "read", 325.0, 195.0, -6.0, code="LOT-47X1"),
     DrawnPart("bad-print", "print", 315.0, 210.0, 9.0, print="smartcar"),
@@ -101,10 +102,10 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     from smartcam.inspection import Picture, load_cell
 
     steps = Steps(options)
-    with naming_file_errors(f"--folder {folder}"):
+    with label_file_errors(f"--folder {folder}"):
         await asyncio.to_thread(_write_folder, folder, seed)
     steps.step(
-        f"A folder with drawn pictures of {len(PARTS)} parts, and a file with the expected "
+        f"A folder with synthetic pictures of {len(PARTS)} parts, and a file with the expected "
         f"findings: {folder / 'cell.yaml'}",
         folder=str(folder),
     )
@@ -112,13 +113,13 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     check = camera.program("check")
     steps.step("The application 3 reads, looks for a hole, and compares a print. Its results are:")
     steps.detail(f"   {check.interpret_as}", layout=check.interpret_as)
-    steps.step("Inspected, beside the truth:")
+    steps.step("Faults that the inspection found, next to the true ones:")
     rows: list[tuple[object, ...]] = []
     parts: list[dict[str, Any]] = []
     for part in PARTS:
         picture = await asyncio.to_thread(Picture.read, folder / "pictures" / f"{part.name}.png")
         inspection = await asyncio.to_thread(check.inspect, picture)
-        with naming_file_errors(f"--folder {folder}"):
+        with label_file_errors(f"--folder {folder}"):
             await asyncio.to_thread(
                 _save_findings, folder / "seen" / f"{part.name}.png", inspection
             )
@@ -158,12 +159,12 @@ def _save_findings(path: Path, inspection: Inspection) -> None:
 
 
 def _save(path: Path, pixels: NDArray[Any]) -> None:
-    path.write_bytes(load("cv2", INSPECTION_NEEDS).imencode(".png", pixels)[1].tobytes())
+    path.write_bytes(load("cv2", CV2_PURPOSE).imencode(".png", pixels)[1].tobytes())
 
 
 def draw_part(part: DrawnPart, random: np.random.Generator) -> Pixels:
     """Return a picture of a part, (H, W), uint8."""
-    cv2 = load("cv2", INSPECTION_NEEDS)
+    cv2 = load("cv2", CV2_PURPOSE)
     part_picture = _draw_upright_part(part)
     cos, sin = math.cos(math.radians(part.degrees)), math.sin(math.radians(part.degrees))
     rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]])
@@ -182,7 +183,7 @@ def draw_part(part: DrawnPart, random: np.random.Generator) -> Pixels:
 
 def _draw_upright_part(part: DrawnPart) -> Pixels:
     """Return an oversampled picture of the part from above, upright."""
-    cv2, zxing = load("cv2", INSPECTION_NEEDS), load("zxingcpp", "codes need")
+    cv2, zxing = load("cv2", CV2_PURPOSE), load("zxingcpp", "codes need")
     scale = OVERSAMPLING
     part_picture = np.full((scale * PART_PX[1], scale * PART_PX[0]), 215, np.uint8)
     if part.hole:

@@ -26,7 +26,7 @@ from smartcam._cli.demo_table import (
     TableRobot,
     radius_of,
 )
-from smartcam._cli.options import naming_file_errors
+from smartcam._cli.options import label_file_errors
 from smartcam._cli.texts import table_text
 from smartcam._extras import load
 from smartcam.emulator import TablePose
@@ -89,7 +89,7 @@ async def palletize(options: Options, folder: Path, seed: int, grid: Grid) -> No
     """
     load("scipy", "calibration needs")  # first, so that it fails before the other steps
     steps = Steps(options)
-    with naming_file_errors(f"--folder {folder}"):
+    with label_file_errors(f"--folder {folder}"):
         await asyncio.to_thread(folder.mkdir, parents=True, exist_ok=True)
     table = DrawnTable(seed)
     TableDriver.tables[table.address] = table
@@ -111,12 +111,13 @@ class _Demo(NamedTuple):
 async def _run(demo: _Demo) -> None:
     steps, table = demo.steps, demo.table
     steps.step(
-        f"A plain camera above a level table, drawn: {1e3 * table.pixel:g} mm a pixel, noise of "
-        f"{NOISE:g} grey levels. A robot beside it, which does not know where the table is.",
+        f"A simulated camera, which is not smart, above a level table: {1e3 * table.pixel:g} mm a "
+        f"pixel, noise of {NOISE:g} grey levels. A robot beside it, which does not know where the "
+        "table is.",
         address=table.address,
     )
     bracket = await _teach_parts(demo)
-    grip = table.reference_pose(TAUGHT_PART, bracket.reference)
+    reference = table.reference_pose(TAUGHT_PART, bracket.reference)
     await _calibrate(demo)
     pattern = _touch_pallet(demo)
     await _write_file(demo, CELL_FILE, CELL.format(address=table.address, most=MAX_PARTS))
@@ -128,7 +129,7 @@ async def _run(demo: _Demo) -> None:
             if not table.parts:
                 table.lay_parts("bracket", min(MAX_PARTS, len(pattern) - len(placed)))
             result = await camera.trigger(timeout=timeout)
-            _move_parts(demo, result.value, grip, pattern, placed, expected)
+            _move_parts(demo, result.value, reference, pattern, placed, expected)
             if not result.value.locate:
                 break
         last_value = (await camera.trigger(timeout=timeout)).value
@@ -159,7 +160,7 @@ async def _teach_parts(demo: _Demo) -> PartModel:
     rows: list[tuple[object, ...]] = []
     for part in (TablePart("mark", TablePose(0.15, 0.125, 0.0)), TAUGHT_PART):
         demo.table.parts = [part]
-        with naming_file_errors(f"--folder {demo.folder}"):
+        with label_file_errors(f"--folder {demo.folder}"):
             model = await asyncio.to_thread(_teach_part, demo, part)
         position_sigma, angle_sigma = model.predicted_sigma()
         rows.append(
@@ -171,7 +172,7 @@ async def _teach_parts(demo: _Demo) -> PartModel:
                 "-" if math.isnan(angle_sigma) else f"{math.degrees(angle_sigma):.4f} deg",
             )
         )
-    head = ("part", "symmetry", "pieces of edges", "a pose is good to", "")
+    head = ("part", "symmetry", "pieces of edges", "sigma of a pose", "")
     demo.steps.detail(table_text(head, rows))
     return model
 
@@ -207,7 +208,7 @@ async def _calibrate(demo: _Demo) -> PlaneCalibration:
     calibration = fit_plane(
         mark_points, touched_points, touch_sigma=TOUCH_SIGMA, tool_z=DOWN, y_down=True
     )
-    with naming_file_errors(f"--folder {demo.folder}"):
+    with label_file_errors(f"--folder {demo.folder}"):
         await asyncio.to_thread(calibration.save, demo.folder / "plane.json")
     held_out = calibration.held_out_error or math.nan
     demo.steps.step(
@@ -242,7 +243,7 @@ def _touch_pallet(demo: _Demo) -> PlacePattern:
 def _move_parts(
     demo: _Demo,
     value: Any,
-    grip: TablePose,
+    reference: TablePose,
     pattern: PlacePattern,
     placed: list[Placed],
     expected: list[float],
@@ -255,14 +256,14 @@ def _move_parts(
             break
         pose = (part.x, part.y, part.theta)
         sigma = math.hypot(part.sigma_x, part.sigma_y)
-        placed_part = demo.robot.palletize(pose, grip, pattern, number)
+        placed_part = demo.robot.palletize(pose, reference, pattern, number)
         placed.append(placed_part)
         expected.append(sigma)
         rows.append(
             (
                 *(f"{1e3 * length:.2f}".rjust(8) for length in (part.x, part.y)),
                 *(f"{1e3 * length:.3f}" for length in (placed_part.error, sigma)),
-                f"{math.degrees(placed_part.turned):+.3f}",
+                f"{math.degrees(placed_part.heading_error):+.3f}",
                 f"{math.degrees(part.sigma_theta):.3f}",
                 "/".join(str(1 + count) for count in pattern.row_column_layer(number))
                 if placed_part.taken
@@ -282,7 +283,7 @@ def _move_parts(
 
 
 async def _write_file(demo: _Demo, name: str, text: str) -> None:
-    with naming_file_errors(f"--folder {demo.folder}"):
+    with label_file_errors(f"--folder {demo.folder}"):
         await asyncio.to_thread((demo.folder / name).write_text, text, encoding="utf-8")
 
 

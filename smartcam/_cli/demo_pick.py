@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import smartcam
 from smartcam._cli.demo import Steps
-from smartcam._cli.options import naming_file_errors
+from smartcam._cli.options import label_file_errors
 from smartcam._cli.texts import table_text
 from smartcam.emulator import EmulatedCamera, TablePose
 from smartcam.emulator._inside import TABLE_SIZE
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.geometry import Transform
     from smartcam.models import Localization
 
-TANGRAM: Final = 7
+TANGRAM_ID: Final = 7
 
 TOUCH_SIGMA: Final = 2e-4
 """Standard deviation of a touch along each of the robot's axes, metres."""
@@ -48,7 +48,7 @@ class Pick(NamedTuple):
     z: float  # z
     error: float  # distance from there to the part, metres
     predicted: float  # rms of the error to expect there, metres
-    turned: float  # error of the gripper's heading, radians
+    heading_error: float  # error of the gripper's heading, radians
     taken: bool  # whether the gripper was near enough
 
 
@@ -81,8 +81,8 @@ class SimulatedRobot:
 
     def touch(self, mark: TablePose) -> NDArray[Any]:
         """Return the robot's reading when its tip touches a mark, (3,) in metres."""
-        true = self.table.apply([mark.x, mark.y, 0.0])
-        return true + self._random.normal(0.0, TOUCH_SIGMA, 3)
+        true_point = self.table.apply([mark.x, mark.y, 0.0])
+        return true_point + self._random.normal(0.0, TOUCH_SIGMA, 3)
 
     def pick(self, part: Localization, predicted: float) -> Pick:
         """Go to a part and close the gripper, which takes the part if it is near enough.
@@ -96,14 +96,14 @@ class SimulatedRobot:
         gripper = Transform.from_quaternion("robot", "part", pose.position, pose.orientation)
         pose_on_table = self.table.inverse() @ gripper
         x, y, z = pose_on_table.translation.tolist()
-        true = self._scene.pieces[part.feature_id]
-        error = math.dist((x, y, z), (true.x, true.y, 0.0))
+        true_pose = self._scene.pieces[part.feature_id]
+        error = math.dist((x, y, z), (true_pose.x, true_pose.y, 0.0))
         heading = math.atan2(pose_on_table.rotation[1, 0], pose_on_table.rotation[0, 0])
-        turned = math.remainder(heading - true.theta, math.tau)
+        heading_error = math.remainder(heading - true_pose.theta, math.tau)
         taken = error < MAX_GRIP_ERROR
         if taken:
             del self._scene.pieces[part.feature_id]
-        return Pick(part.feature_id, *pose.position, error, predicted, turned, taken)
+        return Pick(part.feature_id, *pose.position, error, predicted, heading_error, taken)
 
 
 async def pick(options: Options, picture: str, seed: int) -> None:
@@ -117,7 +117,7 @@ async def pick(options: Options, picture: str, seed: int) -> None:
 
     load("scipy")  # first, so that it fails before the other steps
     steps = Steps(options)
-    async with EmulatedCamera(active=TANGRAM, seed=seed) as emulator:
+    async with EmulatedCamera(active=TANGRAM_ID, seed=seed) as emulator:
         robot = SimulatedRobot(emulator.scene, seed)
         steps.step(
             f"A camera above a table: {emulator.url}. A robot beside it, which does not know where "
@@ -125,7 +125,7 @@ async def pick(options: Options, picture: str, seed: int) -> None:
             url=emulator.url,
         )
         async with smartcam.connect(
-            emulator.url, name="demo", application=TANGRAM, interpret_as="localizations"
+            emulator.url, name="demo", application=TANGRAM_ID, interpret_as="localizations"
         ) as camera:
             timeout = options.step_timeout(5.0)
             pieces = dict(emulator.scene.pieces)
@@ -213,7 +213,7 @@ def _pick_all(
         (
             pick.part,
             *_mm_texts(pick.x, pick.y, pick.z, pick.error, pick.predicted),
-            f"{math.degrees(pick.turned):+.2f} deg",
+            f"{math.degrees(pick.heading_error):+.2f} deg",
             "picked" if pick.taken else "missed",
         )
         for pick in picks
@@ -250,6 +250,6 @@ def _write_picture(
     from smartcam.calibration._inside import draw
 
     text = draw(calibration, parts, title="smartcam demo --pick")
-    with naming_file_errors(f"--picture {path}"):
+    with label_file_errors(f"--picture {path}"):
         Path(path).write_text(text, encoding="utf-8", newline="\n")
     steps.step(f"The touches, their errors and the calibration's uncertainty: {path}", picture=path)

@@ -270,7 +270,7 @@ class Placed(NamedTuple):
     x: float  # place that the robot went to, metres in the robot's frame: x
     y: float  # y
     error: float  # distance from there to the part, metres
-    turned: float  # error of the gripper's heading, radians
+    heading_error: float  # error of the gripper's heading, radians
     taken: bool  # whether the gripper was near enough
     off_place: float  # distance of the part from its place on the pallet, metres; NaN: none there
 
@@ -308,47 +308,47 @@ class TableRobot:
             self._pallet_pose.apply([column * PITCH[0], row * PITCH[1], 0.0])
         )
 
-    def _add_touch_noise(self, true: Array) -> list[float]:
-        reading: list[float] = (true + self._random.normal(0.0, TOUCH_SIGMA, 3)).tolist()
+    def _add_touch_noise(self, true_point: Array) -> list[float]:
+        reading: list[float] = (true_point + self._random.normal(0.0, TOUCH_SIGMA, 3)).tolist()
         return reading
 
     def palletize(
         self,
         pose: tuple[float, float, float],
-        grip: TablePose,
+        reference: TablePose,
         pattern: PlacePattern,
         number: int,
     ) -> Placed:
         """Pick the part that is nearest to a found pose, and put it onto a place of the pallet.
 
         ``pose``: x and y (metres) and heading of the part's reference in the robot's frame;
-        ``grip``: the true pose of the reference in the part's frame.
+        ``reference``: the true pose of the reference in the part's frame.
         """
         offset, part = min(
-            ((self._reference_error(part, pose, grip), part) for part in self._table.parts),
+            ((self._reference_error(part, pose, reference), part) for part in self._table.parts),
             key=lambda pair: abs(pair[0][0]),
         )
-        error, turned = abs(offset[0]), offset[1]
+        error, heading_error = abs(offset[0]), offset[1]
         if error > MAX_GRIP_ERROR:
-            return Placed(pose[0], pose[1], error, turned, False, math.nan)
+            return Placed(pose[0], pose[1], error, heading_error, False, math.nan)
         self._table.parts.remove(part)
         row, column, layer = pattern.row_column_layer(number)
-        true = self._pallet_pose.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
+        true_place = self._pallet_pose.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
         # the part does not move in the gripper, so its offset turns with the gripper
         place = pattern[number]
         part_offset = place.rotation[:2, :2] @ _rotate([offset[0].real, offset[0].imag], -pose[2])
-        off_place = float(np.linalg.norm(place.translation[:2] + part_offset - true[:2]))
-        return Placed(pose[0], pose[1], error, turned, True, off_place)
+        off_place = float(np.linalg.norm(place.translation[:2] + part_offset - true_place[:2]))
+        return Placed(pose[0], pose[1], error, heading_error, True, off_place)
 
     def _reference_error(
-        self, part: TablePart, found_pose: tuple[float, float, float], grip: TablePose
+        self, part: TablePart, found_pose: tuple[float, float, float], reference: TablePose
     ) -> tuple[complex, float]:
         """Return the offset of a part's true reference from the found pose, and its rotation."""
         pose = part.pose
-        x, y = _rotate([grip.x, grip.y], pose.theta).tolist()
-        true = self._table_pose.apply([pose.x + x, pose.y + y, 0.0])
-        heading = pose.theta + grip.theta + math.atan2(*self._table_pose.rotation[1::-1, 0])
-        offset = complex(true[0] - found_pose[0], true[1] - found_pose[1])
+        x, y = _rotate([reference.x, reference.y], pose.theta).tolist()
+        true_point = self._table_pose.apply([pose.x + x, pose.y + y, 0.0])
+        heading = pose.theta + reference.theta + math.atan2(*self._table_pose.rotation[1::-1, 0])
+        offset = complex(true_point[0] - found_pose[0], true_point[1] - found_pose[1])
         return offset, math.remainder(found_pose[2] - heading, math.tau)
 
 

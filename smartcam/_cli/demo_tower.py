@@ -90,14 +90,14 @@ class Compared(NamedTuple):
 
     what: str
     found: BlockPose
-    beside: float
+    offset: float
     turned: float
     higher: float
 
     @property
     def errors(self) -> tuple[float, float, float]:
         """Magnitude of each error, in the order of :data:`TOLERANCE`."""
-        return self.beside, abs(self.turned), abs(self.higher)
+        return self.offset, abs(self.turned), abs(self.higher)
 
 
 async def tower(
@@ -146,7 +146,7 @@ class Measurements(NamedTuple):
     """The measurements that the robot makes before it moves a block."""
 
     blocks: list[BlockPose]  # blocks that lie on the table
-    reached: list[BlockPose]  # blocks within reach of the gripper
+    within_reach: list[BlockPose]  # blocks within reach of the gripper
     block: BlockPose  # block to take
     top: BlockPose  # block on top of the tower
 
@@ -160,12 +160,12 @@ def _measure(table: TowerTable, colours: ColourRange) -> Measurements:
     overview = table.look(OVERVIEW)
     depth = SpatialFilter(delta=MIN_DEPTH_STEP)(overview.depth[0])
     blocks = find_loose_blocks(overview, depth, colours)
-    least, most = REACH_RANGE
-    within_reach = [block for block in blocks if least <= math.hypot(block.x, block.y) <= most]
+    low, high = REACH_RANGE
+    within_reach = [block for block in blocks if low <= math.hypot(block.x, block.y) <= high]
     if not within_reach:
         raise FrameFormatError(
-            f"{CAMERA_NAME}: expected a block within {least:g} to {most:g} m of the robot, got "
-            f"{len(blocks)} that are not: nothing to pick",
+            f"{CAMERA_NAME}: expected a block within {low:g} to {high:g} m of the "
+            f"robot, got {len(blocks)} that are not: nothing to pick",
             source=CAMERA_NAME,
         )
     nearest = min(within_reach, key=lambda block: math.hypot(block.x, block.y))
@@ -192,23 +192,22 @@ def _put_block(
     ]
     steps.step(
         f"Layer {layer}: {len(measurements.blocks)} black blocks lie on the table, "
-        f"{len(measurements.reached)} within reach. The nearest of these, and the tower's top:",
+        f"{len(measurements.within_reach)} within reach. The nearest, and the tower's top:",
         layer=layer,
         seen=len(measurements.blocks),
-        reached=len(measurements.reached),
+        within_reach=len(measurements.within_reach),
     )
     values = [row._asdict() | {"found": row.found._asdict()} for row in rows]
     steps.detail(_text(rows), compared=values)
     if table.held is None:
         raise FrameFormatError(
-            f"{CAMERA_NAME}: the gripper closed {1e3 * grip.off:.1f} mm beside the block, on "
-            "nothing",
+            f"{CAMERA_NAME}: the gripper closed {1e3 * grip.off:.1f} mm off the block, on nothing",
             source=CAMERA_NAME,
         )
     placed_block = table.place(top.x, top.y, top.angle + math.pi / 2)
     steps.detail(
-        f"   picked, and put down across at {1e3 * top.height:.1f} mm; the tower is now "
-        f"{1e3 * placed_block.top:.1f} mm high",
+        f"   picked, and put down crosswise at a height of {1e3 * top.height:.1f} mm; the tower is "
+        f"now {1e3 * placed_block.top:.1f} mm high",
         height=placed_block.top,
     )
     return rows
@@ -246,11 +245,11 @@ def measure_block(table: TowerTable, rough: BlockPose, colours: ColourRange) -> 
     if not poses:
         raise _nothing_found_error(sight, colours)
     block = min(poses, key=lambda pose: math.dist(pose[:2], rough[:2]))
-    beside = math.dist(block[:2], rough[:2])
-    if beside > BLOCK[1] / 2:
+    offset = math.dist(block[:2], rough[:2])
+    if offset > BLOCK[1] / 2:
         raise FrameFormatError(
             f"{CAMERA_NAME}: expected the block that was seen from above, got one "
-            f"{1e3 * beside:.0f} mm beside it: something has moved",
+            f"{1e3 * offset:.0f} mm away from it: something has moved",
             source=CAMERA_NAME,
         )
     return block
@@ -308,8 +307,8 @@ def _find_block_regions(sight: TableSight, colours: ColourRange) -> list[ColourR
 def _area_limits(sight: TableSight) -> tuple[float, float]:
     """Return the least and largest area of a block on the table, pixels."""
     scale = FOCAL / (sight.camera[2] - BLOCK[2])
-    least, most = (part * BLOCK[0] * BLOCK[1] * scale**2 for part in AREA_RANGE)
-    return least, most
+    min_area, max_area = (part * BLOCK[0] * BLOCK[1] * scale**2 for part in AREA_RANGE)
+    return min_area, max_area
 
 
 def _find_high_regions(sight: TableSight, depth: NDArray[np.float32]) -> list[ColourRegion]:
@@ -326,11 +325,11 @@ def _find_high_regions(sight: TableSight, depth: NDArray[np.float32]) -> list[Co
 
 
 def _without_rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask without its rim."""
+    """Return the mask of a region without its rim; it must not touch the border of the picture."""
     inner = mask.copy()
     for axis in (0, 1):
         for step in (-RIM_WIDTH_PX, RIM_WIDTH_PX):
-            inner &= np.roll(mask, step, axis)  # a whole region does not touch the rim
+            inner &= np.roll(mask, step, axis)
     return inner
 
 
@@ -342,14 +341,14 @@ def _block_pose(sight: TableSight, region: ColourRegion, height: float) -> Block
 
 def _nothing_found_error(sight: TableSight, colours: ColourRange) -> FrameFormatError:
     """Return an error that describes the regions of a colour, none of which is a block."""
-    least, most = _area_limits(sight)
-    regions = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
+    min_area, max_area = _area_limits(sight)
+    regions = find_regions(colours.mask(sight.rgb), area=(min_area / 10, math.inf))
     found = "none of it"
     if regions:
         found = f"{len(regions)} regions of it, the largest {_region_text(regions[0])}"
     return FrameFormatError(
         f"{CAMERA_NAME}: expected a block on the table of the colour {colours.as_json()}, "
-        f"{least:.0f} to {most:.0f} pixels with sides of {SIDE_RATIO_RANGE[0]:g}:1 to "
+        f"{min_area:.0f} to {max_area:.0f} pixels with sides of {SIDE_RATIO_RANGE[0]:g}:1 to "
         f"{SIDE_RATIO_RANGE[1]:g}:1, got {found}",
         source=CAMERA_NAME,
     )
@@ -363,18 +362,18 @@ def _region_text(region: ColourRegion) -> str:
 
 
 def _compare(label: str, measured: BlockPose, true: WoodenBlock) -> Compared:
-    beside = math.hypot(measured.x - true.x, measured.y - true.y)
+    offset = math.hypot(measured.x - true.x, measured.y - true.y)
     turned = math.remainder(measured.angle - true.angle, math.pi)
-    return Compared(label, measured, beside, turned, measured.height - true.top)
+    return Compared(label, measured, offset, turned, measured.height - true.top)
 
 
 def _text(rows: list[Compared]) -> str:
     head = ("mm, degrees", *(title.rjust(8) for title in ("x", "y", "angle", "height")))
-    titles = [title.rjust(8) for title in ("beside", "turned", "higher", "sigma")]
+    titles = [title.rjust(8) for title in ("offset", "turned", "higher", "sigma")]
     cells: list[tuple[Any, ...]] = []
-    for label, block, beside, turned, higher in rows:
+    for label, block, offset, turned, higher in rows:
         values = (1e3 * block.x, 1e3 * block.y, math.degrees(block.angle), 1e3 * block.height)
-        errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * block.sigma)
+        errors = (1e3 * offset, math.degrees(turned), 1e3 * higher, 1e3 * block.sigma)
         measured_errors = (
             errors if block.sigma else errors[:2]
         )  # otherwise its height was not measured
@@ -385,23 +384,23 @@ def _text(rows: list[Compared]) -> str:
 
 def _report_errors(comparisons: list[Compared], table: TowerTable, steps: Steps) -> None:
     """Print the largest errors; raise SystemExit if one of them is above its tolerance."""
-    beside, turned, higher = (
-        max(row.errors[place] for row in comparisons) for place in range(len(TOLERANCE))
+    offset, turned, higher = (
+        max(row.errors[index] for row in comparisons) for index in range(len(TOLERANCE))
     )
     within = all(
-        error <= most
+        error <= tolerance
         for row in comparisons
-        for error, most in zip(row.errors, TOLERANCE, strict=True)
+        for error, tolerance in zip(row.errors, TOLERANCE, strict=True)
     )
-    most = f"{1e3 * TOLERANCE[0]:g} mm, {math.degrees(TOLERANCE[1]):g} degree"
+    tolerances = f"{1e3 * TOLERANCE[0]:g} mm, {math.degrees(TOLERANCE[1]):g} degree"
     stack = table.tower()
     steps.step(
         f"The tower has {len(stack)} layers, {1e3 * stack[-1].top:.1f} mm. At worst "
-        f"{1e3 * beside:.2f} mm beside, {math.degrees(turned):.2f} degrees turned, "
-        f"{1e3 * higher:.2f} mm of height: {'all' if within else 'not all'} within {most}, "
+        f"{1e3 * offset:.2f} mm off, {math.degrees(turned):.2f} degrees turned, "
+        f"{1e3 * higher:.2f} mm of height: {'all' if within else 'not all'} within {tolerances}, "
         f"{1e3 * TOLERANCE[2]:g} mm",
         within=within,
-        beside=beside,
+        offset=offset,
         turned=turned,
         height=higher,
     )

@@ -42,8 +42,8 @@ class PalletSize(_ParamType):
 @click.option(
     "--plain",
     is_flag=True,
-    help="With --pick: locate a taught part in the drawn pictures of a plain camera, and put the "
-    'parts onto a pallet. Needs the extra "inspection".',
+    help="With --pick: locate a taught part in synthetic pictures of a camera that is not smart, "
+    'and put the parts onto a pallet. Needs the extra "inspection".',
 )
 @click.option(
     "--pallet",
@@ -56,8 +56,8 @@ class PalletSize(_ParamType):
     "--fleet",
     "use_fleet",
     is_flag=True,
-    help="Share ten cameras by two agents, and one of them by three programs, instead. Needs the "
-    'extra "fleet".',
+    help="Have two agents share ten cameras, and three programs use one of these, instead. Needs "
+    'the extra "fleet".',
 )
 @click.option(
     "--tower",
@@ -69,7 +69,7 @@ class PalletSize(_ParamType):
     "--inspect",
     "use_inspection",
     is_flag=True,
-    help="Read, check and compare drawn parts by a software camera, instead, and draw its "
+    help="Read, check and compare synthetic parts by a software camera, instead; draw its "
     'findings. Needs the extra "inspection".',
 )
 @click.option(

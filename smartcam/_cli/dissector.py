@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import async_command, naming_file_errors, option
+from smartcam._cli.options import async_command, label_file_errors, option
 
 if TYPE_CHECKING:
     from smartcam._cli.options import Options
@@ -32,5 +32,5 @@ async def dissector(output: str | None, options: Options) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    with naming_file_errors(f"--output {path}"):
+    with label_file_errors(f"--output {path}"):
         path.write_text(text, encoding="ascii")

@@ -15,8 +15,8 @@ from smartcam._cli.texts import table_text
 if TYPE_CHECKING:
     from smartcam.doctor._inside import Finding
 
-MAX_BROKEN_LINES = 4
-"""Largest number of lines with broken frames below a finding."""
+MAX_INVALID_FRAMES = 4
+"""Largest number of invalid frames below a finding."""
 
 
 @click.command(
@@ -40,7 +40,7 @@ MAX_BROKEN_LINES = 4
 @option("--seconds", help="Seconds to watch for unasked results; 3 by default.")
 @async_command(*CAMERA_OPTIONS)
 async def doctor(url: str, trigger: bool, options: Options) -> None:
-    """Print each finding of an examination at once; end with the exit code of the worst."""
+    """Print each finding as soon as it is known; end with the exit code of the worst."""
     from smartcam.doctor import examine
     from smartcam.doctor._inside import summary
 
@@ -70,7 +70,7 @@ async def doctor(url: str, trigger: bool, options: Options) -> None:
 def _finding_text(finding: Finding) -> str:
     severity = coloured(finding.severity, f"{finding.severity:<8}")
     lines = [f"{severity} {finding.check}: {finding.text}"]
-    lines += [f"         {line}" for line in _broken_frames(finding)]
+    lines += [f"         {line}" for line in _invalid_frames(finding)]
     if finding.cure:
         lines.append(f"         -> {finding.cure}")
     rows = finding.details.get("dump")
@@ -80,8 +80,8 @@ def _finding_text(finding: Finding) -> str:
     return "\n".join(lines)
 
 
-def _broken_frames(finding: Finding) -> list[str]:
-    """Return the last broken frames as text; their bytes help the camera's owner most."""
+def _invalid_frames(finding: Finding) -> list[str]:
+    """Return the last invalid frames as text; their bytes help the camera's owner most."""
     frames = [entry for trial in finding.details.get("frames", ()) for entry in trial]
-    broken = {entry.hex: frame_text(entry) for entry in reversed(frames) if entry.direction == "!"}
-    return list(broken.values())[:MAX_BROKEN_LINES]
+    invalid = {entry.hex: frame_text(entry) for entry in reversed(frames) if entry.direction == "!"}
+    return list(invalid.values())[:MAX_INVALID_FRAMES]

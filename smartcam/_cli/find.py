@@ -38,7 +38,7 @@ _EVIDENCE_TEXTS = {
     "greeted": "greets as {protocols}: {greeting}",
     "silent": "silent, as {protocols} is before a client speaks",
     "said": "may be {protocols}: {greeting}",
-    "ended": "hangs up at once: {protocols} with a client, or something else",
+    "ended": "closes the connection at once: {protocols} with another client, or another service",
 }
 """The text about the received bytes, by kind of evidence."""
 
@@ -102,7 +102,7 @@ _EVIDENCE_TEXTS = {
     type=click.FloatRange(0, MAX_SECONDS, min_open=True),
     default=1.0,
     show_default=True,
-    help="Seconds until a port is open, and as many again to read unasked bytes.",
+    help="Seconds to wait for a connection, and again as many for a greeting.",
 )
 @click.option(
     "--max-addresses",

@@ -37,7 +37,7 @@ _EVENT_TEXTS = {
 }
 """The text for an event, by the name of its class."""
 
-_READING_OPTIONS = ("--interpret-as", "--y-down", "--calibration", "--units")
+_VALUE_OPTIONS = ("--interpret-as", "--y-down", "--calibration", "--units")
 
 
 @click.group(
@@ -45,7 +45,7 @@ _READING_OPTIONS = ("--interpret-as", "--y-down", "--calibration", "--units")
     help="Show and use the cameras of a fleet together. URL is fleet://HOST[:PORT], or a fleet "
     "file, whose agent and cameras then run in this process, for this command only. PATTERN "
     "selects cameras by their names: * is one part of a name, ** any number of them; default "
-    'all. Needs the extra "fleet", but for a file.',
+    'all. A URL needs the extra "fleet".',
 )
 def fleet() -> None:
     """Register the commands of a fleet."""
@@ -58,14 +58,14 @@ def _make_fleet(url: str, options: Options) -> Fleet:
     from smartcam.fleet import open
 
     return open(
-        url, connect_timeout=options.step_timeout(10.0), **options.reading_options(fleet=True)
+        url, connect_timeout=options.step_timeout(10.0), **options.interpret_options(fleet=True)
     )
 
 
 def _require_cameras(fleet: Fleet) -> None:
     """Raise ConnectFailedError if the fleet has no cameras."""
     if not len(fleet):
-        raise ConnectFailedError(f"no agent of {fleet.url} is there")
+        raise ConnectFailedError(f"{fleet.url}: no agent shares a camera")
 
 
 # ---------------------------------------------------------------------- list
@@ -88,7 +88,7 @@ async def list_(url: str, pattern: str, options: Options) -> None:
             options.show(value, "")
         return
     if not cameras:
-        click.echo(f"no camera of the fleet is {pattern}")
+        click.echo(f"no camera of the fleet matches {pattern}")
         return
     head = ("camera", "agent", "application", "status", "url")
     click.echo(table_text(head, [_camera_row(value) for value in cameras]))
@@ -136,7 +136,7 @@ def _camera_row(value: dict[str, Any]) -> tuple[str, ...]:
 @click.argument("url")
 @click.argument("pattern", default="**")
 @async_command(
-    *_READING_OPTIONS, "--count", "--seconds", "--timeout", *OUTPUT_OPTIONS, interrupt_code=0
+    *_VALUE_OPTIONS, "--count", "--seconds", "--timeout", *OUTPUT_OPTIONS, interrupt_code=0
 )
 async def watch(url: str, pattern: str, options: Options) -> None:
     async with _make_fleet(url, options) as fleet:
@@ -186,7 +186,7 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
     async with _make_fleet(url, options) as fleet:
         outcomes = await fleet.reload(agent, timeout=options.step_timeout(30.0))
     if not outcomes:
-        raise ConnectFailedError(f"no agent of {fleet.url} is there")
+        raise ConnectFailedError(f"{fleet.url}: no agent answers")
     codes: list[int] = []
     for name, outcome in outcomes.items():
         if isinstance(outcome, SmartCamError):
@@ -202,8 +202,8 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
 
 
 @fleet.command(
-    help="Show the accounts of outlets: results = delivered + spooled + dropped. PLACE is a "
-    "fleet's URL, whose agents are asked, or a fleet file, whose spools are read, with or "
+    help="Show the counts of outlets: results = delivered + spooled + dropped. URL: asks the "
+    "agents of a fleet; FLEET.yaml: reads the spools of the outlets in the file, with or "
     "without a running agent."
 )
 @click.argument("url_or_file", metavar="URL|FLEET.yaml")
@@ -224,31 +224,31 @@ async def outlets(url_or_file: str, options: Options) -> None:
     for name, account in stored_counts(section, Path(url_or_file).parent).items():
         fields = {} if account is None else account.fields()
         if options.as_json:
-            options.show({"outlet": name, "account": fields or None}, "")
-        rows.append((name, *_account_row(fields)))
+            options.show({"outlet": name, "counts": fields or None}, "")
+        rows.append((name, *_counts_row(fields)))
     if not options.as_json:
         head = ("outlet", "results", "delivered", "spooled", "dropped")
         click.echo(table_text(head, rows) if rows else "the file has no outlets")
 
 
-def _account_row(fields: dict[str, Any]) -> tuple[str, ...]:
+def _counts_row(fields: dict[str, Any]) -> tuple[str, ...]:
     dropped = ", ".join(f"{count} {reason}" for reason, count in fields.get("dropped", {}).items())
     numbers = [str(fields.get(key, "")) for key in ("results", "delivered", "spooled")]
     return (*numbers, dropped or "0" if fields else "no spool yet")
 
 
 async def _ask_outlets(url: str, options: Options) -> None:
-    """Ask a fleet's agents for the accounts of their outlets, and show them."""
+    """Ask a fleet's agents for the counts of their outlets, and show them."""
     async with _make_fleet(url, options) as fleet:
         outlets = await fleet.outlets(timeout=options.step_timeout(5.0))
     if options.as_json:
         for outlet in outlets:
-            account = outlet._asdict()
-            labels = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
-            options.show({**labels, "account": account}, "")
+            counts = outlet._asdict()
+            labels = {key: counts.pop(key) for key in ("agent", "outlet", "trouble")}
+            options.show({**labels, "counts": counts}, "")
         return
     rows = [
-        (outlet.agent, outlet.outlet, *_account_row(outlet._asdict()), outlet.trouble or "well")
+        (outlet.agent, outlet.outlet, *_counts_row(outlet._asdict()), outlet.trouble or "well")
         for outlet in outlets
     ]
     head = ("agent", "outlet", "results", "delivered", "spooled", "dropped", "state")
@@ -277,8 +277,8 @@ async def take_back(url: str, camera: str, options: Options) -> None:
 
 @fleet.command(
     help="Serve a page of all cameras until Ctrl-C: state, rate, last result, outcomes, errors, "
-    "and a page for each. The page's address goes to stdout. The command waits for a fleet whose "
-    'agents do not run. Needs the extra "web", too.'
+    "and a page for each. The page's address goes to stdout. If no agent runs yet, the command "
+    'waits for one. Needs the extra "web", too.'
 )
 @click.argument("url")
 @click.option(
@@ -286,7 +286,7 @@ async def take_back(url: str, camera: str, options: Options) -> None:
 )
 @page_options(always=True)
 @async_command(
-    *_READING_OPTIONS, "--seconds", "--timeout", *OUTPUT_OPTIONS, interrupt_code=0, terminate_code=0
+    *_VALUE_OPTIONS, "--seconds", "--timeout", *OUTPUT_OPTIONS, interrupt_code=0, terminate_code=0
 )
 async def page(url: str, control: bool, web: PageOptions, options: Options) -> None:
     from smartcam.web import FleetSite
@@ -335,7 +335,7 @@ async def _wait_for_fleet(url: str, options: Options) -> AsyncGenerator[Fleet]:
 @click.argument("url")
 @click.argument("pattern", default="**")
 @click.option("--input", "input_hex", metavar="HEX", help="Input data for the inspections.")
-@async_command(*_READING_OPTIONS, "--timeout", *OUTPUT_OPTIONS)
+@async_command(*_VALUE_OPTIONS, "--timeout", *OUTPUT_OPTIONS)
 async def trigger(url: str, pattern: str, input_hex: str | None, options: Options) -> None:
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 

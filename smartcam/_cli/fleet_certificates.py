@@ -11,7 +11,7 @@ import click
 
 from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command
 from smartcam._cli.texts import table_text
-from smartcam._cli.usage import JsonErrors
+from smartcam._cli.usage import JsonErrorCommand
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,7 +26,7 @@ def _names_option(option: str, variable: str, text: str) -> Callable[[F], F]:
 
 
 @click.command(
-    cls=JsonErrors,
+    cls=JsonErrorCommand,
     help="Make certificates for a fleet over TLS, each with a role: agents share cameras, viewers "
     "read, operators also command, and Zenoh routers forward. DIR gets an authority "
     "the first time, with its key, and a folder for each name, with instructions for its "

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @click.option("--load", metavar="SET", help="Have the device load a user set, such as Default.")
 @click.option("--execute", multiple=True, metavar="COMMAND", help="Execute a command.")
 @click.option("--save", metavar="SET", help="Have the device keep its features in a user set.")
-@option("--timeout", help="Longest time for each of these.  [default: 10]")
+@option("--timeout", help="Longest time for each feature, command or set.  [default: 10]")
 @async_command(*OUTPUT_OPTIONS)
 async def features_command(
     url: str,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameReader, FrameSource
 
 STAMP_PERIOD: Final = 0.1
-"""Seconds between two searches for a stamp, so that they take little of the processor's time."""
+"""Seconds between two searches for a stamp: the time, which synthetic:// draws into pictures."""
 
 STAMP_ROWS: Final = 16
 """Number of rows of a picture that a stamp covers."""
@@ -122,12 +122,12 @@ class _ReceivedFrames:
         lost = reader.statistics().lost
         self._delivered = 1
         async for frame in reader:
-            account = reader.statistics()
-            if account.skipped == self._skipped and not frame.lost:
+            statistics = reader.statistics()
+            if statistics.skipped == self._skipped and not frame.lost:
                 self._intervals.append(frame.captured - self._last.captured)
-            self._frames_received = account.delivered + account.skipped
-            self._delivered, self._skipped = account.delivered, account.skipped
-            self._lost = account.lost - lost
+            self._frames_received = statistics.delivered + statistics.skipped
+            self._delivered, self._skipped = statistics.delivered, statistics.skipped
+            self._lost = statistics.lost - lost
             self._last = frame
             self._note_frame(frame)
 
@@ -173,9 +173,9 @@ def _spread(seconds: Sequence[float]) -> dict[str, float | None] | None:
     """Return the median, the 99th percentile and the maximum, in milliseconds."""
     if not seconds:
         return None
-    ordered = sorted(seconds)
+    in_order = sorted(seconds)
     shares = {"median": 0.5, "p99": 0.99, "worst": 1.0}
-    return {name: _ms(ordered[round(part * (len(ordered) - 1))]) for name, part in shares.items()}
+    return {name: _ms(in_order[round(part * (len(in_order) - 1))]) for name, part in shares.items()}
 
 
 def measurement_text(value: dict[str, Any]) -> str:

@@ -31,7 +31,7 @@ DESCRIPTION_TIMEOUT = 5.0
 """Longest time to wait for the first frame, which completes the description, seconds."""
 
 
-class Players(NamedTuple):
+class Outputs(NamedTuple):
     """The streams that are served in addition to the page.
 
     Attributes:
@@ -106,23 +106,23 @@ def rtsp_urls(
 # ---------------------------------------------------------------------- RTP
 
 
-async def send_rtp(source: FrameSource, players: Players, options: Options) -> None:
+async def send_rtp(source: FrameSource, outputs: Outputs, options: Options) -> None:
     """Send a source by RTP whenever it is open, until cancelled; publish its SDP description.
 
     Raises ConfigurationError: the address is not valid, or the file cannot be written.
     """
     from smartcam.frames import RtpSender
 
-    host, port = players.rtp or ("", 0)
+    host, port = outputs.rtp or ("", 0)
     receiver = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     last_sdp, last_note, delays = "", "", Backoff().delays()
     while True:
         try:
             async with RtpSender(source, receiver) as sender:
                 await _wait_for_frame(sender)
-                if sender.sdp != last_sdp and (players.sdp is not None or not last_sdp):
+                if sender.sdp != last_sdp and (outputs.sdp is not None or not last_sdp):
                     await _describe(
-                        receiver, sender.sdp, players.sdp, options, is_update=bool(last_sdp)
+                        receiver, sender.sdp, outputs.sdp, options, is_update=bool(last_sdp)
                     )
                     last_sdp = sender.sdp
                 last_note, delays = "", Backoff().delays()

@@ -57,8 +57,8 @@ frames.add_command(force_address_command)
 
 @frames.command(
     name="list",
-    help="List the devices that are found on this machine and its network: the URL that opens "
-    "each, its formats, and the reason why it cannot be opened.",
+    help="List the devices that are found on this machine and its network: the URL of each, "
+    "its formats and, if it cannot be opened, the reason.",
 )
 @click.option("--scheme", metavar="SCHEME", help="Only search for this scheme, such as v4l2.")
 @option("--timeout", help="Longest time of the search.  [default: 5]")
@@ -165,7 +165,7 @@ def _check_suffix(_context: object, _option: object, file: str) -> str:
     help="Write the newest frame to a file, or several. The suffix sets the format: .png and .jxl "
     "(JPEG XL) lose nothing, with 16 bits if the camera sends more than 8; .jpg; .npy (the "
     "array of numpy) and .raw have the pixels as the camera sends them. JPEGs of a camera "
-    'are written unchanged. Needs the extra "frames", but for .npy and .raw.'
+    'are written unchanged. Needs the extra "frames", except for .npy and .raw.'
 )
 @click.argument("url")
 @option("--output", required=True, callback=_check_suffix)
@@ -234,9 +234,9 @@ async def grab(
             if written_count < len(files):
                 next_frame = source.trigger(timeout=timeout) if trigger else anext(reader)
                 frame = await _await_frame(next_frame, source, written_count, len(files))
-        account = reader.statistics()
-    if len(files) > 1 and not trigger and (account.skipped or account.lost):
-        click.echo(f"note: {account.skipped} skipped, {account.lost} lost", err=True)
+        statistics = reader.statistics()
+    if len(files) > 1 and not trigger and (statistics.skipped or statistics.lost):
+        click.echo(f"note: {statistics.skipped} skipped, {statistics.lost} lost", err=True)
 
 
 async def _await_frame(next_frame: Any, source: FrameSource, count: int, expected: int) -> Frame:
@@ -297,7 +297,7 @@ def _write(file: str, data: bytes) -> None:
 @frames.command(
     name="measure",
     help="Read a source for some seconds and report its rate and jitter, the age of arriving "
-    "frames, lost and skipped frames, and this process' part of a core. The latency is "
+    "frames, lost and skipped frames, and the CPU load of this process. The latency is "
     "measured by the stamp that synthetic:// on this machine draws into its pictures; they may "
     "come through any camera or codec.",
 )

@@ -54,8 +54,8 @@ class _Amount(_AmountType):
     "as it came, with its times, number and losses; Foxglove shows it, and smartcam frames and "
     "frames.open() play it. FILE.mkv is a video without loss (JPEGs as they came) for players, "
     "with the captures' times in milliseconds; it needs the extra "
-    '"video". FOLDER gets files that follow each other, the oldest of which are deleted. A slow '
-    "disk costs pictures, never the camera: how many is told. Needs the extra "
+    '"video". FOLDER gets files that follow each other, the oldest of which are deleted. If the '
+    "disk is too slow, pictures are left out and counted; the camera never waits. Needs the extra "
     '"record".',
 )
 @click.argument("url")
@@ -78,7 +78,7 @@ class _Amount(_AmountType):
 @click.option(
     "--age",
     type=_Amount("AGE", SECONDS),
-    help="Time span of a file in a folder, before the next one begins.  [default: 1 h]",
+    help="Age of a file in a folder at which the next one begins.  [default: 1 h]",
 )
 @click.option(
     "--keep",

@@ -12,7 +12,7 @@ import click
 
 from smartcam._cli.frame_players import (
     RTSP_USER,
-    Players,
+    Outputs,
     parse_address_option,
     rtsp_server,
     rtsp_urls,
@@ -127,7 +127,7 @@ async def serve(
         raise click.UsageError("--rtp: expected the receiver's port, got 0")
     if sdp is not None and rtp is None:
         raise click.UsageError("--sdp needs --rtp")
-    await serve_sources(urls, quality, Players(rtsp, rtp, sdp), web, options, changes=changes)
+    await serve_sources(urls, quality, Outputs(rtsp, rtp, sdp), web, options, changes=changes)
 
 
 @click.command(
@@ -141,13 +141,13 @@ async def show(
     urls: tuple[str, ...], quality: int, changes: bool, web: PageOptions, options: Options
 ) -> None:
     """Show some sources."""
-    await serve_sources(urls, quality, Players(), web, options, changes=changes)
+    await serve_sources(urls, quality, Outputs(), web, options, changes=changes)
 
 
 async def serve_sources(
     urls: Sequence[str],
     quality: int,
-    players: Players,
+    outputs: Outputs,
     web: PageOptions,
     options: Options,
     *,
@@ -165,14 +165,14 @@ async def serve_sources(
     sources = [make_source(url, options) for url in urls]
     site = FramesSite(sources, quality=quality, changes=changes, **web.site_arguments)
     tries = _FirstTries(len(sources))
-    jobs = [_serve(site, tries, players, options)]
+    jobs = [_serve(site, tries, outputs, options)]
     jobs += [
         site.pictures.keep_open(index, tries.callback_for(index)) for index in range(len(sources))
     ]
     await run_until_first(jobs, None)
 
 
-async def _serve(site: FramesSite, tries: _FirstTries, players: Players, options: Options) -> None:
+async def _serve(site: FramesSite, tries: _FirstTries, outputs: Outputs, options: Options) -> None:
     """Wait for the first try of each source, at most :data:`FIRST_TRY_TIMEOUT`; then serve."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(FIRST_TRY_TIMEOUT):
@@ -180,8 +180,8 @@ async def _serve(site: FramesSite, tries: _FirstTries, players: Players, options
     async with contextlib.AsyncExitStack() as stack:
         server: RtspServer | None = None
         urls: dict[str, str] = {}
-        if players.rtsp is not None:
-            server, password = rtsp_server(site.sources, players.rtsp, site.token)
+        if outputs.rtsp is not None:
+            server, password = rtsp_server(site.sources, outputs.rtsp, site.token)
             await stack.enter_async_context(server)
             urls = rtsp_urls(server, site.sources, password)
         await stack.enter_async_context(site)
@@ -189,8 +189,8 @@ async def _serve(site: FramesSite, tries: _FirstTries, players: Players, options
         value = {"page": site.url, **({"rtsp": urls} if urls else {})}
         options.show(value, "\n".join(lines))
         jobs = [_show_viewers(site, server), tries.run()]
-        if players.rtp is not None:
-            jobs.append(send_rtp(site.sources[0], players, options))
+        if outputs.rtp is not None:
+            jobs.append(send_rtp(site.sources[0], outputs, options))
         await run_until_first(jobs, options.seconds)
 
 
@@ -255,7 +255,7 @@ async def _show_viewers(site: FramesSite, server: RtspServer | None) -> None:
 
 
 def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
-    """Return a text of each source's viewers: addresses of the page's, number of RTSP's."""
+    """Return a text of each source's viewers: addresses at the page, number by RTSP."""
     rtsp_statistics = {} if server is None else server.statistics()
     rows: list[str] = []
     for index, (name, source) in enumerate(unique_names(site.sources).items()):

@@ -1,4 +1,4 @@
-"""``smartcam gateway``: serve parts of a camera to robots and PLCs, line by line."""
+"""``smartcam gateway``: answer robots and PLCs with the workpieces that a camera finds."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--robot",
             type=click.Choice(["plain", "ur", "kuka", "fanuc", "siemens"]),
-            help="Make of the controller, which sets the defaults below.  [default: plain]",
+            help="Brand of the controller, which sets the defaults below.  [default: plain]",
         ),
         click.option("--form", type=click.Choice(["text", "brackets", "xml"])),
         click.option(
             "--pose",
             type=click.Choice(["ur", "abb", "kuka", "fanuc", "meca500"]),
-            help="Make with the convention for orientations.",
+            help="Brand of robot whose convention for orientations is used.",
         ),
         click.option("--length", type=click.Choice(["m", "mm"])),
         click.option("--angle", type=click.Choice(["rad", "deg"])),
@@ -57,7 +57,7 @@ def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--tool-flip", is_flag=True, help="Make z point into the table, as a tool's."),
         click.option("--max-age", type=SECONDS, help="Largest age of a result for NEXT, seconds."),
         click.option("--idle", type=SECONDS, help="Seconds until a silent robot is disconnected."),
-        click.option("--clients", type=click.IntRange(1, 100), help="Most robots at a time."),
+        click.option("--clients", type=click.IntRange(1, 100), help="How many robots at a time."),
     ]
     for option in reversed(decorators):
         command = option(command)

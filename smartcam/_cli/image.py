@@ -12,8 +12,8 @@ from smartcam.exceptions import ConfigurationError
 
 @click.command(
     help="Write a camera's last picture to a file, as the camera sends it (In-Sight: a bitmap), "
-    "if its protocol has a request for it. A software camera begins with the command, so it is "
-    f"triggered first, and its picture is a PNG. {CONNECT_WARNING}"
+    "if its protocol has a request for it. A software camera is started by this command, so it "
+    f"is triggered first; its picture is a PNG. {CONNECT_WARNING}"
 )
 @click.argument("url")
 @option("--output", required=True)

@@ -14,7 +14,7 @@ from smartcam._cli.options import (
     Options,
     async_command,
     from_hex,
-    naming_file_errors,
+    label_file_errors,
     option,
 )
 from smartcam._cli.texts import value_text
@@ -74,7 +74,7 @@ async def inspect(
     files = [file for picture in pictures for file in picture_files(Path(picture))]
     folder = None if output is None else Path(output)
     if folder is not None:
-        with naming_file_errors(f"--output {output}"):
+        with label_file_errors(f"--output {output}"):
             folder.mkdir(parents=True, exist_ok=True)
     error: FrameFormatError | None = None
     figures: list[str] = []
@@ -87,7 +87,7 @@ async def inspect(
             continue
         picture_path = None if folder is None else folder / f"{number:04}-{file.stem}.png"
         if picture_path is not None:
-            with naming_file_errors(f"--output {output}"):
+            with label_file_errors(f"--output {output}"):
                 await asyncio.to_thread(_write_picture, picture_path, inspection)
             figures.append(_figure(file, inspection, picture_path))
         options.show(
@@ -96,7 +96,7 @@ async def inspect(
         )
     if folder is not None:
         title = f"{camera}: {program.name}"
-        with naming_file_errors(f"--output {output}"):
+        with label_file_errors(f"--output {output}"):
             (folder / PAGE).write_text(_page(title, figures), encoding="utf-8")
     if error is not None:
         raise error

@@ -82,7 +82,7 @@ def _describe_interpreter(info: PluginInfo) -> tuple[object, str]:
     except PluginError as exc:
         return _describe_broken(info, exc)
     except SmartCamError:
-        pass  # the interpreter needs a layout
+        pass  # it can be used, with a layout as its argument
     origin_text = "" if info.origin == "built-in" else f" ({info.origin}: {info.target})"
     return {**info._asdict(), "about": about}, f"{info.name:14} {about}{origin_text}"
 

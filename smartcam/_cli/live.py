@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    help="Serve a page of a camera until Ctrl-C: results as they come, status, account. The page's "
+    help="Serve a page of a camera until Ctrl-C: results as they come, status, counts. The page's "
     "address goes to stdout. The command waits for a missing or lost camera, and the page says "
     f'so. Needs the extra "web". {CONNECT_WARNING}'
 )

@@ -85,7 +85,7 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     },
     "--json": {
         "is_flag": True,
-        "help": "One JSON object a line on stdout; an error is one on stderr.",
+        "help": "One JSON object a line on stdout; an error is a JSON object on stderr.",
     },
     "--debug": {
         "is_flag": True,
@@ -155,7 +155,7 @@ def async_command(
 
 
 @contextmanager
-def naming_file_errors(label: str) -> Iterator[None]:
+def label_file_errors(label: str) -> Iterator[None]:
     """Turn an OSError in the block into a ConfigurationError that begins with ``label``."""
     try:
         yield
@@ -216,16 +216,17 @@ class Options:
         ``option``: the option that names the calibration.
         """
         if calibration.y_down is not None and calibration.y_down != self.y_down:
-            done, to_do = ("with", "give it") if calibration.y_down else ("without", "leave it out")
+            done, to_do = ("with", "give") if calibration.y_down else ("without", "omit")
             raise ConfigurationError(
-                f"{option}: it was made {done} --y-down: {to_do} here, too, or poses are mirrored"
+                f"{option}: the calibration was made {done} --y-down: {to_do} it here, too, or "
+                "poses are mirrored"
             )
 
     async def locate_url(self, url: str) -> str:
         """Return the URL; for HOST[:PORT], search for a camera there and return its URL.
 
         Raises ConnectFailedError: no camera answers in any registered protocol; errors of
-        :meth:`reading_options`, before any camera is asked.
+        :meth:`interpret_options`, before any camera is asked.
         """
         from smartcam.settings import is_software
 
@@ -256,7 +257,7 @@ class Options:
 
         with self.open_trace(url) as trace:
             options: dict[str, Any] = {
-                **self.reading_options(fleet=is_fleet(url)),
+                **self.interpret_options(fleet=is_fleet(url)),
                 "observers": self._observers(trace),
                 "reconnect": None,
                 "name": self.name or "",
@@ -274,7 +275,7 @@ class Options:
 
         return [FrameObserver(trace)]
 
-    def reading_options(self, *, fleet: bool) -> dict[str, Any]:
+    def interpret_options(self, *, fleet: bool) -> dict[str, Any]:
         """Return the options for the interpretation of results.
 
         ``fleet``: the agent of a fleet may know missing options, such as ``y_down``. Raises
@@ -298,7 +299,7 @@ class Options:
         with from_part("calibration", "--calibration needs"):
             from smartcam.calibration import load_calibration
             from smartcam.calibration._inside import doubt_text
-        with naming_file_errors(option):
+        with label_file_errors(option):
             calibration = load_calibration(self.calibration or "")
         if check_y_down:
             self.check_y_down(calibration, option)
@@ -325,7 +326,7 @@ class Options:
                 f"--trace: frames of {url} are between the camera and its agent; a trace needs the "
                 "camera's own address, such as bvs://HOST"
             )
-        with naming_file_errors(f"--trace {self.trace}"):
+        with label_file_errors(f"--trace {self.trace}"):
             stream = Path(self.trace).open("w", encoding="utf-8", buffering=1)  # noqa: SIM115
         failed: list[OSError] = []
 

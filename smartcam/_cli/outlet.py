@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 @click.command(
     help="Bring a camera's results to brokers and databases, as a YAML file says, until Ctrl-C. "
     "Undelivered results wait in a spool beside the file, also for the next start. The file "
-    "has the section outlets: of a fleet file. Prints a line for each trouble, "
-    f"and the accounts at the end. {CONNECT_WARNING}"
+    'has a section "outlets" as in a fleet file. Prints a line for each trouble, '
+    f"and the counts at the end. {CONNECT_WARNING}"
 )
 @click.argument("url")
 @click.argument("file", metavar="FILE.yaml")
@@ -138,7 +138,7 @@ class _OutletSource:
 
 
 async def _pass_results(name: str, results: Any, outlets: Outlets) -> None:
-    """Pass results on to the outlets; report results that the subscription lost as an error."""
+    """Pass results on to the outlets; report as an error that the subscription lost results."""
     reported_count = 0
     while True:
         try:
@@ -151,8 +151,8 @@ async def _pass_results(name: str, results: Any, outlets: Outlets) -> None:
                 return
         else:
             outlets.offer_result(result)
-        account = results.statistics()
-        lost_count = account.dropped + account.missed
+        counts = results.statistics()
+        lost_count = counts.dropped + counts.missed
         if lost_count > reported_count:
             text = f"{lost_count - reported_count} results did not arrive"
             outlets.offer_error(name, datetime.now(UTC), text, "Missed")

@@ -18,8 +18,9 @@ MAX_HEX_DIGITS = 128
 
 
 @click.command(
-    help="Find out how a camera speaks; HOST or URL. Tries the URL's options, then every protocol, "
-    f"transport and dialect, the most probable first, until one is answered. {CONNECT_WARNING}"
+    help="Find out how the camera at HOST or URL speaks. Tries the URL's options, then every "
+    "protocol, transport and dialect, the most probable first, until one is answered. "
+    f"{CONNECT_WARNING}"
 )
 @click.argument("host_or_url")
 @click.option("--all", "try_all", is_flag=True, help="Try the rest, too, after one is answered.")
@@ -61,7 +62,7 @@ async def probe(host_or_url: str, try_all: bool, options: Options) -> None:
 
 
 def frame_text(entry: TraceEntry) -> str:
-    """Return an entry as a line: message, fields, bytes; broken bytes also as characters."""
+    """Return an entry as a line: message, fields, bytes; invalid bytes also as characters."""
     data = entry.hex[:MAX_HEX_DIGITS] + ("..." if len(entry.hex) > MAX_HEX_DIGITS else "")
     if entry.direction != "!":
         fields = ", ".join(f"{name}={value}" for name, value in (entry.fields or {}).items())
@@ -76,12 +77,12 @@ def _show_attempt(attempt: TracedAttempt, options: Options) -> None:
     address = {"protocol": attempt.address.protocol, "port": attempt.address.port}
     value = {**address, **{name: getattr(attempt, name) for name in names}}
     outcome = f"{attempt.step}: {attempt.outcome}" if attempt.answer is None else "a camera answers"
-    of = (
+    prefix = (
         f"{attempt.address.protocol} at port {attempt.address.port}: "
         if attempt.is_other_protocol
         else ""
     )
-    lines = [f"{of}{attempt.transport} {attempt.dialect}: {outcome}"]
+    lines = [f"{prefix}{attempt.transport} {attempt.dialect}: {outcome}"]
     lines += [f"  {frame_text(entry)}" for entry in attempt.frames]
     if attempt.omitted:
         lines.append(f"  ... and {attempt.omitted} more")

@@ -20,7 +20,7 @@ from smartcam._cli.options import (
 )
 from smartcam._cli.running import run_until_first
 from smartcam._cli.terminal import counting_line
-from smartcam._cli.texts import camera_value, not_running_error
+from smartcam._cli.texts import emulator_data, not_running_error
 from smartcam._extras import from_part
 from smartcam.backoff import Backoff
 from smartcam.exceptions import (
@@ -67,9 +67,9 @@ _camera_option = click.option(
 
 
 @click.command(
-    help="Record everything a camera says to an MCAP file, until Ctrl-C, --count or --seconds: "
-    "frames, results, events, errors; of a fleet's camera no frames, and the results of "
-    "every program's triggers. --bag writes a rosbag2 for ROS 2, too, or instead. After a "
+    help="Record into an MCAP file all that a camera sends, until Ctrl-C, --count or --seconds: "
+    "frames, results, events, errors; for a fleet's camera the results of all programs' "
+    "triggers, but no frames. --bag writes a rosbag2 for ROS 2, too, or instead. After a "
     "lost link the recording goes on. "
     f"{CONNECT_WARNING}"
 )
@@ -121,7 +121,7 @@ async def record(
         )
     if read_images and every is None:
         raise click.UsageError(
-            "--read-images needs --every: the picture that is read is surely the result's only if "
+            "--read-images needs --every: it is only certain that the picture is the result's if "
             "the trigger was sent from here"
         )
     recorders = _make_recorders(output, bag, force=force, pictures=pictures != NO_PICTURES)
@@ -165,7 +165,7 @@ def _result_pictures(url: str, recorder: Recorder) -> ResultPictures | None:
         raise UnsupportedError(
             f"--pictures judged: {masked(url)} sends no pictures with its results: expected a "
             "software camera, or a camera with frames of a fleet; --pictures SOURCE records those "
-            "of a source of frames, and --read-images asks a camera that has any"
+            "of a source of frames, and --read-images asks a camera that can send one"
         )
     with from_part("frames", "pictures need"):
         from smartcam.recording._inside import ResultPictures
@@ -351,7 +351,7 @@ async def _send_triggers(
     count: int | None,
     result_pictures: ResultPictures | None,
 ) -> None:
-    """Send a trigger every ``every`` seconds; after the first success, ignore failed triggers.
+    """Send a trigger every ``every`` seconds; ignore failed ones, if the camera runs at first.
 
     ``image_recorder``: recorder for the picture of each of ``count`` results, None for no pictures.
     ``result_pictures``: finds each result's picture; the first trigger waits until frames arrive.
@@ -471,7 +471,7 @@ async def replay(
     loaded = _load(recording, start, until)
     if loaded.files != (loaded.path,):
         if transport is not None:
-            raise click.UsageError("--transport is for a file: programs come to a folder's agent")
+            raise click.UsageError("--transport is only for a file: an agent plays a folder")
         cameras = None if camera is None else [camera]
         bracketed_host = f"[{host}]" if ":" in host else host
         with from_part("fleet", "a folder of a fleet's recordings needs"):
@@ -500,7 +500,7 @@ async def replay(
                 **({} if transport is None else {"transport": transport}),
             )
             await stack.enter_async_context(emulator)
-            options.show({**camera_value(emulator), "camera": emulator.name}, emulator.url)
+            options.show({**emulator_data(emulator), "camera": emulator.name}, emulator.url)
         await asyncio.Event().wait()
 
 
@@ -516,7 +516,7 @@ async def _play_fleet(fleet_replay: FleetReplay, options: Options) -> None:
 
 
 def _report_camera_end(name: str) -> None:
-    click.echo(f"smartcam: note: {name}: the recording is over: nothing of it is left", err=True)
+    click.echo(f"smartcam: note: {name}: the end of its recording is reached", err=True)
 
 
 def _report_end() -> None:
@@ -563,7 +563,7 @@ async def bag(
         from smartcam.recording._inside import BagConversion
 
     loaded = _load(recording)
-    reading = options.reading_options(fleet=True) if options.calibration or options.y_down else {}
+    reading = options.interpret_options(fleet=True) if options.calibration or options.y_down else {}
     conversion = BagConversion(
         loaded,
         Path(output),

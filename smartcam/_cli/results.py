@@ -35,11 +35,11 @@ def _parse_since(_context: Any, _parameter: Any, text: str | None) -> datetime |
 
 
 @click.command(
-    help="Show the results in a store: those of a shift, those that failed. PLACE is the file of "
-    "an outlet of the kind sqlite, or a fleet's URL, whose agents then show their stores. "
-    "The oldest result comes first. --failed shows the results that did not pass, by the "
-    "names of their truth values, with errors and gaps. The last line of a store counts all "
-    "of the time."
+    help="Show the results in a store: those of a shift, those that failed. FILE is that of an "
+    "outlet of the kind sqlite; URL is a fleet's, whose agents show their stores. The oldest "
+    "result comes first. --failed shows errors, gaps, and results with a false value whose name "
+    "is one such as ok or passed. The last line of a store has the counts of the whole period, "
+    "also of results that --count leaves out."
 )
 @click.argument("store", metavar="FILE|URL")
 @click.option(
@@ -83,12 +83,12 @@ async def _show_fleet_stores(
         if store.error:
             raise ConfigurationError(f"results of the agent {name}: {store.error}")
         summary = {
-            key: value for key, value in store._asdict().items() if key not in _NO_COUNT_KEYS
+            key: value for key, value in store._asdict().items() if key not in _NOT_IN_SUMMARY
         }
         _show_rows(store.rows, summary, name, options)
 
 
-_NO_COUNT_KEYS = ("rows", "error")
+_NOT_IN_SUMMARY = ("rows", "error")
 
 
 def _show_rows(

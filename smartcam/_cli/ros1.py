@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     'services of "smartcam ros2", without those that ROS 1 cannot have. A fleet file is '
     'served as by "smartcam serve"; a fleet\'s URL, fleet://HOST, means the cameras of a '
     "running fleet. Prints one line per camera, with its node. A missing or lost bridge is "
-    "tried again, which is reported on stderr, with --json as the same object on stdout. "
+    "tried again, which is reported on stderr; with --json on stdout, as the node's object. "
     'Needs the extras "ros2" and "web", and no ROS on this machine.'
 )
 @click.argument("fleet", metavar="FLEET")

@@ -119,7 +119,7 @@ def _make_section(settings: dict[str, object]) -> RosSection:
     from smartcam.fleet._inside import RosSection
 
     if settings.get("args") and settings.get("through") != RMW_NAMES["native"]:
-        raise ConfigurationError(f"{ROS_ARGS}: expected --rmw native, which has them read by ROS")
+        raise ConfigurationError(f"{ROS_ARGS}: expected --rmw native, as only ROS reads them")
     try:
         return RosSection.model_validate(settings)
     except ValidationError as exc:

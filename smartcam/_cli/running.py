@@ -56,11 +56,11 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 )
 """Exit codes of errors; the first matching class counts.
 
-0: done. 1: a fault of smartcam. 2: wrong usage. 3: no session or a broken session, or a source of
-frames that is missing, in use or lost. 4: a time-out in a session, or while waiting for a frame.
-5: the camera refused, is not running, or lacks the pixel format or feature. 6: a result cannot be
-interpreted. 7: ``calibrate --check`` found a stale calibration, or ``calibrate compare`` found
-different ones. 130 and 143: ended by Ctrl-C or SIGTERM.
+0: done. 1: an error of the system, as of a file, or a fault of smartcam. 2: wrong usage. 3: no
+session or a broken session, or a source of frames that is missing, in use or lost. 4: a time-out in
+a session, or while waiting for a frame. 5: the camera refused, is not running, or lacks the pixel
+format or feature. 6: a result cannot be interpreted. 7: ``calibrate --check`` found a stale
+calibration, or ``calibrate compare`` found different ones. 130 and 143: ended by Ctrl-C or SIGTERM.
 """
 
 

@@ -38,9 +38,9 @@ logger: logging.Logger = logging.getLogger("smartcam.serve")
     help="Connect to the cameras of a fleet file, and share them with any number of programs, "
     "until Ctrl-C or SIGTERM. Prints one line per camera, with its fleet URL, which every "
     "command accepts as a camera. A missing camera has the reason on its line, and is tried "
-    "again. Later changes are reported on stderr, with --json as the same object on stdout. "
-    'SIGHUP reads the file again, unless stdin is a terminal. Needs the extra "fleet"; with '
-    'operations: in the file "operations", too.'
+    "again. Later changes are reported on stderr; with --json on stdout, as the camera's "
+    'object. SIGHUP reads the file again, unless stdin is a terminal. Needs the extra "fleet", '
+    'and, if the file has a section operations, also the extra "operations".'
 )
 @click.argument("file", required=False, metavar="FLEET.yaml")
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of fleet files, and end.")
@@ -68,9 +68,9 @@ async def serve(file: str | None, schema: bool, log: str | None, options: Option
     else:
         server = smartcam.fleet.serve(file)
     section = server.file.operations
-    as_lines = (log or (section and section.log)) == "json"
-    with _json_logs(server, options) if as_lines else contextlib.nullcontext():
-        await AgentRunner(server, options, as_lines).run()
+    log_is_json = (log or (section and section.log)) == "json"
+    with _json_logs(server, options) if log_is_json else contextlib.nullcontext():
+        await AgentRunner(server, options, log_is_json).run()
 
 
 @contextlib.contextmanager
@@ -98,7 +98,7 @@ class AgentRunner:
     Args:
         server: the agent.
         options: options of the command.
-        as_lines: whether events are logged as lines of JSON, and not printed for people.
+        log_is_json: whether events are logged as lines of JSON, and not printed for people.
         show: function that reports the start; None: print a line for each camera.
     """
 
@@ -106,10 +106,10 @@ class AgentRunner:
         self,
         server: FleetServer,
         options: Options,
-        as_lines: bool,
+        log_is_json: bool,
         show: Callable[[], None] | None = None,
     ) -> None:
-        self._server, self._options, self._as_lines = server, options, as_lines
+        self._server, self._options, self._log_is_json = server, options, log_is_json
         self._show: Callable[[], None] = show or self._show_cameras
         self._notifier = Notifier()
         self._is_ready = False
@@ -121,7 +121,7 @@ class AgentRunner:
             reload_requested = stack.enter_context(_reload_requests())
             await stack.enter_async_context(self._operations_page())
             if server.file.record is not None:
-                recorder = _make_recorder(server, self._options, self._as_lines)
+                recorder = _make_recorder(server, self._options, self._log_is_json)
                 await stack.enter_async_context(recorder)
             if server.file.outlets is not None:
                 from smartcam.fleet._inside import FleetOutlets
@@ -142,9 +142,9 @@ class AgentRunner:
             events = server.events()
             self._show()
             async for event in events:
-                if self._as_lines:
+                if self._log_is_json:
                     self._log_event(event)
-                if self._options.as_json or not self._as_lines:
+                if self._options.as_json or not self._log_is_json:
                     report_event(server, event, self._options)
 
     async def _start_agent(self, stack: contextlib.AsyncExitStack) -> None:
@@ -164,13 +164,13 @@ class AgentRunner:
             await asyncio.sleep(delay)
 
     def _warn(self, text: str) -> None:
-        if self._as_lines:
+        if self._log_is_json:
             logger.warning("%s", text)
         else:
             click.echo(f"{coloured('error', 'warning:')} {text}", err=True)
 
     def _notify_outlet(self, name: str, reason: str) -> None:
-        if not self._as_lines:  # otherwise it was logged
+        if not self._log_is_json:  # otherwise it was logged
             text = reason or "delivers again"
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} outlet {name}: {text}", err=True)
 
@@ -199,10 +199,10 @@ class AgentRunner:
             yield
 
     def _print(self, camera: str, value: dict[str, Any], text: str, *, connected: bool) -> None:
-        if self._as_lines:
+        if self._log_is_json:
             level = logging.INFO if connected else logging.WARNING
             logger.log(level, "shared: %s", text, extra={"camera": camera})
-        if self._options.as_json or not self._as_lines:
+        if self._options.as_json or not self._log_is_json:
             self._options.show(value, text)
 
     def _log_event(self, event: CameraEvent) -> None:
@@ -231,7 +231,7 @@ class AgentRunner:
             return
         if self._is_ready:
             self._notifier.report_ready(self._status())
-        if not self._as_lines:  # otherwise it was logged
+        if not self._log_is_json:  # otherwise it was logged
             failed = isinstance(outcome, Exception)
             text = (
                 f"not reloaded, all stays as it was: {outcome}"
@@ -280,7 +280,7 @@ async def _background_task(work: Any) -> AsyncIterator[None]:
         await asyncio.wait({task})
 
 
-def _make_recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRecorder:
+def _make_recorder(server: FleetServer, options: Options, log_is_json: bool) -> FleetRecorder:
     """Return the recorder of the cameras; it prints a line when it fails and when it recovers."""
     from smartcam.recording import FleetRecorder
 
@@ -297,11 +297,11 @@ def _make_recorder(server: FleetServer, options: Options, as_lines: bool) -> Fle
             text = f"records are written again; {sum(lost.values())} records were not written"
         else:
             text = f"{trouble}; nothing is recorded until the disk works again"
-        if as_lines:
+        if log_is_json:
             logger.log(logging.INFO if trouble is None else logging.ERROR, "%s", text)
         if options.as_json:
             options.show(value, "")
-        elif not as_lines:
+        elif not log_is_json:
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} {text}", err=True)
 
     recorder = FleetRecorder(server, on_trouble=show_trouble)

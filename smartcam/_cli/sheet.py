@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, naming_file_errors
+from smartcam._cli.options import OUTPUT_OPTIONS, Options, async_command, label_file_errors
 from smartcam._cli.usage import ListedGroup
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ def _length_option(name: str, about: str, **settings: Any) -> Callable[[F], F]:
     return click.option(name, type=kind, metavar="MM", callback=_to_metres, help=about, **settings)
 
 
-def _count_option(name: str, about: str, least: int = 3) -> Callable[[F], F]:
-    return click.option(name, type=click.IntRange(least, 1000), required=True, help=about)
+def _count_option(name: str, about: str, min_count: int = 3) -> Callable[[F], F]:
+    return click.option(name, type=click.IntRange(min_count, 1000), required=True, help=about)
 
 
 def _sheet_command(
@@ -124,8 +124,8 @@ async def charuco(square: float, marker: float | None, **arguments: Any) -> None
 
 
 @sheet.command("marker_grid")
-@_count_option("--columns", "Markers along x.", least=1)
-@_count_option("--rows", "Markers along y.", least=1)
+@_count_option("--columns", "Markers along x.", min_count=1)
+@_count_option("--rows", "Markers along y.", min_count=1)
 @_length_option("--marker", "Side of a marker, with its black border.", required=True)
 @_length_option("--gap", "Distance between two markers.", required=True)
 @click.option(
@@ -228,5 +228,5 @@ def _lower_suffix(path: str) -> str:
 
 
 def _write(path: str, data: bytes) -> None:
-    with naming_file_errors(path):
+    with label_file_errors(path):
         Path(path).write_bytes(data)

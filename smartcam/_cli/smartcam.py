@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
 EPILOG = (
-    "Exit codes: 0 done; 1 a fault of smartcam; 2 wrong usage, or a bad layout text; 3 no "
-    "session: nothing listens, silence or garbage, connection lost, no such source of frames; 4 a "
-    "wait in a session, or for a frame, ran out; 5 the camera refused, is not running or has no "
-    "such pixels; 6 a result is not interpretable; 7 a calibration that was checked is stale, or "
-    "two differ."
+    "Exit codes: 0 done; 1 an error of the system, or a fault of smartcam; 2 wrong usage, or a bad "
+    "layout text; 3 no session: nothing listens, silence or garbage, connection lost, no such "
+    "source of frames; 4 a wait in a session, or for a frame, ran out; 5 the camera refused, is "
+    "not running or lacks the pixel format; 6 a result is not interpretable; 7 a calibration that "
+    "was checked is stale, or two differ."
 )
 
 
@@ -53,7 +53,7 @@ TOPICS: Mapping[str, Mapping[str, ListedCommand]] = {
         ),
         "live": ListedCommand(
             "live",
-            "Serve a page of a camera until Ctrl-C: results as they come, status, account.",
+            "Serve a page of a camera until Ctrl-C: results as they come, status, counts.",
         ),
         "image": ListedCommand(
             "image",
@@ -133,7 +133,7 @@ TOPICS: Mapping[str, Mapping[str, ListedCommand]] = {
             "Report each problem with its cure, in plain words: name, session, status, "
             "application, round trip, run state, results, clock.",
         ),
-        "probe": ListedCommand("probe", "Find out how a camera speaks; HOST or URL."),
+        "probe": ListedCommand("probe", "Find out how the camera at HOST or URL speaks."),
         "protocols": ListedCommand("listings", "List the protocols and their dialects."),
         "interpreters": ListedCommand(
             "listings", "List the interpreters that --interpret-as knows."
@@ -164,9 +164,9 @@ TOPICS: Mapping[str, Mapping[str, ListedCommand]] = {
     "Recordings": {
         "record": ListedCommand(
             "record",
-            "Record everything a camera says to an MCAP file, until Ctrl-C, --count or "
-            "--seconds: frames, results, events, errors; of a fleet's camera no frames, and the "
-            "results of every program's triggers.",
+            "Record into an MCAP file all that a camera sends, until Ctrl-C, --count or "
+            "--seconds: frames, results, events, errors; for a fleet's camera the results of all "
+            "programs' triggers, but no frames.",
         ),
         "replay": ListedCommand(
             "record",

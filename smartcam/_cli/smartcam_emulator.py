@@ -10,8 +10,8 @@ from click.core import ParameterSource
 import smartcam
 from smartcam._cli.options import DIALECTS, OUTPUT_OPTIONS, Options, async_command
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.texts import camera_value
-from smartcam._cli.usage import JsonErrors
+from smartcam._cli.texts import emulator_data
+from smartcam._cli.usage import JsonErrorCommand
 from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError
 
@@ -38,7 +38,9 @@ _OPTION_NAMES = {
 """Options that not every emulated camera accepts, with their names in error texts."""
 
 
-@click.command("emulator", cls=JsonErrors, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(
+    "emulator", cls=JsonErrorCommand, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.argument("scenario", required=False, metavar="[SCENARIO.yaml]")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
@@ -71,8 +73,8 @@ _OPTION_NAMES = {
     "quirks",
     multiple=True,
     metavar="NAME[=VALUE]",
-    help="Set unknown behaviour of real cameras; without a value it is on. Repeatable; overrides "
-    "the scenario's.",
+    help="Choose a behaviour that the manuals leave open; NAME alone means NAME=true. Repeatable; "
+    "overrides the scenario's.",
 )
 @click.option(
     "--seed",
@@ -145,7 +147,7 @@ async def command(
     if program is not None:
         if scenario is not None or cameras > 1:
             raise click.UsageError(
-                "--program has the cameras of its file: no scenario, no --cameras"
+                "--program has the cameras of its file: expected no scenario and no --cameras"
             )
         servers = [*_software_cameras(program, protocol or PROTOCOL, port, seed, camera_options)]
     else:
@@ -235,7 +237,7 @@ def _load_scenarios(
 ) -> tuple[Scenario, ...]:
     """Return a scenario for each camera.
 
-    Raises ConfigurationError: the file is wrong, or ``camera_count`` is given for several cameras;
+    Raises ConfigurationError: the file is wrong, or ``camera_count`` multiplies several cameras;
     MissingExtraError: PyYAML is not installed.
     """
     from smartcam.emulator._inside import load_scenarios
@@ -261,16 +263,16 @@ def _load_scenarios(
 
 
 def _default_scenario(protocol: str, *, has_page: bool) -> Scenario:
-    """Return the scenario without a file; with a page, an application runs if that is possible."""
+    """Return the scenario for no file; with a page, an application runs if that is possible."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
-    camera = emulated_class(protocol)
-    running = Scenario(protocol=protocol, active=PAGE_APPLICATION, running=True)
-    idle = Scenario(protocol=protocol)
-    if not has_page or not camera.state_options(PAGE_APPLICATION, running=True):
-        return idle
-    return running if camera.mistake(running) is None else idle
+    camera_class = emulated_class(protocol)
+    running_scenario = Scenario(protocol=protocol, active=PAGE_APPLICATION, running=True)
+    idle_scenario = Scenario(protocol=protocol)
+    if not has_page or not camera_class.state_options(PAGE_APPLICATION, running=True):
+        return idle_scenario
+    return running_scenario if camera_class.mistake(running_scenario) is None else idle_scenario
 
 
 def _parse_quirk(text: str) -> tuple[str, Any]:
@@ -302,14 +304,12 @@ def _refuse_unsupported_options(context: click.Context, plan: Scenario) -> None:
 def _show_camera(
     emulator: WireCamera, options: Options, *, show_name: bool, page: str | None
 ) -> None:
-    value = camera_value(emulator)
+    value = emulator_data(emulator)
     if show_name or page is not None:
         value["name"] = emulator.name
     if page is not None:
         value["web"] = page
     if emulator.is_random:
         value["seed"] = emulator.seed
-        click.echo(
-            f"{emulator.name}: what is left to chance has the seed {emulator.seed}", err=True
-        )
+        click.echo(f"{emulator.name}: random numbers have the seed {emulator.seed}", err=True)
     options.show(value, emulator.url)

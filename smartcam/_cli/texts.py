@@ -54,7 +54,7 @@ def _column(values: Sequence[object]) -> list[str]:
     return [text[: len(text) - needless].removesuffix(".") for text in texts]
 
 
-def camera_value(emulator: WireCamera) -> dict[str, Any]:
+def emulator_data(emulator: WireCamera) -> dict[str, Any]:
     """Return an emulated camera's address and applications, for JSON."""
     return {
         "url": emulator.url,

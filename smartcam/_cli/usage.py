@@ -27,7 +27,7 @@ def exiting_on_interrupt() -> Iterator[None]:
 def error_json(error: Exception, text: str, code: int, **more: str) -> str:
     """Return an error as JSON: its class, its text, the exit code, and its public attributes.
 
-    ``more``: fields that come before them.
+    ``more``: fields that come before these in the object.
     """
     attributes = {name: value for name, value in vars(error).items() if not name.startswith("_")}
     if isinstance(error, click.ClickException):
@@ -40,7 +40,7 @@ def error_json(error: Exception, text: str, code: int, **more: str) -> str:
     return json.dumps(jsonable(value))
 
 
-class JsonErrors(click.Command):
+class JsonErrorCommand(click.Command):
     """A command that reports wrong usage as JSON if ``--json`` is given."""
 
     def make_context(
@@ -60,7 +60,7 @@ class JsonErrors(click.Command):
             return super().invoke(ctx)
 
 
-class ListedGroup(JsonErrors, click.Group):
+class ListedGroup(JsonErrorCommand, click.Group):
     """A group of commands, which are listed with their whole summaries."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

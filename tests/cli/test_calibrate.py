@@ -130,7 +130,7 @@ def test_calibrate_y_down_is_kept_and_wanted_by_the_check(url: str, tmp_path: Pa
     calibrating(url, tmp_path, lines, "--json", "--y-down").done()
     assert PlaneCalibration.load(tmp_path / "plane.json").y_down is True
     calibrating(url, tmp_path, [], "--check", "plane").failed(
-        2, "--check plane: it was made with --y-down: give it here, too, or poses are mirrored"
+        2, "--check plane: the calibration was made with --y-down: give it here, too"
     )
     assert not (tmp_path / "plane.drift.journal").exists()
     done = calibrating(url, tmp_path, ['{"do": "abort"}'], "--json", "--check", "plane", "--y-down")

@@ -131,7 +131,7 @@ def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) ->
     calibrate_sheet(find_target(render(TARGET, CAMERA, SEEN), TARGET), plane).save(path)
     options = ("--interpret-as", "localizations", "--calibration", str(path))
     with closed_port() as url:
-        run("trigger", url, *options).failed(2, "it was made with --y-down: give it here, too")
+        run("trigger", url, *options).failed(2, "made with --y-down: give it here, too")
         run("trigger", url, *options, "--y-down").failed(3)
 
 

@@ -109,8 +109,8 @@ def test_trigger_calibration_with_a_frame_wants_the_camera_named_so(
 @pytest.mark.parametrize(
     ("y_down", "options", "text"),
     [
-        (True, (), "it was made with --y-down: give it here, too, or poses are mirrored"),
-        (False, ("--y-down",), "it was made without --y-down: leave it out here, too"),
+        (True, (), "made with --y-down: give it here, too, or poses are mirrored"),
+        (False, ("--y-down",), "made without --y-down: omit it here, too"),
     ],
 )
 def test_trigger_calibration_with_another_y_down_says_what_to_give(
@@ -119,7 +119,7 @@ def test_trigger_calibration_with_another_y_down_says_what_to_give(
     path = tmp_path / "table.json"
     calibrated(y_down=y_down).save(path)
     told = [*seven, "--calibration", str(path)]
-    run(*told, *options).failed(2, f"--calibration {path}: {text}")
+    run(*told, *options).failed(2, f"--calibration {path}: the calibration was {text}")
     (result,) = run(*told, *(() if options else ("--y-down",)), "--json").done().lines
     assert len(result["value"]) == len(PIECES)
 

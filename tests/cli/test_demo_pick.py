@@ -53,7 +53,7 @@ async def test_pick_takes_all_seven_and_says_how_well(
     (picks,) = (line["picks"] for line in lines if "picks" in line)
     assert {one["part"] for one in picks} == set(PIECES)
     assert all(one["taken"] and one["error"] < 3 * one["predicted"] < 1e-3 for one in picks)
-    assert max(abs(one["turned"]) for one in picks) < math.radians(0.6)
+    assert max(abs(one["heading_error"]) for one in picks) < math.radians(0.6)
     (left,) = (line["left"] for line in lines if "left" in line)
     assert left == 0
 
@@ -154,7 +154,7 @@ async def test_every_part_is_put_onto_its_place_and_errors_are_as_predicted(
     placed: list[dict[str, Any]] = [one for line in lines for one in line.get("placed", [])]
     assert len(placed) == 9
     assert all(one["taken"] and one["off_place"] < 2e-3 for one in placed)
-    assert max(abs(one["turned"]) for one in placed) < math.radians(0.2)
+    assert max(abs(one["heading_error"]) for one in placed) < math.radians(0.2)
     (account,) = (line for line in lines if "filled" in line)
     assert (account["filled"], account["places"]) == (9, 9)
     # all errors of a run have one calibration's in common: four parameters, so they vary a lot

@@ -37,11 +37,11 @@ async def test_block_is_found_picked_and_put_on_top(capsys: pytest.CaptureFixtur
     told = await built(capsys, 3, table=table, layers=1)
     (rows,) = (line["compared"] for line in told if "compared" in line)
     assert [row["what"] for row in rows] == ["block", "tower's top"]
-    assert all(row["beside"] < 2e-3 and abs(row["turned"]) < math.radians(1) for row in rows)
+    assert all(row["offset"] < 2e-3 and abs(row["turned"]) < math.radians(1) for row in rows)
     assert abs(rows[1]["higher"]) < 1e-3
     assert 0 < rows[1]["found"]["sigma"] < 1e-3
     layer = next(line for line in told if "layer" in line)
-    assert (layer["seen"], layer["reached"]) == (3, 2)
+    assert (layer["seen"], layer["within_reach"]) == (3, 2)
     # and the truth: three blocks lie on each other, the highest is a black one, across
     stack = table.tower()
     assert [one.colour for one in stack] == ["wood", "wood", "black"]
@@ -97,7 +97,7 @@ def test_block_that_moved_between_two_looks_is_not_picked_elsewhere() -> None:
     table = TowerTable(1)
     table.blocks.append(WoodenBlock(0.33, 0.0, 0.3, colour="black"))
     rough = BlockPose(0.30, 0.0, 0.3, BLOCK[2])
-    with pytest.raises(FrameFormatError, match=r"one 30 mm beside it: something has moved"):
+    with pytest.raises(FrameFormatError, match=r"one 30 mm away from it: something has moved"):
         measure_block(table, rough, demo_tower.BLACK)
     table.blocks.clear()
     with pytest.raises(FrameFormatError, match="got none of it"):

@@ -68,7 +68,7 @@ def test_folder_goes_on_after_a_kill_and_is_played_as_a_fleet(tmp_path: Path) ->
         assert cam.endswith("/line1/cam1")
         again = run("trigger", text, "--count", "6", "--json").done()
         assert [line["raw"] for line in again.lines] == [b"Hello World".ljust(20, b"\0").hex()] * 6
-        over = played.read_until(b"line1/text: the recording is over", stream="stderr")
+        over = played.read_until(b"line1/text: the end of its recording", stream="stderr")
         assert over.count("the recording was cut off") == 2
         played.send_signal(signal.SIGTERM)
         assert played.wait().code == 0

@@ -226,7 +226,7 @@ async def test_fleet_outlets_shows_the_accounts(tmp_path: Path) -> None:
         await until(lambda: outlets.states["store"].counts.delivered == 1)
         code, out, err = await command("fleet", "outlets", str(path), "--json")
     assert code == 0, err
-    assert json.loads(out)["account"] == {
+    assert json.loads(out)["counts"] == {
         "results": 1,
         "delivered": 1,
         "spooled": 0,
@@ -246,7 +246,7 @@ async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path
         code, out, err = await command("fleet", "outlets", url, "--json", "--timeout", "30")
         assert code == 0, err
         (told,) = map(json.loads, out.splitlines())
-        assert (told["outlet"], told["trouble"], told["account"]["delivered"]) == ("store", "", 1)
+        assert (told["outlet"], told["trouble"], told["counts"]["delivered"]) == ("store", "", 1)
         code, out, err = await command("results", url, "--since", "8h", "--json", "--timeout", "30")
         assert code == 0, err
         row, total = map(json.loads, out.splitlines())
