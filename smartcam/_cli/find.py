@@ -29,8 +29,8 @@ PERIOD = 1.0
 """Seconds between two updates of the progress line."""
 
 DISTURBANCE_WARNING = (
-    "No document says that a camera of {} keeps its client when another one connects and says "
-    "nothing: --exclude and --fleet keep away from those at work."
+    "A camera of {} may drop its client when another one connects, as this search does: keep "
+    "away from cameras at work with --exclude or --fleet."
 )
 """The warning about open ports of cameras that serve one client."""
 
