@@ -151,7 +151,6 @@ def test_names_on_a_page_are_in_the_package(page: str) -> None:
 ELSEWHERE = {
     "docs/architecture/inspection.md": {"smartcam.tools"},  # entry points
     "docs/decisions/0002-receive-task.md": {"epoll_wait"},  # the system's
-    "docs/decisions/0011-recordings.md": {"Writer"},  # the mcap library's
     "docs/decisions/0026-the-door.md": {"tls_handshake_timeout_ms"},  # Zenoh's
 }
 """Names by page that are not the package's: other programs' and those that were rejected."""
