@@ -107,7 +107,7 @@ def test_bounds_are_those_of_the_code() -> None:
         f"{streams.MAX_STREAMS} event streams",
         f"nothing for {streams.READER_TIMEOUT:g} s",
         f"at most {serialize.MAX_HEX_BYTES} bytes of a payload, "
-        f"and decode results of at most {serialize.MAX_VALUES_BYTES}",
+        f"and no values of results longer than {serialize.MAX_VALUES_BYTES} bytes",
     }
     assert [text for text in said if text not in PAGE] == []
     assert emulator.MAX_ENTRIES >= 100  # the example's limit
