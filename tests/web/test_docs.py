@@ -79,7 +79,7 @@ def test_fleet_page_has_its_numbers() -> None:
     said = {
         f"in the last {ERROR_MARK_SECONDS:g} s lost",
         f"at most {MAX_ROWS} rows",
-        f"shows nothing for {streams.READER_TIMEOUT:g} s",
+        f"accepts no update for {streams.READER_TIMEOUT:g} s",
         f"At most {MAX_FLEET_VIEWERS} browsers",
         f"at most {MAX_CAMERAS} cameras",
         f"and {LINGER:g} s longer",
@@ -107,7 +107,7 @@ def test_bounds_are_those_of_the_code() -> None:
         f"{streams.MAX_STREAMS} event streams",
         f"nothing for {streams.READER_TIMEOUT:g} s",
         f"at most {serialize.MAX_HEX_BYTES} bytes of a payload, "
-        f"and no values of results longer than {serialize.MAX_VALUES_BYTES} bytes",
+        f"and results longer than {serialize.MAX_VALUES_BYTES} bytes undecoded",
     }
     assert [text for text in said if text not in PAGE] == []
     assert emulator.MAX_ENTRIES >= 100  # the example's limit
