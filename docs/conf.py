@@ -240,7 +240,7 @@ LIMITS = (
     "calibration.formats._trajectories.MAX_LINE_LENGTH",
     "calibration._least_squares.MAX_STEPS",
     "calibration.formats._foreign.MAX_CAMERAS",
-    "calibration.formats._cameras.MAX_FILE_BYTES",
+    "calibration.formats._cameras.MAX_CAMERA_FILE_BYTES",
     "calibration._detection.charucos.MAX_DOUBLED_PX",
     "calibration._detection.circle_grids.EXTRA_SPOTS",
     "calibration._detection.corners.MAX_REACH_PX",

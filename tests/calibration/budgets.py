@@ -193,7 +193,11 @@ PARSERS: tuple[Parser, ...] = (
             if name == "mrcal"
             else form.max_bytes,  # mrcal: beside the solver's inputs
             "calibration.formats."
-            + ("_file_format.MAX_YAML_BYTES" if name == "mrcal" else "_cameras.MAX_FILE_BYTES"),
+            + (
+                "_file_format.MAX_YAML_BYTES"
+                if name == "mrcal"
+                else "_cameras.MAX_CAMERA_FILE_BYTES"
+            ),
             size=2500,
             short=PAST_LOOKAHEAD,
             needs=("yaml",),

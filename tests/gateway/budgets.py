@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 
-from smartcam.gateway._lines import RequestReader, WriteError
+from smartcam.gateway._lines import RequestReader, TooLongError
 from tests.budgets.parser import Make, Parser, fill, streamed
 
 
@@ -31,7 +31,7 @@ PARSERS: tuple[Parser, ...] = (
         256,
         "gateway._lines.MAX_LINE_BYTES",
         size=1000,
-        refuses=(WriteError,),
+        refuses=(TooLongError,),
     ),
     Parser(
         "robots: requests as XML",
@@ -40,6 +40,6 @@ PARSERS: tuple[Parser, ...] = (
         256,
         "gateway._lines.MAX_LINE_BYTES",
         size=1000,
-        refuses=(WriteError,),
+        refuses=(TooLongError,),
     ),
 )
