@@ -88,7 +88,7 @@ napoleon_custom_sections = ["Cancellation", "Source"]
 
 ROOT = Path(__file__).parents[1]
 
-DOES = {
+USES = {
     "put": "puts",
     "subscribe": "subscribes",
     "query": "queries",
@@ -601,7 +601,7 @@ def access_rights() -> str:
     rows = [
         (
             right.what,
-            DOES[right.does],
+            USES[right.use],
             " ".join(f"`{key.removeprefix('smartcam/*/')}`" for key in right.keys),
             *("yes" if role in right.roles else "" for role in ROLES[:3]),
         )

@@ -338,7 +338,7 @@ replay  recording: object, speed: number, loop: flag, on_over: function or None,
 write_bag  recording: object, path: text, camera: text or None, interpret_as: reading,
     y_down: flag or None, calibration: choice or None, overwrite: flag
 write_pcap  recording: object, path: text, camera: text or None, overwrite: flag
-Device.change_inspection  late: seconds, silent: flag, extra: integer
+Device.change_inspection  late: seconds, no_result: flag, extra: integer
 Device.drop_triggers  count: count
 Device.hold_busy  seconds: seconds or None
 Device.reboot  seconds: seconds or None

@@ -15,12 +15,12 @@ STATES = {"run": m.StatusReport(status=RUNNING), "stop": m.StatusReport(status=S
 
 
 def program(line: str) -> m.QueryAnswer:
-    """Return the number of the program."""
+    """Return the id of the application."""
     return m.QueryAnswer(application=int(line))
 
 
 def measured(line: str) -> m.ResultContainer:
-    """Return the result of a trigger: its words are the cells."""
+    """Return the result of a trigger: each word is a cell, a value with a name."""
     cells = tuple(m.CellValue(str(i), text) for i, text in enumerate(line.split()))
     return m.ResultContainer(data=line.encode(), cells=cells)
 

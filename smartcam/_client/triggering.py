@@ -198,7 +198,10 @@ class Triggers:
     async def _trigger_until_taken(
         self, request: TriggerRequest, deadline: float, timeout: float
     ) -> list[Result]:
-        """Send a trigger until the camera accepts one, and return its results."""
+        """Send a trigger until the camera accepts one, and return its results.
+
+        It is sent again only after a refusal: without an answer the camera may have accepted it.
+        """
         busy: CameraBusyError | None = None
         while True:
             try:

@@ -138,7 +138,7 @@ def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) ->
 def test_calibrate_by_a_folder_if_nothing_comes_keeps_the_step(
     tmp_path: Path, files: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(PictureFolder.__init__, "__kwdefaults__", {"deadline": 0.3})
+    monkeypatch.setattr(PictureFolder.__init__, "__kwdefaults__", {"timeout": 0.3})
     lines = [*answers(ABOUT, {}, {}), {"do": "abort"}]
     done = calibrating(tmp_path, lines, "--wizard", "sheet", *files)
     assert done.code == 130

@@ -105,7 +105,7 @@ async def test_checks_of_a_client_in_another_language_find_nothing(
 
 HANGS = "it was still under way after "
 SINS: dict[str, tuple[str, str]] = {
-    "triggers": ("id too", "is 12 bytes long; the containers have 8"),
+    "triggers": ("id too", "is 12 bytes long; expected 8"),
     "triggers_three_times": ("one for all", "is of the same inspection as the one before"),
     "sends_whole_messages": ("unknown request", "the camera ignores 50 53 56 42"),
     "sends_whole_messages_in_a_switch": ("unknown request", "no such message"),

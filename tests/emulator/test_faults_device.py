@@ -201,7 +201,7 @@ def test_device_change_of_a_run_that_is_void_is_forgotten() -> None:
     device = Device([Application(id=2, layout="n: uint8", constant=[1])], running=True)
     device.handle(m.Connect())
     device.handle(m.Trigger())
-    device.change_inspection(silent=True)
+    device.change_inspection(no_result=True)
     device.stop()
     device.start()
     device.handle(m.Trigger())

@@ -105,5 +105,5 @@ class RunFaults:
     """The changes that faults make to one inspection."""
 
     delay: int = 0  # additional duration of the inspection, nanoseconds
-    sends_nothing: bool = False  # whether the inspection sends no container
+    no_result: bool = False  # whether the inspection sends no container
     extra_copies: int = 0  # number of times that the container is sent again

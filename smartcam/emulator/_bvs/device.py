@@ -459,20 +459,22 @@ class Device:
         """Drop the next ``count`` triggers, as if the last image were still being analysed."""
         self._triggers_to_drop += check_integer(count, "count", 0, owner="device")
 
-    def change_inspection(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
+    def change_inspection(
+        self, *, late: float = 0.0, no_result: bool = False, extra: int = 0
+    ) -> None:
         """Change the running inspection, or else the next one.
 
         Args:
             late: seconds by which the inspection takes longer.
-            silent: True for an inspection that sends nothing.
+            no_result: True for an inspection without a result.
             extra: number of times that the inspection's container is sent again.
         """
         late = check_seconds(late, "late", "device")
-        silent = check_flag(silent, "silent", "device")
+        no_result = check_flag(no_result, "no_result", "device")
         extra = check_integer(extra, "extra", 0, MAX_EXTRA, "device")
         with self.action_context():
             self._run_faults.delay += nanoseconds(late)
-            self._run_faults.sends_nothing |= silent
+            self._run_faults.no_result |= no_result
             self._run_faults.extra_copies += extra
             if _Event.INSPECTED in self._events:
                 when, action = self._events[_Event.INSPECTED]
@@ -770,7 +772,7 @@ class Device:
         result = self._result(run, values)
         if self.quirks.waiting_before_result:
             self._send_changed_status()
-        if result is not None and not run.faults.sends_nothing:
+        if result is not None and not run.faults.no_result:
             self.last_report = LastReport(self.time, self._byte_order, result)
             for _ in range(1 + run.faults.extra_copies):
                 self._send(result)

@@ -50,7 +50,7 @@ _ACTIONS: Mapping[type[DeviceFault], Callable[[FaultTargets, Any], object]] = {
     f.OperatorStart: lambda targets, _: targets.device.start(),
     f.Condition: _condition,
     f.LateResult: lambda targets, fault: targets.device.change_inspection(late=fault.seconds),
-    f.NoResult: lambda targets, _: targets.device.change_inspection(silent=True),
+    f.NoResult: lambda targets, _: targets.device.change_inspection(no_result=True),
     f.ExtraResult: lambda targets, fault: targets.device.change_inspection(extra=fault.count),
     f.DigitalInput: lambda targets, _: targets.device.trigger(),
     f.ChangeByteOrder: lambda targets, fault: targets.device.set_endian(fault.endian),
