@@ -93,7 +93,7 @@ DOES = {
     "subscribe": "subscribes",
     "query": "queries",
     "answer": "answers queries",
-    "present": "has tokens",
+    "announce": "has tokens",
     "watch": "looks for tokens",
 }
 """Kinds of use in Zenoh's words."""
@@ -601,7 +601,7 @@ def access_rights() -> str:
     rows = [
         (
             right.what,
-            DOES[right.does],
+            DOES[right.use],
             " ".join(f"`{key.removeprefix('smartcam/*/')}`" for key in right.keys),
             *("yes" if role in right.roles else "" for role in ROLES[:3]),
         )
