@@ -93,7 +93,7 @@ USES = {
     "subscribe": "subscribes",
     "query": "queries",
     "answer": "answers queries",
-    "present": "has tokens",
+    "announce": "has tokens",
     "watch": "looks for tokens",
 }
 """Kinds of use in Zenoh's words."""

@@ -117,7 +117,7 @@ class StreamRequest(NamedTuple):
         quality: quality of JPEGs; None for the agent's default.
         bitrate: bits per second; None for no limit.
         latency: seconds; None for no limit.
-        decode: True if H.264 frames are decoded here.
+        decode: True if this program decodes H.264 frames.
         timeout: seconds that an iteration waits for a frame; None for no limit.
     """
 
@@ -140,7 +140,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     Args:
         settings: validated options.
-        observers: objects that are called with its frames, events, results and errors.
+        observers: objects that are called with its messages, events, results and errors.
     """
 
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
@@ -312,7 +312,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """
 
     def statistics(self) -> Statistics:
-        """Return all counters, over all sessions; ``received`` is always the sum of the fates."""
+        """Return all counters, over all sessions: see :class:`~smartcam.models.Statistics`."""
         streams = self._listeners.streams()
         return self._counters.statistics(s.statistics() for s in streams if not s.ended)
 
@@ -351,22 +351,22 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> Subscription[Result[ValueT]] | BatchSubscription[Result[ValueT]]:
         """Subscribe to every result, triggered or not; the call subscribes, not the iteration.
 
-        The stream goes on after a reconnect; results that the camera sent in between are lost.
+        The stream goes on after a reconnect; results of the time without a session are lost.
 
-        For a container that does not fit its layout, or its calibration, the iterator raises
+        For a container that cannot be interpreted, or not be calibrated, the iterator raises
         :exc:`~smartcam.InterpretationError`; it stays usable. Results of another application than
-        the one that was named, by the option or a switch, are counted, but not delivered.
+        the last one named, by the option or a switch, are counted, but not delivered.
 
         Args:
             batch: return lists of all waiting results, at least one, instead of single results: for
                 a camera that sends thousands a second. ``max_queue`` counts results, not lists.
             min_interval: seconds; results that come sooner after the last kept result are dropped.
-            max_queue: results kept for a slow reader; best at least as many as 32 KiB hold, which
-                may come at once.
+            max_queue: results kept for a slow reader; best at least as many as fit into 32 KiB,
+                which may arrive at once.
             max_queue_bytes: largest number of bytes of the kept containers together
                 (``Result.raw``; values may be larger). A larger single container is kept if the
                 queue is empty.
-            overflow: what happens when one of the two limits is reached.
+            overflow: what to do when one of these two limits is reached.
         """
         check_flag(batch, "batch", self.name)
         kind = BatchSubscription[Result[ValueT]] if batch else Subscription[Result[ValueT]]
@@ -580,11 +580,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         If the layout has an ``@sequence`` field, the number of the run is set right before the
         trigger, and only the container with this number is the result. Otherwise, over TCP, a Query
-        is sent before the trigger: containers that arrive before its answer are older. Before that,
-        the client handles an earlier trigger that was given up: it waits a moment for the result,
-        or prevents it (Stop, Query, Start; that a stopped inspection has no result is concluded,
-        not documented). Over UDP without ``@sequence`` a late result can be mistaken for that of
-        the next trigger: no message tells them apart.
+        is sent before the trigger: containers that arrive before its answer are older than the
+        trigger. Before that, the client handles an earlier trigger that was given up: it waits a
+        moment for the result, or prevents it (Stop, Query, Start; that a stopped inspection has no
+        result is concluded, not documented). Over UDP without ``@sequence`` a late result can be
+        mistaken for that of the next trigger: no message tells them apart.
 
         Args:
             application: id, or name in ``application_names``, of the application to run for this
@@ -827,7 +827,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         Args:
             encoding: ``raw`` for frames as the device sends them; ``jpeg``; or ``png`` and
                 ``jpegxl``, without loss. Frames stay encoded until their pixels are read. ``h264``
-                is decoded here, and only whole pictures are returned.
+                is decoded in this program, and only whole pictures are returned.
             quality: quality of JPEG, 1 to 100.
             bitrate: largest number of bits per second of JPEGs: first their quality is reduced for
                 it, then the frame rate (each frame's ``rate`` says how); for H.264 the bit rate of
@@ -946,10 +946,10 @@ class Camera(abc.ABC, Generic[ValueT]):
         Raises:
             UnsupportedError: the camera is not in a fleet.
             ResponseTimeoutError: another program has the camera; the error names it.
-            ConnectionLostError: the agent is away, or was restarted meanwhile.
+            ConnectionLostError: the agent cannot be reached, or was restarted meanwhile.
             ReservationLostError: the reservation was lost, or may have been lost.
 
-        Cancellation: safe; the reservation is given back.
+        Cancellation: safe; the reservation ends.
         """
         return self._reserved(check_seconds(timeout, "timeout", self.name))
 
@@ -1019,8 +1019,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Send input data for the next inspection; confirmed only by result codes, if any.
 
         ``trigger(input=...)`` sends the data of its own trigger. The camera queues input containers
-        for its inspections; the Input Container bit shows that there are more of one than of the
-        other.
+        for its inspections; the Input Container bit shows that inputs and inspections are not
+        equally many.
         """
         await self._set_input(check_bytes(data, "data", self.name))
 
@@ -1049,8 +1049,8 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def reboot(self) -> None:
         """Restart the camera; return when the session has ended.
 
-        The camera is away for about 30 seconds then, as a similar one, and comes back with the
-        last application, stopped. :meth:`wait_connected` waits for it.
+        A restart takes about 30 seconds (with a similar camera); then the last application is
+        loaded, but stopped. :meth:`wait_connected` waits for the new session.
 
         Raises:
             UnsupportedError: the dialect has no such request (``bid``).
@@ -1107,7 +1107,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     def _check_encoding(
         self, encoding: str, quality: int | None, encodings: Collection[str]
     ) -> FrameRequest:
-        """Check encoding and quality of frames; the agent checks whether they fit together."""
+        """Check encoding and quality of frames; the agent checks if they go together."""
         if quality is not None:
             quality = check_integer(quality, "quality", 1, 100, self.name)
         encoding = check_choice(encoding, "encoding", STREAM_ENCODINGS, self.name)

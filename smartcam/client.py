@@ -1,8 +1,8 @@
 """The client of one camera, which talks to the camera itself.
 
 ``open()`` starts the :class:`~smartcam._client.supervisor.Supervisor`, which makes sessions and
-passes every chunk of their links to the :class:`~smartcam._client.dispatch.Dispatch`. The commands
-are here; each sends a few messages and waits with a deadline.
+passes every chunk that they receive to the :class:`~smartcam._client.dispatch.Dispatch`. The
+commands are here; each sends a few messages and waits with a deadline.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ class SmartCamera(Camera[ValueT]):
 
     async def _switch_application(self, application: int | str, timeout: float) -> None:
         async with self._lock.hold(timeout) as deadline:
-            self._commands.make_load_request(application)  # refuses what cannot be loaded
+            self._commands.make_load_request(application)  # raises if it cannot be loaded
             await self._status.refresh(deadline)
             await self._commands.switch(application, deadline, start=self._commands.is_in_run_mode)
 

@@ -90,10 +90,10 @@ def connect(
         url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
             sets the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
             ``fleet://HOST[:PORT]/CAMERA`` is a camera that an agent shares
-            (:mod:`smartcam.fleet`). ``software:FILE#CAMERA`` is a plain camera whose pictures
+            (:mod:`smartcam.fleet`). ``software:FILE#CAMERA`` is an ordinary camera whose pictures
             are inspected in this process, by a cell file (:mod:`smartcam.inspection`).
         model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
-        observers: objects that are called with frames, events, results and errors:
+        observers: objects that are called with messages, events, results and errors:
             :class:`~smartcam.Observer`.
         **options: ``name``, ``application``, ``application_names``,
             ``interpret_as``, ``calibration``, ``y_down``,
@@ -102,22 +102,23 @@ def connect(
             ``restore``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
 
     ``interpret_as`` gives the type of the camera's values: ``"localizations"``, ``"raw"``, a class,
-    a function. Without it the type is ``Any``, since a URL does not show it: a camera at
-    the wire gives bytes, a camera of a fleet the values that its agent makes.
+    a function. Without it the type is ``Any``, since a URL does not show it: results of a
+    directly connected camera are bytes, those of a fleet's camera are as its fleet file says.
 
     With ``calibration`` the value of every result is a list of localizations in the robot's frame,
     as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
     an observer. The calibration gets the values that ``interpret_as`` gives; with ``y_down``, their
-    y axis is reversed before. The frame in their headers is the camera's ``name``, which has to be
-    the ``camera_frame`` of a calibration that has one. No value is returned uncalibrated: a value
-    that is no list of localizations, or that the calibration refuses, gives an
+    y axis is reversed before. The frame in their headers is the camera's ``name``; if the
+    calibration has a ``camera_frame``, it has to be the same. No value is returned uncalibrated: a
+    value that is no list of localizations, or that the calibration refuses, gives an
     :exc:`~smartcam.InterpretationError` with the cause chained. An interpreter that never gives
     localizations (raw, record, table, strings50) is a ConfigurationError at once; if a single
     trigger names one, its value stays as it is. A mapping gives each application id its own
-    calibration, or None to leave its values as they are; an id that it lacks is an error, too.
+    calibration, or None to leave its values as they are; a result of any other application is an
+    error, too.
 
     Raises:
-        ConfigurationError: an address or option cannot work; nothing was tried.
+        ConfigurationError: an address or option cannot work; no connection was tried.
     """
     if is_fleet(url):
         with from_part("fleet", "a camera of a fleet needs"):

@@ -59,7 +59,7 @@ class Status(enum.IntFlag):
     Source: SC manual p. 30 and p. 33 (published) for the first seven bits and their values; the
     client need not reset the bits: when a state ends, the camera sends a status without its bit.
     If a dialect's own word differs, its table maps its bits to these; a bit without a
-    counterpart here stands 32 bits higher than on the wire. In ``bid`` Overtriggered is the Trigger
+    counterpart here is 32 bits higher than on the wire. In ``bid`` Overtriggered is the Trigger
     Error, which stays set until the errors are reset.
     """
 
@@ -68,7 +68,7 @@ class Status(enum.IntFlag):
     SYSTEM_ERROR = 0x002
     """Fatal: at least a reboot is needed."""
     INPUT_CONTAINER = 0x004
-    """More input containers than inspections (one dropped) or fewer (one reused)."""
+    """Input containers and inspections were not equally many: one was dropped, or reused."""
     BUSY = 0x010
     """Busy; set while the application is being switched."""
     RUNNING = 0x080
@@ -435,7 +435,7 @@ class StatusChanged(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ApplicationChanged(CameraEvent):
-    """The active application is another one than in the client's last information."""
+    """The active application is another one than the client knew before."""
 
     application: int
     previous: int | None
@@ -531,7 +531,7 @@ class Statistics:
         streamed: results without a trigger of this client, while there was a subscriber.
         late: results that came after their trigger had given up.
         wrong_application: containers from another application than expected; not interpreted.
-        uninterpretable: containers that do not fit their layout.
+        uninterpretable: containers that could not be interpreted, or not be calibrated.
         unclaimed: results without a trigger of this client and without a subscriber.
         empty_slots: all-zero records skipped by interpreters.
         extra_results: containers that came for a trigger which had its results already; they are

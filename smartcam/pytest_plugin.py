@@ -40,12 +40,12 @@ PROTOCOL = "bvs"
 """The default protocol of the emulated camera."""
 
 FORWARDED_OPTIONS = frozenset({"protocol", "manual_clock"})
-"""Options of the marker itself that the emulated camera gets, too."""
+"""Options of :class:`ThreadedCamera` itself, which the fixture passes on."""
 
 MARKER_OPTIONS = FORWARDED_OPTIONS | frozenset(
     {"application", "interpret_as", "connect", "cameras"}
 )
-"""Options of the marker itself; all others are options of the emulated camera."""
+"""Options with every protocol; all others are those of the protocol's emulated camera."""
 
 FLEET_OPTIONS = frozenset({"scenario", "quirks", "dialect", "transport"})
 """Options of the marker that an emulated fleet gets."""
@@ -56,9 +56,9 @@ DEFAULT_CAMERA_COUNT = 2
 MARKER = (
     "smartcam(application=None, interpret_as=None, connect={}, cameras=2, protocol='bvs', "
     "scenario=None, dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and "
-    "emulated_fleet are made. application=ID has that application running; connect={...} are "
+    "emulated_fleet are made. application=ID loads and runs this application; connect={...} are "
     "further options of smartcam.connect(); the rest are options of "
-    "smartcam.emulator.EmulatedCamera, or of the class that the protocol brings. A scenario is "
+    "smartcam.emulator.EmulatedCamera, or of the protocol's own class. A scenario's file is "
     "looked for beside the test, then below the root."
 )
 
@@ -114,7 +114,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 
 @pytest.fixture
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
-    """Emulated cameras by name: two, or a scenario's cameras; otherwise like emulated_camera."""
+    """Emulated cameras by name, like emulated_camera: those of ``scenario``, else ``cameras``."""
     from smartcam.testing import ThreadedFleet
 
     given = _given_options(request)
@@ -135,12 +135,12 @@ def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
-    state = emulated_class(protocol).state_options(application, running=True)
+    start_options = emulated_class(protocol).state_options(application, running=True)
     return Scenario(
         name=f"camera{number}",
         protocol=protocol,
-        active=application if state else None,
-        running=bool(state) and application is not None,
+        active=application if start_options else None,
+        running=bool(start_options) and application is not None,
         seed=number,
     )
 
@@ -156,13 +156,13 @@ def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> C
     from smartcam.connecting import connect
 
     given = _given_options(request)
-    options = {
+    client_options = {
         "interpret_as": given.get("interpret_as"),
         "application": given.get("application"),
         **given.get("connect", {}),
     }
-    given = {key: value for key, value in options.items() if value is not None}
-    client = _make_or_fail(lambda: connect(emulated_camera.url, **given))
+    options = {key: value for key, value in client_options.items() if value is not None}
+    client = _make_or_fail(lambda: connect(emulated_camera.url, **options))
     request.node.stash[_CLIENT] = client
     return client
 
@@ -175,7 +175,7 @@ def _make_or_fail(make: Callable[[], T]) -> T:
         return make()
     except (SmartCamError, TypeError, OSError) as exc:
         text = f"the marker smartcam: {exc}"
-    pytest.fail(text, pytrace=False)  # outside of the except block, which pytest would show
+    pytest.fail(text, pytrace=False)  # after the except block, so that pytest does not show exc
 
 
 def _given_options(request: pytest.FixtureRequest) -> dict[str, Any]:
@@ -186,7 +186,7 @@ def _given_options(request: pytest.FixtureRequest) -> dict[str, Any]:
             text = "the marker smartcam takes keyword arguments only, such as application=7"
             pytest.fail(text, pytrace=False)
         given |= marker.kwargs
-    known = MARKER_OPTIONS | _options(given)
+    known = MARKER_OPTIONS | _camera_options(given)
     unknown = sorted(given.keys() - known)
     if unknown:
         from smartcam._suggestions import did_you_mean
@@ -201,8 +201,8 @@ def _given_options(request: pytest.FixtureRequest) -> dict[str, Any]:
     return given
 
 
-def _options(given: dict[str, Any]) -> frozenset[str]:
-    """Return the options of the marker that an emulated camera takes."""
+def _camera_options(given: dict[str, Any]) -> frozenset[str]:
+    """Return the names of the options that the protocol's emulated camera has."""
     from smartcam.emulator._inside import emulated_class, options_of
     from smartcam.exceptions import SmartCamError
 

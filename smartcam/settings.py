@@ -48,7 +48,7 @@ M = TypeVar("M", bound="BaseModel")
 
 
 class Address(NamedTuple):
-    """The address of a camera, and the parts of its protocol that are fixed in advance.
+    """The address of a camera, and what is known about its protocol before connecting.
 
     Attributes:
         protocol: name of the protocol.
@@ -57,7 +57,7 @@ class Address(NamedTuple):
         port: port of the camera.
         dialect: the dialect; None if the client has to find it.
         quirks: the camera's deviations from the dialect.
-        parameters: other parts of the URL by name, which the protocol interprets. They include
+        parameters: other parameters in the URL by name, which the protocol uses. They include
             ``user`` and ``password`` if the protocol has a login.
         path: part of the URL after the host: a camera's name in a fleet.
     """
@@ -124,7 +124,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         model: camera model; picks the protocol of a bare host.
 
     Raises:
-        ConfigurationError: names the wrong part, and the accepted values.
+        ConfigurationError: the text names the wrong part, and the accepted values.
     """
     url = check_text(url, "camera address")
     if model is not None:
@@ -355,7 +355,7 @@ class CameraSettings:
         """Validate the options of ``connect()``.
 
         Raises:
-            ConfigurationError: names the option, the given value and the expected one.
+            ConfigurationError: the text has the option, the given value and the expected one.
         """
         return cls.of(parse_address(url, model=model), options)
 
@@ -364,7 +364,7 @@ class CameraSettings:
         """Validate options for an address.
 
         Raises:
-            ConfigurationError: names the option, the given value and the expected one.
+            ConfigurationError: the text has the option, the given value and the expected one.
         """
         default_name = address.path or f"{address.host}:{address.port}"
         try:
@@ -429,7 +429,7 @@ def _validated(given: dict[str, Any]) -> dict[str, Any]:
     """Return options as pydantic's model reads them.
 
     Raises:
-        ConfigurationError: names the option, the given value and the expected one.
+        ConfigurationError: the text has the option, the given value and the expected one.
     """
     from pydantic import ValidationError
 

@@ -51,10 +51,10 @@ class _Amount(_AmountType):
 @click.command(
     name="record",
     help="Record a source until Ctrl-C, its end, --count or --seconds. FILE.mcap holds every frame "
-    "as it came, with its times, number and losses; Foxglove shows it, and smartcam frames and "
-    "frames.open() play it. FILE.mkv is a video without loss (JPEGs as they came) for players, "
-    "with the captures' times in milliseconds; it needs the extra "
-    '"video". FOLDER gets files that follow each other, the oldest of which are deleted. If the '
+    "as the source gave it, with its times, number and losses. Foxglove shows it; 'smartcam "
+    "frames' and, in Python, frames.open() play it. FILE.mkv is a lossless video (JPEGs as they "
+    "are) for players, with the captures' times in milliseconds; it needs the extra "
+    '"video". FOLDER gets consecutive files; the oldest are deleted when all exceed --keep. If the '
     "disk is too slow, pictures are left out and counted; the camera never waits. Needs the extra "
     '"record".',
 )
@@ -68,8 +68,8 @@ class _Amount(_AmountType):
 )
 @option("--force")
 @option("--name", help="The camera's name in the file; default made of the URL.")
-@option("--count", help="End after so many pictures.")
-@option("--seconds", help="End so many seconds after the first picture.")
+@option("--count", help="End after this many pictures.")
+@option("--seconds", help="End this many seconds after the first picture.")
 @click.option(
     "--size",
     type=_Amount("SIZE", BYTES),
@@ -83,7 +83,7 @@ class _Amount(_AmountType):
 @click.option(
     "--keep",
     type=_Amount("SIZE", BYTES),
-    help="Size of all files of a folder; the oldest are deleted.  [default: 10 GB]",
+    help="Size of all files of a folder, above which the oldest are deleted.  [default: 10 GB]",
 )
 @option("--timeout", help=TIMEOUT)
 @async_command(*OUTPUT_OPTIONS, interrupt_code=0)
@@ -101,8 +101,8 @@ async def record(
     from smartcam.recording._inside import name_in_recording
 
     bounds = {"size": size, "age": age, "keep": keep}
-    set_bounds = {name: bound for name, bound in bounds.items() if bound is not None}
-    recorder = _make_recorder(output, set_bounds, force=force)
+    given_bounds = {name: bound for name, bound in bounds.items() if bound is not None}
+    recorder = _make_recorder(output, given_bounds, force=force)
     async with make_source(url, options) as source:
         recorder.open()
         try:
@@ -129,7 +129,7 @@ def _make_recorder(
     if suffix in (".mcap", ".mkv") and not Path(output).is_dir():
         if bounds:
             raise click.UsageError(
-                f"--{next(iter(bounds))} is for a folder, whose files follow each other: "
+                f"--{next(iter(bounds))} is for a folder of consecutive files, such as "
                 f"-o {Path(output).with_suffix('')}"
             )
         return Recorder(output, overwrite=force)
@@ -142,7 +142,7 @@ def _make_recorder(
 
 
 def _report_trouble(trouble: RecordingError | None) -> None:
-    text = "recording again" if trouble is None else f"{trouble}; pictures are lost"
+    text = "recording has resumed" if trouble is None else f"{trouble}; pictures are lost"
     click.echo(f"smartcam: note: {text}", err=True)
 
 
@@ -168,7 +168,10 @@ async def _record(
 async def _close_and_report(
     recorder: Recorder | RotatingRecorder, lost: int, options: Options
 ) -> None:
-    """Close the recording and report its contents; remove a file without a picture."""
+    """Close the recording and report its contents; remove a file without a picture.
+
+    ``lost``: pictures that the source lost; the recorder itself counts those that it left out.
+    """
     from smartcam.recording import RotatingRecorder
 
     await asyncio.to_thread(recorder.close)

@@ -1,7 +1,7 @@
 """A Wireshark dissector for every dialect of ``bvs``, made from the message tables.
 
-The tables become Lua tables; ``engine.lua`` in this folder reads frames with them. So Wireshark
-also knows a new message of ``protocols/_bvs.py``.
+The message tables of ``protocols/_bvs.py`` become Lua tables, with which ``engine.lua`` in this
+folder reads frames. So a message that is added there is known to Wireshark, too.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def lua_tables() -> dict[str, Any]:
     """Return the tables of the Lua code, as plain values by the names of the Lua variables."""
     dialects = BVS.dialects
     rows = [row for dialect in dialects.values() for row in dialect.table]
-    tried = [dialect for group in BVS.detection[Transport.TCP] for dialect in group]
+    detected_dialects = [dialect for group in BVS.detection[Transport.TCP] for dialect in group]
     return {
         "PORT": DEFAULT_PORT,
         "MAX_LENGTH": DEFAULT_MAX_LENGTH,
@@ -53,7 +53,7 @@ def lua_tables() -> dict[str, Any]:
         "STATUSES": [_status_name(member) for member in Status],
         "IDS": _names_by_id(rows),
         "DIALECTS": [_dialect_table(dialect) for dialect in dialects.values()],
-        "TRIED_TOGETHER": [[dialect.name, *dialect.quirks] for dialect in tried],
+        "TRIED_TOGETHER": [[dialect.name, *dialect.quirks] for dialect in detected_dialects],
     }
 
 
@@ -88,9 +88,9 @@ def _quirk_differences(variant: FramedDialect, rows_without_quirk: Rows) -> dict
         "codes": _code_table(variant.codes) if variant.wire_quirks[name].codes is not None else {},
         "messages": {
             sender: {
-                number: row
-                for number, row in rows.items()
-                if row != rows_without_quirk[sender][number]
+                message_id: row
+                for message_id, row in rows.items()
+                if row != rows_without_quirk[sender][message_id]
             }
             for sender, rows in _dialect_rows(variant).items()
         },
@@ -128,9 +128,9 @@ def _status_name(status: Status) -> str:
 
 
 def _status_table(bits: StatusBits) -> dict[str, Any]:
-    """Return the statuses of the wire's bits; the keys are attributes of StatusBits.
+    """Return the names of the bits of the status on the wire, under keys named as in StatusBits.
 
-    A wire bit that ``named`` does not have means the status bit ``bit << unnamed_shift``.
+    A bit that is not in ``bits.named`` means the bit ``bit << bits.unnamed_shift`` of Status.
     """
     if bits.unnamed_shift:
         status_by_bit = {member.value >> bits.unnamed_shift: member for member in Status}

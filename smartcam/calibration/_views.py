@@ -39,11 +39,12 @@ class TargetView(storage.Stored):
         points: (N, 2), places of these points in the image, pixels.
         covariance: (N, 2, 2), of each point, pixels^2, from the noise of the image; 0 for points
             without noise.
-        margin: number of grey levels, of 255, by which the origin's mark, or the rim of its larger
-            dot, is darker than the same place at the other corners; None if ids or colours of
-            squares show the origin, or if the target looks the same when turned.
+        margin: certainty of the origin: number of grey levels, of 255, by which the origin's mark,
+            or the rim of its larger dot, is darker than the same place at the other corners; None
+            if ids or colours of squares show the origin, or if the target looks the same when
+            turned.
         name: name of the image, for messages.
-        warnings: points that were left out because they contradict the target.
+        warnings: texts about points that were left out because they contradict the target.
 
     Raises:
         CalibrationError: ``SHAPE``: the target or the size is not valid, arrays do not fit
@@ -72,7 +73,7 @@ class TargetView(storage.Stored):
         ids = _as_ids(self.ids, len(target.points), label)
         points = as_points(self.points, 2, f"{label}: points").copy()
         if len(points) != len(ids):
-            expected = f"{label}: points: expected shape ({len(ids)}, 2) as there are ids"
+            expected = f"{label}: points: expected shape ({len(ids)}, 2), a row for each id"
             raise Code.SHAPE.error_with_value(expected, (len(ids), 2), points.shape)
         covariance = as_covariances(self.covariance, len(ids), f"{label}: covariance").copy()
         check_size(self.size, label)
@@ -84,7 +85,7 @@ class TargetView(storage.Stored):
     def _read(cls, fields: dict[str, Any], context: storage.Context) -> TargetView:
         if context.get("target") is None:
             raise storage.invalid_data_error(
-                context["label"], "target: expected the one that it shows", None
+                context["label"], "target: expected the target of the view", None
             )
         return super()._read({"target": context["target"], **fields}, context)
 
@@ -96,10 +97,10 @@ class TargetView(storage.Stored):
 
     @property
     def handedness(self) -> float:
-        """Handedness, -1 to 1, of the points in the image, compared with the target; NaN on a line.
+        """Handedness, -1 to 1, of the points in the image, compared with the target.
 
         It is near -1 for the front of a sheet (y points up on the sheet, v down in the image), near
-        1 for a mirrored sheet, near 0 if points have wrong numbers.
+        1 for a mirrored sheet, near 0 if points have wrong ids, NaN if the points are on a line.
         """
         # det(A^T B) is the sum, over all triples of points, of the products of their triangles'
         # signed areas (Cauchy and Binet), and a plane in front of a camera keeps all signs. Divided
@@ -125,7 +126,7 @@ def view_name(view: TargetView, number: int) -> str:
 
 
 def check_type(value: Any, types: type | tuple[type, ...], label: str) -> Any:
-    """Return a value that is of one of the types; otherwise raise SHAPE, which names its type."""
+    """Return a value that is of one of the types; otherwise raise ``SHAPE`` with its type."""
     if isinstance(value, types):
         return value
     type_names = [type_.__name__ for type_ in (types if isinstance(types, tuple) else (types,))]
@@ -142,12 +143,12 @@ def describe_type(value: Any) -> str:
 
 
 def as_views(views: Iterable[TargetView], label: str) -> list[TargetView]:
-    """Return views as a list; raise SHAPE for no list, or for an element of another type."""
+    """Return views as a list; raise ``SHAPE`` for no list, or for another type in it."""
     return as_list(views, TargetView, f"{label}: view")
 
 
 def as_list(values: Any, types: type | tuple[type, ...], label: str) -> list[Any]:
-    """Return values as a list; raise SHAPE unless each is of one of the types."""
+    """Return values as a list; raise ``SHAPE`` unless each is of one of the types."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
         raise Code.SHAPE.error_with_value(
             f"{label}: expected a list", "a list", describe_type(values)

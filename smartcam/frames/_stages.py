@@ -1,4 +1,4 @@
-"""Process frames on their way: remove the distortion of the lens."""
+"""Correct frames by a calibration: remove a lens' distortion, rectify pairs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Undistorter:
     """Remove the distortion of a lens from pictures; the maps are computed once.
 
     Args:
-        camera: the lens.
+        camera: model of the lens that took the pictures.
         alpha: part of the picture that is kept: 0: only valid pixels; 1: all source pixels.
 
     Attributes:
-        camera: lens of the output, without distortion.
+        camera: model of a lens without distortion that would take the corrected pictures.
 
     Raises:
         ConfigurationError: an alpha outside of 0 to 1.
@@ -71,7 +71,7 @@ class Undistorter:
 
 
 class Rectifier:
-    """Rectify pairs of pictures by a calibration's maps, so that rows show the same points.
+    """Rectify pairs of pictures by a calibration's maps: a point is in the same row of both.
 
     Args:
         rectification: result of :meth:`~smartcam.calibration.StereoCalibration.rectify`.

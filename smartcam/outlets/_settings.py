@@ -31,7 +31,7 @@ class _OutletFields(BaseModel):
 
 
 class Secret(_OutletFields):
-    """The source of a secret, which is never in a settings file itself."""
+    """The place of a secret, such as a password: a settings file never has the secret itself."""
 
     file: str | None = Field(None, min_length=1, description="path of a file with only the secret")
     variable: str | None = Field(
@@ -45,7 +45,7 @@ class Secret(_OutletFields):
     def _refuse_literal(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             raise ValueError(  # noqa: TRY004 - pydantic tells the place of a ValueError
-                "a secret never stands in the file: expected {file: PATH} or {variable: NAME}"
+                "a secret is never in this file itself: expected {file: PATH} or {variable: NAME}"
             )
         if len(value) != 1:
             raise ValueError("expected either file or variable")
@@ -55,10 +55,10 @@ class Secret(_OutletFields):
         """Return the secret.
 
         Args:
-            folder: folder to which a relative path refers.
+            folder: folder to which a relative ``file`` refers.
 
         Raises:
-            ConfigurationError: the secret does not exist; the text names its place.
+            ConfigurationError: the secret cannot be read; the text names its file or variable.
         """
         if self.variable is not None:
             value = os.environ.get(self.variable)
@@ -72,13 +72,13 @@ class Secret(_OutletFields):
         except OSError as exc:
             raise ConfigurationError(f"the secret's file {path}: {exc.strerror}") from exc
         except UnicodeDecodeError:
-            raise ConfigurationError(f"the secret's file {path} is no text") from None
+            raise ConfigurationError(f"the secret's file {path} is not UTF-8") from None
 
 
 class OutletSettings(_OutletFields):
     """The settings that every outlet has; each kind adds its own."""
 
-    kind: str | None = Field(None, description="the kind of outlet; default: its name")
+    kind: str | None = Field(None, description="the kind of outlet; default: the outlet's name")
     cameras: Patterns = Field(
         ("**",), description="cameras: names, * for one part of a name, ** for any number"
     )
@@ -90,8 +90,9 @@ class OutletSettings(_OutletFields):
     size: Size = Field(1e9, description="largest size of the waiting entries, such as 1 GB")
     full: Policy = Field(
         "drop_oldest",
-        description="what a full spool does; drop_oldest: drop the oldest; drop_newest: refuse the "
-        "newest. Dropped entries are counted, and an entry about the gap is delivered instead",
+        description="what to do when the spool is full; drop_oldest: drop the oldest entry; "
+        "drop_newest: drop the new one. Dropped entries are counted, and an entry about the gap is "
+        "delivered instead",
     )
     durable: bool = Field(
         False,
@@ -114,7 +115,7 @@ Section = dict[str, dict[str, Any]]
 class OutletsFile(_OutletFields):
     """Outlets of one camera in a file of their own."""
 
-    outlets: Section = Field(description="by name, which is also the kind unless it is given")
+    outlets: Section = Field(description="outlets by name; one without kind has its name as kind")
 
     @classmethod
     def load(cls, path: str | Path) -> OutletsFile:
@@ -134,17 +135,17 @@ def outlet_class(name: str, fields: Mapping[str, Any]) -> type[Outlet[Any]]:
     """Return the class of an outlet.
 
     Raises:
-        PluginError: its kind is unknown or cannot be loaded.
+        PluginError: the outlet's kind is unknown or cannot be loaded.
     """
     kind = fields.get("kind") or name
     class_ = OUTLETS.load(str(kind))
     if not (isinstance(class_, type) and issubclass(class_, Outlet)):
-        raise PluginError(f"smartcam.outlets: {kind} is no class of Outlet", name=str(kind))
+        raise PluginError(f"smartcam.outlets: {kind} is not a subclass of Outlet", name=str(kind))
     return class_
 
 
 def mistakes_of(section: Section) -> Iterator[tuple[Sequence[int | str], str]]:
-    """Yield the mistakes in a section ``outlets:``: the keys of the field, and a text."""
+    """Yield each mistake in a section ``outlets:``: the keys of its place, and a text."""
     if len(section) > MAX_OUTLETS:
         yield ("outlets",), f"{len(section)} outlets, expected {MAX_OUTLETS} at most"
         return

@@ -1,4 +1,4 @@
-"""Speak with cameras whose frames have a header of text: a ticket, the length, and the content.
+"""Frames of cameras that send a text header (a ticket and the length) before each content.
 
 Each request carries a ticket that its answer repeats, so answers may come in any order, with other
 frames between them. Such a frame is handled as a line whose length is given in advance. Contents
@@ -51,7 +51,7 @@ class TicketedDialect(LineDialect):
 
     @property
     def width(self) -> int:
-        """Digits of a ticket, 0 without tickets."""
+        """Number of digits of a ticket, 0 without tickets."""
         return len(str(self.tickets[-1])) if self.tickets else 0
 
     def _split(self, line: str) -> tuple[str, str]:
@@ -106,31 +106,31 @@ class HeaderReader(LineReader):
     """Cuts frames with a header of text from a stream of bytes.
 
     Args:
-        width: digits of a ticket, 0 for frames without tickets.
-        digits: digits of the length.
+        ticket_digits: number of digits of a ticket, 0 for frames without tickets.
+        length_digits: number of digits of the length.
         max_length: largest number of bytes of a frame's content.
     """
 
-    def __init__(self, width: int, digits: int, max_length: int) -> None:
+    def __init__(self, ticket_digits: int, length_digits: int, max_length: int) -> None:
         super().__init__(re.compile(b"\r\n"), max_line=0, encoding=ENCODING)
-        self._ticket_digits = width
-        self._header_bytes = width + 1 + digits + 2
-        self._form = re.compile(rb"([0-9]{%d})L([0-9]{%d})\r\n" % (width, digits))
+        self._ticket_digits = ticket_digits
+        self._header_bytes = ticket_digits + 1 + length_digits + 2
+        self._form = re.compile(rb"([0-9]{%d})L([0-9]{%d})\r\n" % (ticket_digits, length_digits))
         self._max_length = max_length
 
     def next_line(self) -> str | None:
         """Return the next frame's ticket and content, None if there is no whole frame yet.
 
-        Raises FrameError: the bytes are no frame; the stream cannot be read on.
+        Raises FrameError: the bytes are no frame, so the rest of the stream cannot be read either.
         """
         header = bytes(self._buffer[: self._header_bytes])
         if len(header) < self._header_bytes:
             if not self._may_begin(header):
-                raise FrameError(f"{header!r} came, no frame begins so", data=header)
+                raise FrameError(f"no frame begins with {header!r}", data=header)
             return None
         form = self._form.fullmatch(header)
         if form is None:
-            raise FrameError(f"{header!r} came, no frame begins so", data=header)
+            raise FrameError(f"no frame begins with {header!r}", data=header)
         length = int(form[2])
         shortest = self._ticket_digits + 2
         longest = shortest + self._max_length

@@ -184,10 +184,10 @@ async def test_appear(ends: Ends) -> None:
     seen = Seen()
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.watch(pattern, seen)
-    for key in keys_of("present"):
+    for key in keys_of("announce"):
         end.announce(key)
     end.announce(KEYS.program(f"{role}-{MARK}"))
-    assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "present")
+    assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "announce")
 
 
 async def test_watch(ends: Ends) -> None:
@@ -364,7 +364,7 @@ async def test_wide_pattern_does_nothing_at_keys_that_the_role_may_not_use(ends:
     allowed_to_ask = {one for one in WIDE if covered(role, "query", one)} | {KEYS.listing(MARK)}
     assert {*asked.keys} <= allowed_to_ask
     own = {KEYS.program(f"{role}-{MARK}")}
-    assert {*present.keys} - own <= {one for one in WIDE if covered(role, "present", one)}
+    assert {*present.keys} - own <= {one for one in WIDE if covered(role, "announce", one)}
     for key in (KEYS.service("line1/cam3", "trigger"), KEYS.summary("line1"), KEYS.reload("x")):
         forged = [(key, b"forged")] if allowed(role, "answer", key) else []
         assert await guard.ask(key, b"", 1.0) in ([], forged)

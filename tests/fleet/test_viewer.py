@@ -103,7 +103,7 @@ def test_viewer_may_do_nothing_at_a_key_of_an_operator_but_hear_and_look() -> No
     assert found == VIEWER_DOES
 
 
-@pytest.mark.parametrize("does", ["put", "answer", "present"])
+@pytest.mark.parametrize("does", ["put", "answer", "announce"])
 def test_roles_share_no_key_under_which_anything_is_said_or_present(does: str) -> None:
     """Whoever could say it could say it in the place of another role's program."""
     of = [

@@ -169,7 +169,7 @@ async def test_a_trigger_over_mqtt_reaches_a_camera_of_the_fleet(tmp_path: Path)
     [
         ("  store: {kind: sqlite}", r"line 5.*outlets\.store\.file"),
         ("  store: {kind: sqlit, file: a}", "line 5.*unknown"),
-        ("  mqtt: {broker: 'mqtt://a', password: geheim}", "line 5.*never stands in the file"),
+        ("  mqtt: {broker: 'mqtt://a', password: geheim}", "line 5.*is never in this file itself"),
     ],
 )
 def test_a_wrong_outlet_in_a_fleet_file_is_told_with_its_line(

@@ -312,7 +312,7 @@ async def test_a_trigger_by_topic_is_done_once_and_answered_where_it_was_asked_f
     [
         ({"broker": "http://a"}, "expected mqtt://HOST"),
         ({"broker": "mqtt://u:geheim@a"}, "no user in the address"),
-        ({"broker": "mqtt://a", "password": "geheim"}, "a secret never stands in the file"),
+        ({"broker": "mqtt://a", "password": "geheim"}, "a secret is never in this file itself"),
         ({"broker": "mqtt://a", "password": {}}, "either file or variable"),
         ({"broker": "mqtt://a", "topic": "a/#"}, "without"),
     ],

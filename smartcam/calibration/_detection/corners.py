@@ -91,7 +91,7 @@ def refine_corners(
         image, points, reach if arm_widths is None else reach * arm_widths.min(axis=1)
     )
     windows = cut_windows(
-        image, start, edge_steps, MAX_REACH_PX, round_=False, arm_widths=arm_widths
+        image, start, edge_steps, MAX_REACH_PX, elliptical=False, arm_widths=arm_widths
     )
     if is_single_square:
         windows = windows.without_discs(start, ROUNDED_RADIUS_PX)

@@ -43,7 +43,7 @@ MAX_RESIDUAL_RATIO = 0.5
 large as the gain."""
 
 UNREFINED_SIGMA_PX = 0.5
-"""Standard deviation, pixels, that is assumed for a dot that could not be refined: it is usual for
+"""Standard deviation, pixels, that is assumed for a dot that could not be refined: a usual error of
 other detectors."""
 
 CENTRE, ELLIPSE = slice(0, 2), slice(2, 5)
@@ -67,7 +67,7 @@ class Dots(NamedTuple):
     points: Array  # (N, 2), centres, pixels
     covariance: Array  # (N, 2, 2), pixels^2
     areas: Array  # (N,), pixels^2
-    # (N,), whether the fit was good; a dot that was not fitted keeps its place
+    # (N,), whether the fit was good; the others have the point given to refine_dots
     fitted: NDArray[np.bool_]
 
 
@@ -100,11 +100,11 @@ class GridMap:
     def shifts(self, points: Array, diameters: Array) -> Array:
         """Return the offsets (N, 2) of the outlines' centres from the dots' own centres, pixels."""
         # A tilted circle's image is an ellipse whose middle is not the image of the circle's
-        # centre. The formula for a pinhole would ignore the lens, so the dot's outline is mapped as
-        # the grid is, and the centre of its area computed. For a polygon with corners p_i it is
+        # centre. The formula for a pinhole would ignore the lens, so the dot's outline is mapped
+        # like the grid, and the centre of its area computed. For a polygon with corners p_i it is
         #     sum (p_i + p_i+1) (p_i x p_i+1) / (3 sum p_i x p_i+1).
-        # Source of the bias: Heikkila, Geometric Camera Calibration Using Circular Control Points
-        # (2000).
+        # Source, on this offset: Heikkila, Geometric Camera Calibration Using Circular Control
+        # Points (2000).
         rim_points = points[:, None] + diameters[:, None, None] / 2 * OUTLINE
         outline = self(rim_points.reshape(-1, 2)).reshape(rim_points.shape) - self(points)[:, None]
         next_corners = np.roll(outline, -1, axis=1)
@@ -120,15 +120,15 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
     """Return the fitted ellipses of dots.
 
     ``points`` (N, 2): centres, which may be off by a fraction of the radius. ``radii`` (N, 2, 2):
-    from the centre to the rim along the sheet's x and y. ``reaches`` (N, 2, 2): in the same
-    directions, to where the next printed mark begins. All are in pixels.
+    vectors from the centre to the rim along the sheet's x and y. ``reaches`` (N, 2, 2): in the same
+    directions, to the beginning of the next printed mark. All are in pixels.
     """
     longest_reach = float(np.hypot(reaches[:, 0], reaches[:, 1]).max())
     if longest_reach > MAX_REACH_PX:
         return _refine_smaller(
             image, points, radii, reaches, math.ceil(longest_reach / MAX_REACH_PX)
         )
-    windows = cut_windows(image, points, reaches, MAX_REACH_PX, round_=True)
+    windows = cut_windows(image, points, reaches, MAX_REACH_PX, elliptical=True)
     start_offsets = points - windows.centre
     start_values = _start_values(start_offsets, radii)
     fits, is_good = fit_windows(
@@ -186,7 +186,7 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
     # The ellipse is |S (p - m)| = 1 with S = (a b; b d). The distance from its rim is, to first
     # order, (r - 1) / |grad r| with r = |S (p - m)| and grad r = S S (p - m) / r.
     # Source: Sampson, Fitting Conic Sections to "Very Scattered" Data (1982).
-    # Columns of r: for m -grad r, for a, b, d the elements of (S (p - m) / r) (p - m)^T. The change
+    # Columns of r: for m -grad r, for a, b, d the entries of (S (p - m) / r) (p - m)^T. The change
     # of |grad r| with these values is neglected.
     weights = windows.weights
     u, v, a, b, d, blur, gain, offset = values.astype(np.float32).T[:, :, None]
@@ -194,10 +194,10 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
     normal_x, normal_y = a * x + b * y, b * x + d * y
     radius = np.maximum(np.sqrt(normal_x * normal_x + normal_y * normal_y), np.float32(1e-3))
     normal_x, normal_y = normal_x / radius, normal_y / radius
-    # the gradient of the radius, whose length turns it into a distance from the rim
-    slope_x, slope_y = a * normal_x + b * normal_y, b * normal_x + d * normal_y
+    # the gradient of r; r - 1 divided by its length is the distance from the rim
+    gradient_x, gradient_y = a * normal_x + b * normal_y, b * normal_x + d * normal_y
     distance_scale = 1 / np.maximum(
-        np.sqrt(slope_x * slope_x + slope_y * slope_y), np.float32(1e-6)
+        np.sqrt(gradient_x * gradient_x + gradient_y * gradient_y), np.float32(1e-6)
     )
     scale = 1 / (np.sqrt(np.float32(2)) * blur)
     signed_distance = (radius - 1) * distance_scale * scale
@@ -206,8 +206,8 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
     slope_scale = slope * distance_scale
     product = profile * weights
     columns = (
-        slope_scale * slope_x,
-        slope_scale * slope_y,
+        slope_scale * gradient_x,
+        slope_scale * gradient_y,
         slope_scale * normal_x * x,
         slope_scale * (normal_x * y + normal_y * x),
         slope_scale * normal_y * y,

@@ -58,19 +58,21 @@ def cut_windows(
     half_sides: Array,
     max_reach: int,
     *,
-    round_: bool,
+    elliptical: bool,
     arm_widths: Array | None = None,
 ) -> Windows:
     """Return the pixels around points (N, 2).
 
     ``half_sides`` (N, 2, 2): half sides of the parallelogram around each point whose pixels count,
-    or the half axes of an ellipse (``round_``). A window reaches at most ``max_reach`` pixels to
+    or, if ``elliptical``, half axes of an ellipse. A window reaches at most ``max_reach`` pixels to
     each side. ``arm_widths`` (N, 2): of the parallelogram only a cross counts, whose pixels are
     nearer to the point than this fraction of a half side; None: all of it counts. Pixels nearer
     than MIN_REACH_PX count always.
     """
     reach = (
-        np.hypot(half_sides[:, 0], half_sides[:, 1]) if round_ else np.abs(half_sides).sum(axis=1)
+        np.hypot(half_sides[:, 0], half_sides[:, 1])
+        if elliptical
+        else np.abs(half_sides).sum(axis=1)
     )
     half = int(np.clip(np.ceil(reach.max()), MIN_REACH_PX, max_reach))
     span = np.arange(-half, half + 1)
@@ -83,7 +85,7 @@ def cut_windows(
     # coordinates of each pixel along the two half sides
     coordinates = np.linalg.inv(half_sides.transpose(0, 2, 1)) @ np.stack([x, y])
     is_in_shape = (
-        (coordinates**2).sum(axis=1) <= 1 if round_ else (np.abs(coordinates) <= 1).all(axis=1)
+        (coordinates**2).sum(axis=1) <= 1 if elliptical else (np.abs(coordinates) <= 1).all(axis=1)
     )
     if arm_widths is not None:
         is_in_shape &= (np.abs(coordinates) <= arm_widths[:, :, None]).any(axis=1)

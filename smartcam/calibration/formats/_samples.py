@@ -4,7 +4,7 @@ The tests of MoveIt's solver have JSON: a list of pairs of (4, 4) matrices. Move
 YAML: a list of mappings, in which each value is a list of the 16 numbers of a matrix, row by row.
 
 Source: github.com/moveit/moveit_calibration, ``pose_samples.json`` and
-``handeye_control_widget.cpp`` (published).
+``handeye_control_widget.cpp``.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _check_frames(samples: Sequence[HandEyeSample]) -> None:
 def check_same_frames(transforms: Sequence[Transform], label: str) -> None:
     """Raise ``WRONG_FRAME`` unless all transforms have the same frames.
 
-    ``label``: a transform's name in the error, with ``{}`` for its number.
+    ``label``: template of a transform's name in the error, with ``{}`` for its number.
     """
     for index, transform in enumerate(transforms):
         if (transform.target, transform.source) != (transforms[0].target, transforms[0].source):

@@ -23,7 +23,7 @@ STATUS_GRACE = 0.05
 
 def _find_wrong_result(run: ClientRun) -> str | None:
     """Return the first mistake in the client's results; too few results are no mistake."""
-    scene, sent_runs, last_run = run.scene, run.sent_runs, -1
+    scene, sent_run_numbers, last_run = run.scene, run.sent_run_numbers, -1
     for number, data in enumerate(run.outcome.results, 1):
         label = f"result {number}, {data[:32].hex(' ') or 'empty'},"
         content = read_container(data)
@@ -32,7 +32,7 @@ def _find_wrong_result(run: ClientRun) -> str | None:
         application, run_number = content
         if application != scene.application:
             return f"{label} is of application {application}, not of {scene.application}"
-        if run_number not in sent_runs:
+        if run_number not in sent_run_numbers:
             return f"{label} was never sent"
         if run_number in scene.stale:
             return f"{label} is of an inspection that was under way before the client's trigger"

@@ -26,7 +26,7 @@ CLIENT_END_TIMEOUT = 0.3
 """Seconds that the camera waits for the last messages of a client that has ended."""
 
 MAX_LINES = 40
-"""Largest number of messages that a finding shows, one a line: the last ones."""
+"""Largest number of messages in a finding, one a line: the last ones are shown."""
 
 
 class RecordedMessage(NamedTuple):
@@ -79,7 +79,7 @@ class ClientRun:
         )
 
     @property
-    def sent_runs(self) -> list[int]:
+    def sent_run_numbers(self) -> list[int]:
         """Run numbers of the results that the scene's application sent, in order."""
         numbers: list[int] = []
         for message in self.messages:
@@ -101,7 +101,7 @@ class ClientRun:
         """The last messages on the wire as lines, for people."""
         left_out = len(self.messages) - MAX_LINES
         lines = [str(message) for message in self.messages[-MAX_LINES:]]
-        return [f"... {left_out} before" if left_out > 0 else "", *lines][left_out <= 0 :]
+        return [f"... {left_out} messages before" if left_out > 0 else "", *lines][left_out <= 0 :]
 
 
 async def run_scene(
@@ -201,17 +201,17 @@ def _join_ignored_frames(log: Iterable[LogEntry]) -> list[LogEntry]:
 
 
 def _record_entry(dialect: FramedDialect, entry: LogEntry, started_at: float) -> RecordedMessage:
-    data = entry.wire
-    if data is None and entry.message_id is not None:
+    sent_hex = entry.wire
+    if sent_hex is None and entry.message_id is not None:
         payload = bytes.fromhex(entry.hex)
-        data = dialect.encode_frame(Frame(entry.message_id, payload)).hex(" ")
+        sent_hex = dialect.encode_frame(Frame(entry.message_id, payload)).hex(" ")
     return RecordedMessage(
         entry.time - started_at,
         Sender.CLIENT if entry.direction == "in" else Sender.CAMERA,
         entry.peer,
         entry.message,
         _message_text(dialect, entry.message),
-        entry.hex if data is None else data,
+        entry.hex if sent_hex is None else sent_hex,
         entry.error,
         entry.wire == "" or (entry.fault or "").endswith(("not sent", "connection ended")),
     )

@@ -1,7 +1,7 @@
-"""Define an agent's client of a shared camera, which does not interpret the results.
+"""Define the client with which an agent shares a camera; it does not interpret results.
 
-Each program interprets containers by itself. So at the agent, the value of a result is only the
-owner of the result's trigger; the container's bytes are in ``raw``. If a program's layout has a
+Each program interprets containers by itself. So at the agent a result's ``value`` is a
+:class:`RawValue`; the container's bytes are in the result's ``raw``. If a program's layout has a
 field ``@sequence``, the agent reads this field.
 """
 
@@ -49,7 +49,7 @@ class RawValue(NamedTuple):
 
 
 class AgentInterpretation(Interpretation):
-    """An interpretation that reads at most ``@sequence`` from a container.
+    """An interpretation that reads nothing from a container but ``@sequence``, if a layout has it.
 
     Args:
         owner: owner of the trigger of the results.
@@ -94,7 +94,7 @@ class AgentInterpretation(Interpretation):
 class AgentCallbacks(NamedTuple):
     """The agent's callbacks for one of its cameras."""
 
-    on_results: Callable[[Sequence[Result[RawValue]], bool, bool], None]
+    on_results: Callable[[Sequence[Result[RawValue]], bool, bool], None]  # results, current, late
     on_status: Callable[[Status], None]
     on_event: Callable[[CameraEvent], None]
     on_end: Callable[[], None]
@@ -212,16 +212,16 @@ class AgentClient(SmartCamera[RawValue]):
             return await self._trigger(application, request, timeout)
         called_at = datetime.now(UTC)
         try:
-            return await self._trigger_in_order(application, request, timeout)
+            return await self._trigger_without_old_input(application, request, timeout)
         except SmartCamError as error:
             self._observers.error(self.name, error, called_at)
             raise
 
-    async def _trigger_in_order(
+    async def _trigger_without_old_input(
         self, application: int | None, request: TriggerRequest, timeout: float
     ) -> list[Result[RawValue]]:
         if request.input_data is not None and self._results.input_in_doubt:
-            started_at = self._deadline(0.0)
+            started_at = self._deadline(0.0)  # a deadline in 0 s is the present time
             try:
                 await self._lock.load_again(lambda: self._results.input_in_doubt, timeout)
             except ResponseTimeoutError as exc:
@@ -249,7 +249,7 @@ class AgentClient(SmartCamera[RawValue]):
         await self._lock.go_back_and_wait(before)
 
     async def refresh_status(self, timeout: float) -> bool:
-        """Make sure that the known status is current; return whether the camera was asked."""
+        """Make sure that the known status is current; return whether the camera had to be asked."""
         deadline = self._deadline(timeout)
         self._require_session()
         await self._status.refresh(deadline)

@@ -1,4 +1,4 @@
-"""Serve ``reload`` over the bus: an agent reads its file again, and answers with the changes."""
+"""Serve ``reload`` over the bus: an agent reads its file again, and replies with the changes."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ MAX_RUNNING_RELOADS = 16
 
 
 class ReloadService:
-    """Answers programs' requests to reload an agent's file.
+    """Answers programs' requests to reload an agent's fleet file.
 
     Args:
-        agent: the agent, whose tasks do the work.
+        agent: the agent, in whose tasks the reloads run.
         bus: the agent's connection to the bus.
         keys: keys of the fleet.
         reload: function that reads the file again and returns the changes.
@@ -59,7 +59,7 @@ class ReloadService:
 
     async def _answer(self, question: BusQuestion) -> None:
         fields: dict[str, Any] = {
-            "error": to_fields(SmartCamError("the agent ends; whether it was done is unknown"))
+            "error": to_fields(SmartCamError("the agent ends; whether it reloaded is unknown"))
         }
         try:
             fields = {"changes": jsonable(await self._reload())}
@@ -87,7 +87,7 @@ async def reload_agents(
         if agent not in outcomes:
             outcomes[agent] = ResponseTimeoutError(
                 f"reload: no answer of the agent {agent} within {timeout:.3g} s: it may be gone "
-                "or busy, or this program is not allowed to ask; whether it was done is unknown",
+                "or busy, or this program is not allowed to ask; whether it reloaded is unknown",
                 waited=timeout,
             )
     return {name: outcomes[name] for name in sorted(outcomes)}
@@ -102,4 +102,4 @@ def _read_answer(agent: str, payload: bytes) -> FleetChanges | SmartCamError:
         names = {name: tuple(map(str, changes[name])) for name in ("added", "removed", "changed")}
         return FleetChanges(agent=agent, kept=int(changes["kept"]), **names)
     except (ValueError, KeyError, TypeError, RecursionError) as exc:
-        return SmartCamError(f"reload: the agent {agent} answers what cannot be read: {exc!r:.200}")
+        return SmartCamError(f"reload: the agent {agent} sent an unreadable answer: {exc!r:.200}")

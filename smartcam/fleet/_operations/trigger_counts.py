@@ -1,4 +1,4 @@
-"""Count the outcomes of triggers at an agent, and sum the counters of cameras."""
+"""Name the outcomes of triggers at an agent, and sum the counters of its cameras."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ _FAILURE_WORDS: Final[tuple[tuple[type[BaseException], str], ...]] = (
     (OvertriggeredError, "overtriggered"),
     (InputContainerError, "input"),
     (InterpretationError, "uninterpretable"),
-    (CommandRejectedError, "rejected"),
+    (CommandRejectedError, "rejected"),  # by the camera
     (CameraFaultError, "fault"),
     (LinkError, "no_session"),
-    (LocalProtocolError, "refused"),
+    (LocalProtocolError, "refused"),  # by the agent, like the next two
     (ConfigurationError, "refused"),
     (UnsupportedError, "refused"),
 )
@@ -59,13 +59,13 @@ SUMS: Final = (
     *("empty_slots", "extra_results", "inspections_by_others", "ignored_datagrams"),
     *("unknown_ids", "unexpected_messages", "long_bodies"),
 )
-"""Names of the counters that are reported as sums over all cameras."""
+"""Counters of :class:`Statistics` that are reported as sums over all cameras."""
 
 
 class Totals:
     """Sums of counters over an agent's cameras.
 
-    Cameras that were removed stay in the sums, so that the sums never decrease.
+    The sums keep the counts of removed cameras, so that they never decrease.
 
     Args:
         start: sums to begin with; None: zero.

@@ -1,7 +1,7 @@
 """Define the rights of each role, and convert them to rules for Zenoh.
 
-A program's role is the common name in its certificate. Zenoh allows only what :data:`RIGHTS`
-list; ``docs/access.md`` is generated from this list.
+A program's role is the common name in its certificate. Zenoh allows only the uses in
+:data:`RIGHTS`, from which the table in ``docs/access.md`` is generated.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from smartcam.fleet._security.certificates import AGENT, OPERATOR, ROLES, ROUTER
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-Use = Literal["put", "subscribe", "query", "answer", "present", "watch"]
+Use = Literal["put", "subscribe", "query", "answer", "announce", "watch"]
 Flow = Literal["ingress", "egress"]
 
 MESSAGES: dict[Use, tuple[tuple[str, Flow], ...]] = {
@@ -25,7 +25,7 @@ MESSAGES: dict[Use, tuple[tuple[str, Flow], ...]] = {
     "subscribe": (("declare_subscriber", "ingress"), ("put", "egress")),
     "query": (("query", "ingress"), ("reply", "egress"), ("declare_queryable", "egress")),
     "answer": (("declare_queryable", "ingress"), ("query", "egress"), ("reply", "ingress")),
-    "present": (("liveliness_token", "ingress"),),
+    "announce": (("liveliness_token", "ingress"),),
     "watch": (
         ("liveliness_query", "ingress"),
         ("declare_liveliness_subscriber", "ingress"),
@@ -65,8 +65,8 @@ RIGHTS: tuple[Right, ...] = (
     ),
     *(
         Right(
-            "be present under a name of its role",
-            "present",
+            "announce itself under a name of its role",
+            "announce",
             (_ANY.program(names_pattern(role)),),
             (role,),
         )
@@ -79,11 +79,11 @@ RIGHTS: tuple[Right, ...] = (
         _ALL_PROGRAMS,
     ),
     *(
-        Right("send queries as its role", "put", (_ANY.ask(role, "*", "**"),), (role,))
+        Right("send questions as its role", "put", (_ANY.ask(role, "*", "**"),), (role,))
         for role in _ALL_PROGRAMS
     ),
     Right(
-        "get answers and frames", "subscribe", (_ANY.reply("*"), _ANY.frames("*")), _ALL_PROGRAMS
+        "get replies and pictures", "subscribe", (_ANY.reply("*"), _ANY.frames("*")), _ALL_PROGRAMS
     ),
     Right("get results in bundles", "subscribe", (_ANY.bundle("*"),), _ALL_PROGRAMS),
     Right("request the state of all cameras", "query", (_ANY.summary("*"),), _ALL_PROGRAMS),
@@ -92,7 +92,7 @@ RIGHTS: tuple[Right, ...] = (
     Right(
         "JSON: get topics",
         "subscribe",
-        (_ANY.topic("*", "**"), _ANY.thesis_topic("**")),
+        (_ANY.topic("*", "**"), _ANY.thesis_topic("**")),  # see docs/bus.md: the thesis
         _ALL_PROGRAMS,
     ),
     Right(
@@ -105,19 +105,21 @@ RIGHTS: tuple[Right, ...] = (
     Right("JSON: all services", "query", (f"{_ANY.root}/service/**", _ANY.thesis("*")), _OPERATORS),
     Right("make an agent read its file again", "query", (_ANY.reload("*"),), _OPERATORS),
     Right("read its file again", "answer", (_ANY.reload("*"),), _AGENTS),
-    Right("share cameras", "present", (_ANY.agent("*"), _ANY.camera("*", "**")), _AGENTS),
-    Right("reserve its own name", "present", (_ANY.start("*", "*"),), _AGENTS),
-    Right("see which agent has its name", "watch", (_ANY.start("*", "*"),), _AGENTS),
+    Right("share cameras", "announce", (_ANY.agent("*"), _ANY.camera("*", "**")), _AGENTS),
+    Right("reserve its own name", "announce", (_ANY.start("*", "*"),), _AGENTS),
+    Right("see which agents have its name", "watch", (_ANY.start("*", "*"),), _AGENTS),
     Right("see which programs are present", "watch", (_ANY.program("*"),), _AGENTS),
-    Right("get calls", "subscribe", (_ANY.command("*", "**"), _ANY.ask("*", "*", "**")), _AGENTS),
-    Right("answer calls", "put", (_ANY.reply("*"), _ANY.frames("*")), _AGENTS),
+    Right(
+        "get requests", "subscribe", (_ANY.command("*", "**"), _ANY.ask("*", "*", "**")), _AGENTS
+    ),
+    Right("reply, send pictures", "put", (_ANY.reply("*"), _ANY.frames("*")), _AGENTS),
     Right("publish results and states", "put", (_ANY.results("**"), _ANY.states("**")), _AGENTS),
     Right("publish results in bundles", "put", (_ANY.bundle("*"),), _AGENTS),
     Right("report the state of all its cameras", "answer", (_ANY.summary("*"),), _AGENTS),
     Right("JSON: report its outlets' counts", "answer", (_ANY.outlets("*", "*"),), _AGENTS),
     Right("JSON: publish topics", "put", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _AGENTS),
     Right(
-        "JSON: list, serve",
+        "JSON: list cameras, answer services",
         "answer",
         (_ANY.listing("**"), f"{_ANY.root}/service/**", _ANY.thesis("*")),
         _AGENTS,

@@ -21,14 +21,15 @@ MAX_PLAIN_BYTES: Final = 16 << 20
 """Largest size of an unpacked description, bytes; descriptions of large cameras have 2 MB."""
 
 MAX_PACKED_BYTES: Final = 4 << 20
-"""Largest size of a description's ZIP archive, bytes: 2 MB of XML take 0.2 MB. An archive can
-declare a file in 46 bytes; listing one takes 8 us."""
+"""Largest size of a description's ZIP archive, bytes; 2 MB of XML are packed in 0.2 MB. It also
+bounds the number of files to list: an archive declares one in 46 bytes, listing it takes 8 us."""
 
 MAX_LEVELS: Final = 32
 """Largest depth of nested elements of a description."""
 
 MAX_ELEMENTS: Final = 400_000
-"""Largest number of elements of a description; elements of a ``StructReg`` count for each entry."""
+"""Largest number of elements of a description; those of a ``StructReg`` count for each of its
+entries."""
 
 
 class Location(NamedTuple):
@@ -211,8 +212,8 @@ def _nodes(root: Element) -> dict[str, Element]:
                 copies += len(shared)
                 if copies > MAX_ELEMENTS:
                     raise MessageError(
-                        f"the description: expected at most {MAX_ELEMENTS} elements, those of a "
-                        f"StructReg counted for each entry, got {copies} such ones"
+                        f"the description: expected at most {MAX_ELEMENTS} elements, got {copies} "
+                        "copies for the entries of StructRegs"
                     )
                 own_kinds = {child.kind for child in entry.children}
                 entry.children += [node for node in shared if node.kind not in own_kinds]

@@ -23,7 +23,8 @@ MAX_BYTES_PER_REQUEST: Final = 512
 
 ACK_REQUIRED: Final = 0x01
 BROADCAST_ACK: Final = 0x10
-"""Flag of a DISCOVERY: a camera whose address fits no subnet here may broadcast its answer."""
+"""Flag of a DISCOVERY: a camera that is in none of this machine's subnets may broadcast
+its answer."""
 EXTENDED_ID: Final = 0x10
 """Flag of a PACKETRESEND: the block's id has 64 bits."""
 
@@ -34,7 +35,7 @@ _WORD: Final = struct.Struct(">I")
 
 
 class GvcpCommand(IntEnum):
-    """The command of a request; the answer's command is one more."""
+    """The command of a request; the answer's number is larger by one."""
 
     DISCOVERY = 0x0002
     FORCEIP = 0x0004

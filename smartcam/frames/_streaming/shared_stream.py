@@ -54,8 +54,8 @@ class EncodedCounts:
 class SharedH264:
     """Read a source while there are viewers, and encode it once for all.
 
-    When a frame is encoded, the newest frame is encoded next; frames in between are skipped. When
-    the source ends, all viewers are removed; the next viewer restarts the source.
+    After a frame the newest one is encoded; frames that came in between are skipped. When the
+    source ends, all viewers are removed; the next viewer restarts the source.
 
     Args:
         source: open source, which must stay open while this object is used.
@@ -94,14 +94,14 @@ class SharedH264:
     def remove_viewer(self, viewer: StreamViewer) -> None:
         """Remove a viewer; an unknown viewer is ignored."""
         self._viewers.pop(viewer, None)
-        self._stop_if_idle()
+        self._stop_soon_if_idle()
 
     def request_key_frame(self) -> None:
         """Request a key frame, at most one per :data:`KEY_FRAME_INTERVAL` for all viewers."""
         self._key_frame_wanted = True
 
     async def first_key_frame(self, timeout: float) -> Frame:
-        """Return a key frame of the stream, which is started if needed.
+        """Return the last key frame, or wait for the first one; the stream is started if needed.
 
         Raises:
             FrameSourceError: the source ended, or no frame came in time.
@@ -109,7 +109,7 @@ class SharedH264:
         Cancellation: safe.
         """
         if self._task is not None and self._last_key_frame is not None:
-            self._stop_if_idle()
+            self._stop_soon_if_idle()
             return self._last_key_frame
         future: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
         self._key_frame_futures.add(future)
@@ -124,7 +124,7 @@ class SharedH264:
             ) from None
         finally:
             self._key_frame_futures.discard(future)
-            self._stop_if_idle()
+            self._stop_soon_if_idle()
 
     async def close(self) -> None:
         """Stop reading, without informing viewers. Idempotent.
@@ -147,7 +147,7 @@ class SharedH264:
             self._task = asyncio.get_running_loop().create_task(self._read_source(), name=name)
             self._task.add_done_callback(self._on_task_done)
 
-    def _stop_if_idle(self) -> None:
+    def _stop_soon_if_idle(self) -> None:
         if self._viewers or self._key_frame_futures or self._task is None:
             return
         if self._linger_timer is not None:

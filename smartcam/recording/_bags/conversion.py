@@ -46,15 +46,15 @@ def write_bag(
     """Convert a recording to a rosbag2, in its order and with its times.
 
     Without ``interpret_as`` and ``calibration`` the values are the recorded ones. With one of them
-    each result's bytes are interpreted again; results that do not fit are written with the error,
-    and counted.
+    each result's bytes are interpreted again; results whose bytes cannot be interpreted so are
+    written with the error, and counted.
 
     Args:
         recording: recording to read.
         path: the bag's folder.
         camera: name of the camera to write; default all cameras.
-        interpret_as: interpreter of results, as for :func:`smartcam.connect`; default the recorded
-            one, or localizations with a calibration.
+        interpret_as: interpreter of results, as for :func:`smartcam.connect`; with a calibration
+            the default is the recorded one, or ``localizations`` if none was recorded.
         y_down: the camera's y axis points down; default as recorded.
         calibration: calibration that transforms localizations into the robot's frame, as for
             :func:`smartcam.connect`.
@@ -103,8 +103,10 @@ class BagConversion:
             [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
         )
         interprets_again = self.interpret_as is not None or self.calibration is not None
-        reinterpreted = chosen if interprets_again else []
-        self._interpreters = {camera.name: self._interpreter(camera) for camera in reinterpreted}
+        reinterpreted_cameras = chosen if interprets_again else []
+        self._interpreters = {
+            camera.name: self._make_interpreter(camera) for camera in reinterpreted_cameras
+        }
         self._items = BagItems(RosTypes(DISTRIBUTION), self._interpret)
         for camera in chosen:
             metadata = {"interpret_as": self._spec(camera)} if interprets_again else camera.metadata
@@ -143,12 +145,12 @@ class BagConversion:
             raise
 
     def _spec(self, camera: RecordedCamera) -> Any:
-        """Return the interpreter of a camera's results, as given or recorded."""
+        """Return ``interpret_as`` for a camera, as given or recorded."""
         if self.interpret_as is not None:
             return self.interpret_as
         return camera.interpret_as or "localizations"
 
-    def _interpreter(self, camera: RecordedCamera) -> _ResultInterpreter:
+    def _make_interpreter(self, camera: RecordedCamera) -> _ResultInterpreter:
         if camera.dialect not in BVS.dialects and camera.protocol != "bvs":
             raise UnsupportedError(
                 f"bag: camera {camera.name!r} speaks {camera.protocol or 'no known protocol'} "
@@ -166,7 +168,7 @@ class BagConversion:
         )
         endian = camera.metadata.get("endian", "0")
         if endian not in {"0", "1"}:
-            raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
+            raise ConfigurationError(f"recording: endian: expected 0 or 1, got {endian:.20}")
         return _ResultInterpreter(interpretation, int(endian))
 
     def _track_byte_order(self, item: Item) -> None:

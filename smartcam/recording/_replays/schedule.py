@@ -321,7 +321,7 @@ def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) ->
         RecordingError: the containers are too large together.
     """
     if endian not in {"0", "1"}:
-        raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
+        raise ConfigurationError(f"recording: endian: expected 0 or 1, got {endian:.20}")
     steps: list[_ReplayStep] = []
     triggered_at, size = None, 0
     gap_steps = _GapSteps()

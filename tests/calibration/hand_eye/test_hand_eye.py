@@ -783,7 +783,7 @@ def test_hand_eye_from_poses_is_stored_bit_by_bit() -> None:
         ("used", [True, True, True], "used: expected 9"),
         ("covariance", [[0.0]], "covariance: expected 12 rows of 12"),
         ("views", [], ""),
-        ("target", None, "target: expected the one that it shows"),
+        ("target", None, "target: expected the target of the view"),
     ],
 )
 def test_hand_eye_from_other_data_is_refused(

@@ -493,5 +493,5 @@ def test_description_in_a_large_archive_is_refused() -> None:
 def test_description_of_a_structure_with_many_entries_is_refused() -> None:
     text = "<Sign/>" * 1000 + '<StructEntry Name="e"/>' * 1000
     text = f"<RegisterDescription><StructReg>{text}</StructReg></RegisterDescription>"
-    with pytest.raises(MessageError, match="StructReg counted for each entry"):
+    with pytest.raises(MessageError, match="copies for the entries of StructRegs"):
         _description.parse(text.encode())

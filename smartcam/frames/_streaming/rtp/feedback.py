@@ -69,7 +69,7 @@ class ReceiverReports:
     def record(self, report: ReceiverReport, address: str) -> bool:
         """Record a report; return True if it is the first of its receiver."""
         now = time.monotonic()
-        self._forget_silent(now)
+        self._forget_silent_receivers(now)
         is_new = report.ssrc not in self._receivers
         if is_new and len(self._receivers) >= MAX_RECEIVERS:
             return False
@@ -89,7 +89,7 @@ class ReceiverReports:
     def receivers(self) -> tuple[RtpReceiver, ...]:
         """Return the reporting receivers."""
         now = time.monotonic()
-        self._forget_silent(now)
+        self._forget_silent_receivers(now)
         return tuple(
             RtpReceiver(
                 receiver.address,
@@ -102,7 +102,7 @@ class ReceiverReports:
             for receiver in self._receivers.values()
         )
 
-    def _forget_silent(self, now: float) -> None:
+    def _forget_silent_receivers(self, now: float) -> None:
         self._receivers = {
             ssrc: receiver
             for ssrc, receiver in self._receivers.items()
