@@ -54,7 +54,7 @@ RESOLVE_TIMEOUT: Final = 10.0
 """Seconds that the look-up of a host's address may take."""
 
 RESERVED_DESCRIPTORS: Final = 32
-"""File descriptors that a server's connections leave to the rest of the process, and to clients."""
+"""File descriptors that a server's connections leave to the rest of the process, and to cameras."""
 
 DESCRIPTORS_LEFT_BY_EMULATORS: Final = 8
 """File descriptors that the connections of an emulated camera leave to the rest of the process."""

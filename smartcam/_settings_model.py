@@ -41,7 +41,7 @@ OPTIONS: dict[str, tuple[Any, str]] = {
         Annotated[str, Field(strict=True, max_length=MAX_NAME_CHARACTERS), PLAIN],
         "name in logs and results; default HOST:PORT",
     ),
-    "application": (ApplicationId | None, "id of the application to load and run; not a name"),
+    "application": (ApplicationId | None, "id of the application to load and run, or its name"),
     "application_names": (
         Annotated[dict[Text, ApplicationId], Field(max_length=1000)],
         "names of applications and their ids; a name may replace any id",

@@ -60,6 +60,18 @@ def test_room_is_entered_by_its_door() -> None:
     assert found == set(THROUGH_THE_WALL)
 
 
+def test_names_of_each_inside_resolve() -> None:
+    insides = [importlib.import_module(name) for name in package() if name.endswith("._inside")]
+    assert insides
+    unresolved = {
+        (module.__name__, name)
+        for module in insides
+        for name in (*module.__all__, *dir(module))
+        if not hasattr(module, name)
+    }
+    assert unresolved == set()
+
+
 def test_inside_lists_what_other_rooms_use_and_nothing_else() -> None:
     used: dict[str, set[str]] = {}
     for importer, tree in package().items():

@@ -41,7 +41,7 @@ class Attempt:
 
     Attributes:
         dialect: name of the dialect; until the camera's dialect is known, the names of all
-            dialects that the attempt attempts.
+            dialects that it tries.
         transport: ``tcp`` or ``udp``.
         step: name of the last step that was begun.
         outcome: text that says how the attempt ended.

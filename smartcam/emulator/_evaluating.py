@@ -28,7 +28,7 @@ def request(pattern: str) -> Callable[[HandlerT], HandlerT]:
     """
 
     def mark(method: HandlerT) -> HandlerT:
-        method.pattern = re.compile(pattern, re.DOTALL)  # type: ignore[attr-defined]
+        method.request_pattern = re.compile(pattern, re.DOTALL)  # type: ignore[attr-defined]
         return method
 
     return mark
@@ -84,7 +84,9 @@ class EvaluatingCamera(LineCamera):
     def __init_subclass__(cls, **given: Any) -> None:
         """Collect the methods that answer requests, in order."""
         super().__init_subclass__(**given)
-        methods = {m.pattern: m for m in vars(cls).values() if hasattr(m, "pattern")}
+        methods = {
+            m.request_pattern: m for m in vars(cls).values() if hasattr(m, "request_pattern")
+        }
         cls.requests = {**cls.requests, **methods}
 
     def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *idle: int) -> None:

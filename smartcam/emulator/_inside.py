@@ -75,7 +75,7 @@ if not TYPE_CHECKING:
         {
             "_scenario.file": "scenario_schema load_scenarios",
             "faults": "FiredFault",
-            "_traffic": "LogEntry Visit",
+            "_traffic": "EndedConnection LogEntry",
             "_bvs.device": "Device LastReport",
             "_camera": "CONDITIONS",
             "_client_link": "ClientLink",

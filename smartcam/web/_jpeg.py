@@ -24,7 +24,7 @@ HEAD_BYTES: Final = 4096
 """Number of bytes at the start of a JPEG in which the Huffman tables are looked for."""
 
 DIRECT_FORMATS: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
-"""Formats that can be encode_pixels as a JPEG without a conversion, in addition to YUV formats."""
+"""Formats that can be encoded as a JPEG without a conversion, in addition to YUV formats."""
 
 
 def jpeg(frame: Frame, quality: int) -> bytes:

@@ -87,7 +87,7 @@ MIN_DIRECTION_LENGTH = 1e-9
 """A vector shorter than this has no direction."""
 
 STALE_LEVEL = 0.01
-"""Default of the probability with which a calibration that still holds may be label stale."""
+"""Default of the probability with which a calibration that still holds may be called stale."""
 
 
 class Drift(NamedTuple):
@@ -439,7 +439,7 @@ class PlaneCalibration(storage.SavedCalibration):
             camera_points: (K, 2), or one point (2,).
             robot_points: (K, 3) or (3,), where the robot touches them, metres.
             level: probability, between 0 and 1, with which a calibration that still holds may be
-                label stale.
+                called stale.
 
         Raises:
             CalibrationError: as :meth:`covariance_at`; NOT_FINITE: the level is not valid.

@@ -75,7 +75,7 @@ MIN_VARIANCE_RATIO = 1e-8
 
 
 class Evidence(NamedTuple):
-    """The data that the tests examine; lengths are normalized as ``place`` says."""
+    """The data that the tests examine; lengths are normalized by ``normalization``."""
 
     pairs: Pairs
     fitted: Fit  # the fit of the model that is used

@@ -431,7 +431,7 @@ class _StereoSolution(NamedTuple):
     bad: list[IndexedView]  # views that fit badly, whether used or not
     adjusted: AdjustedBundle  # fitted cameras
     min_pairs: int  # number of pairs that are needed
-    # moments whose views do not belong together, as in :class:`FirstGuess`
+    # indices of pairs whose views do not belong together, as in :class:`FirstGuess`
     mismatched: Mapping[int, float]
 
     def pair(self, number: int) -> tuple[TargetView, TargetView]:

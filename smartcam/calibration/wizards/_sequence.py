@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._journal import Journal
     from smartcam.calibration.wizards._steps import Answers, Step
 
-SCHEMA = "smartcam.sequence/1"
+SCHEMA = "smartcam.sequence/2"
 """Name of the journal's form, in its first line."""
 
 Action = Callable[["Answers"], Awaitable[Any]]

@@ -182,7 +182,7 @@ class _RunningCalibration:
         first_step: step before the wizard.
         service: service that runs the wizard; None: no wizard was chosen yet.
         was_returned: whether a step was returned to a client.
-        is_aborted: whether a call has aborted the running.
+        is_aborted: whether a call has aborted the calibration.
         picture_time: time of the last picture, UTC; None: not known.
     """
 

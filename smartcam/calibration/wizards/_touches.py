@@ -127,8 +127,8 @@ class Touches:
         """Ask which marks of a picture will be touched, then for their touches.
 
         ``rows``: result of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.take_marks`.
-        ``most``: largest number of touches of a run; raises SHAPE for more. ``noun``: name of the
-        points, for people.
+        ``max_count``: largest number of touches of a run; raises SHAPE for more. ``noun``: name of
+        the points, for people.
         """
         marks = await ask_marks([Mark.of(row) for row in rows], self.camera_unit)
         self.check_count(len(marks), max_count, noun)

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 LOST_CLOCK = datetime(1970, 1, 1, tzinfo=UTC)
-"""Time that the clock shows after a restart: lost by a related camera's manual; value inferred.
+"""Time that the clock shows after a restart: a related camera's manual says that it is lost; the
+value is inferred.
 
 The camera's clock has no time zone; UTC stands here because our times need one.
 """

@@ -185,7 +185,7 @@ def _outlet_families(core: Any, counts: AgentCounts) -> Iterator[Any]:
         "smartcam_outlet_spooled", "Results that wait for the far end", labels=labels
     )
     is_up = core.GaugeMetricFamily(
-        "smartcam_outlet_up", "Whether results can be delivered or spooled", labels=labels
+        "smartcam_outlet_up", "Whether the outlet delivers its results", labels=labels
     )
     dropped = core.CounterMetricFamily(
         "smartcam_outlet_dropped", "Results that were given up", labels=[*labels, "reason"]

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.inspection._locate.outlines import Unit
 
-VERSION: Final = 2
+VERSION: Final = 3
 """Version of the files of models."""
 
 MAX_FILE_BYTES: Final = 1 << 21
@@ -545,7 +545,7 @@ class _ModelFile(BaseModel):
     )
 
     kind: Literal["smartcam part model"] = "smartcam part model"
-    version: Literal[2] = VERSION
+    version: Literal[3] = VERSION
     name: Annotated[str, Field(min_length=1, max_length=50)]
     reference: tuple[Number, Number]
     border: Annotated[float, Field(ge=0, le=1)]

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from smartcam.outlets._outlet import Column
 
 MAX_FIELDS = 500
-"""Largest number of fields of a layout's structure; a result with more is sent as JSON."""
+"""Largest number of fields of a layout's structure; further fields are only in the JSON."""
 
 MAX_RECORDS = 1000
-"""Largest number of records that become structures; a result with more is sent as JSON."""
+"""Largest number of records of a result that become structures; further ones are only in JSON."""
 
 MAX_STRUCTURES = 2000
 """Largest number of structures of one server, which has one for each layout of an application."""

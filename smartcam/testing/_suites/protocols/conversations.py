@@ -154,7 +154,9 @@ class Player:
         if wire != step.wire:
             raise AssertionError(f"{where}: expected {step.wire!r} on the wire, got {wire!r}")
         if wire and not isinstance(step, Sent) and not self.machine.may_reply:
-            raise AssertionError(f"{where}: the machine replies by itself, so replies must be True")
+            raise AssertionError(
+                f"{where}: the machine replies by itself, so may_reply must be True"
+            )
         self.step_index += 1
 
     def feed_machine(self, chunk: bytes, *, use_buffer: bool = True) -> list[Any]:
