@@ -306,7 +306,10 @@ async def test_the_command_serves_one_camera_without_a_fleet(tmp_path: Path) -> 
         ({"listen": "http://a"}, "expected opc.tcp://HOST:PORT"),
         ({"listen": "opc.tcp://0.0.0.0"}, "expected opc.tcp://HOST:PORT"),
         ({"listen": "opc.tcp://0.0.0.0:4840"}, "nobody could log in"),
-        ({"listen": "opc.tcp://a:1", "users": {"plc": "geheim"}}, "a secret never stands"),
+        (
+            {"listen": "opc.tcp://a:1", "users": {"plc": "geheim"}},
+            "a secret is never in this file itself",
+        ),
         ({"listen": "opc.tcp://a:1", "anonymous": "all"}, "anonymous"),
         ({"listen": "opc.tcp://a:1", "anonymous": "read", "key": "a"}, "both certificate and key"),
     ],

@@ -291,7 +291,10 @@ def test_plan_of_a_fleets_free_run_counts_from_the_one_before(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("facts", "text"),
-    [({"dialect": "native"}, "of a fleet speaks dialect native"), ({"endian": 2}, "endian 2 came")],
+    [
+        ({"dialect": "native"}, "of a fleet speaks dialect native"),
+        ({"endian": 2}, "endian: expected 0 or 1, got 2"),
+    ],
 )
 def test_plan_of_a_fleets_camera_that_cannot_be_played_is_refused(
     tmp_path: Path, facts: dict[str, Any], text: str

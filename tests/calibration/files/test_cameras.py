@@ -70,7 +70,9 @@ def test_view_and_motion_from_data_of_their_data_are_the_same() -> None:
     again = TargetView.from_data(json.loads(json.dumps(view.to_data())), target=BOARD)
     assert again.to_data() == view.to_data()
     assert again.target == BOARD
-    with pytest.raises(CalibrationError, match="stored view: target: expected the one that it"):
+    with pytest.raises(
+        CalibrationError, match="stored view: target: expected the target of the view"
+    ):
         TargetView.from_data(view.to_data())
     one = _stereo().transform
     same = motion_from_data(motion_to_data(one), one.target, one.source)
