@@ -63,7 +63,7 @@ class PartSearch:
         scales: smallest and largest scale.
         max_parts: largest number of found parts of each model.
         min_score: least share of the edges that must be visible.
-        overlap: largest share of a part's area that another part may cover.
+        overlap: largest common area of two parts, as a share of the smaller one's.
         any_polarity: whether dark and bright may be exchanged.
         contrast: least contrast of an edge, grey levels of 255; None: a share of the taught one.
         seconds: seconds after which no further place is fitted.

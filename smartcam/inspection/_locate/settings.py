@@ -82,7 +82,10 @@ class LocateSettings(ToolSettings):
         0.7, ge=0.3, le=1.0, description="least share of a part's edges that must be visible"
     )
     overlap: float = Field(
-        0.5, ge=0.0, le=1.0, description="largest share of a part's area that others may cover"
+        0.5,
+        ge=0.0,
+        le=1.0,
+        description="largest common area of two parts, as a share of the smaller",
     )
     polarity: Literal["same", "any"] = Field(
         "same", description="any: dark and bright may be exchanged"
