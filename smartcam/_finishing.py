@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -45,10 +46,10 @@ async def close_all(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -
 
     Cancellation: passed on to each; takes effect when all have ended.
     """
-    begun: set[Callable[[], Coroutine[Any, Any, None]]] = set()
+    begun: set[asyncio.Task[None] | None] = set()
 
     async def run(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        begun.add(close)
+        begun.add(asyncio.current_task())
         await close()
 
     closing = {asyncio.ensure_future(run(close)): close for close in closes}
@@ -60,13 +61,17 @@ async def close_all(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -
         for task in closing:
             task.cancel()
         await asyncio.wait(closing)
-        for close in closing.values():
-            if close not in begun:  # somebody cancelled all tasks at once
-                await close()
+        # somebody may have cancelled all tasks at once
+        await _close_each(close for task, close in closing.items() if task not in begun)
         raise
-    for task, close in closing.items():
-        if task.cancelled():
-            await close()
+    await _close_each(close for task, close in closing.items() if task.cancelled())
     for task in closing:
         if not task.cancelled():
             task.result()
+
+
+async def _close_each(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -> None:
+    """Close resources one after the other, also those after one that fails."""
+    async with contextlib.AsyncExitStack() as stack:
+        for close in closes:
+            stack.push_async_callback(close)
